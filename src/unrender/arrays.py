@@ -1,0 +1,107 @@
+"""The few array functions that operators do not give, for NumPy arrays and Dr.Jit arrays alike.
+
+Every formula of `statistics/`, `losses.py` and `optimizers/` is written with operators and with these, so that it is
+tested in NumPy against closed forms and runs unchanged on the device.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+Array = Any
+"""A NumPy array, or a Dr.Jit array or tensor."""
+
+
+def is_drjit(x: Array) -> bool:
+    """Whether `x` lives in Dr.Jit (and so may be lazy, symbolic, on a GPU)."""
+    return dr.is_array_v(x)
+
+
+def where(mask: Array, a: Array, b: Array) -> Array:
+    """`a` where `mask` holds, else `b`; either may be a number."""
+    return dr.select(mask, a, b) if is_drjit(mask) else np.where(mask, a, b)
+
+
+def minimum(a: Array, b: Array) -> Array:
+    """The smaller, per element."""
+    return dr.minimum(a, b) if is_drjit(a) or is_drjit(b) else np.minimum(a, b)
+
+
+def maximum(a: Array, b: Array) -> Array:
+    """The larger, per element."""
+    return dr.maximum(a, b) if is_drjit(a) or is_drjit(b) else np.maximum(a, b)
+
+
+def clip(x: Array, low: Array, high: Array) -> Array:
+    """`x` held within [low, high]."""
+    return minimum(maximum(x, low), high)
+
+
+def sqrt(x: Array) -> Array:
+    """The square root, per element."""
+    return dr.sqrt(x) if is_drjit(x) else np.sqrt(x)
+
+
+def absolute(x: Array) -> Array:
+    """The magnitude, per element."""
+    return dr.abs(x) if is_drjit(x) else np.abs(x)
+
+
+def sign(x: Array) -> Array:
+    """-1, 0 or 1 per element. Zero at zero, unlike `drjit.sign`, which never returns 0."""
+    return dr.select(x == 0, 0.0, dr.sign(x)) if is_drjit(x) else np.sign(x)
+
+
+def is_finite(x: Array) -> Array:
+    """A mask: neither infinite nor NaN."""
+    return dr.isfinite(x) if is_drjit(x) else np.isfinite(x)
+
+
+def all_finite(x: Array) -> bool:
+    """Whether every element is finite. Waits for the device."""
+    return bool(np.all(np.isfinite(numpy(x)))) if not is_drjit(x) else bool(dr.all(dr.isfinite(x), axis=None))
+
+
+def zeros_like(x: Array) -> Array:
+    """Zeros of the shape and kind of `x`."""
+    return dr.zeros(type(x), dr.shape(x)) if is_drjit(x) else np.zeros_like(x)
+
+
+def shape(x: Array) -> tuple[int, ...]:
+    """The shape as a tuple of integers."""
+    return tuple(x.shape)
+
+
+def mean(x: Array) -> Array:
+    """The mean over all elements, left lazy on Dr.Jit."""
+    return dr.mean(x, axis=None) if is_drjit(x) else np.mean(x)
+
+
+def total(x: Array) -> Array:
+    """The sum over all elements, left lazy on Dr.Jit."""
+    return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)
+
+
+def scalar(value: float, like: Array) -> Array:
+    """A number that changes from step to step, in a form that does not compile a new kernel each time."""
+    if not is_drjit(like):
+        return value
+    return dr.opaque(dr.leaf_array_t(like), value)
+
+
+def evaluate(*arrays: Any) -> None:
+    """Start the computation of lazy arrays (nothing to do for NumPy). Accepts nested lists, tuples and dicts."""
+    dr.eval(*arrays)
+
+
+def numpy(x: Array) -> np.ndarray:
+    """A NumPy copy, whatever `x` was."""
+    return np.array(x.numpy() if is_drjit(x) else x)
+
+
+def number(x: Array) -> float:
+    """A Python float from an array of one element. Waits for the device."""
+    return float(numpy(x).reshape(-1)[0]) if is_drjit(x) else float(x)

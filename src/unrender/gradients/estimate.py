@@ -1,0 +1,55 @@
+"""What every gradient estimator returns, and what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from unrender.arrays import Array
+from unrender.keys import Key
+from unrender.problem.problem import Problem
+from unrender.trees import Tree
+
+GRADIENT = "gradient"
+VARIANCE = "variance"
+HESSIAN = "hessian"
+HVP = "hvp"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One step's knowledge of the loss around the current parameters.
+
+    Attributes:
+        loss: of this step's samples (biased upward by their noise).
+        gradient: {key: array}, the parameters' keys and shapes.
+        variance: of `gradient`, per element; None where the estimator provides none.
+        hessian: (n, n) over all parameters flattened in key order, or None.
+        hvp: the product of the Hessian with a tree, or None.
+        info: for people: samples traced, control weights, images. Never read back.
+    """
+
+    loss: float
+    gradient: Tree
+    variance: Tree | None = None
+    hessian: Array | None = None
+    hvp: Callable[[Tree], Tree] | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Estimator(Protocol):
+    """A way to estimate the loss gradient. Immutable; all that changes is in the state."""
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """Subset of {"gradient", "variance", "hessian", "hvp"}."""
+        ...
+
+    def init(self, problem: Problem, parameters: Tree) -> Any:
+        """The state before the first step: a dataclass of arrays."""
+        ...
+
+    def estimate(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[Estimate, Any]:
+        """One estimate at `parameters` and the next state. Pure: equal arguments, equal results."""
+        ...

@@ -1,0 +1,38 @@
+"""The only source of seeds: a run is a function of (problem, method, seed)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+_MASK = 0xFFFFFFFFFFFFFFFF
+
+
+def _mix(x: int) -> int:
+    """The SplitMix64 finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words that scatters every bit."""
+    x = (x + 0x9E3779B97F4A7C15) & _MASK
+    x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+    x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & _MASK
+    return x ^ (x >> 31)
+
+
+@dataclass(frozen=True)
+class Key:
+    """Names one draw of a run.
+
+    Args:
+        seed: the run's seed, any integer.
+        step: the step of the run, from 0.
+        stream: which of the step's independent draws; `fold` makes further ones.
+    """
+
+    seed: int = 0
+    step: int = 0
+    stream: int = 0
+
+    def fold(self, number: int) -> Key:
+        """A key independent of this one and of `fold(other)`. Use one number per view, per purpose."""
+        return replace(self, stream=_mix(self.stream ^ _mix(number + 1)))
+
+    def uint32(self) -> int:
+        """The seed of this draw, in [0, 2**32)."""
+        return _mix(_mix(_mix(self.seed & _MASK) ^ (self.step & _MASK)) ^ self.stream) >> 32

@@ -1,0 +1,29 @@
+"""What an optimizer is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from unrender.gradients.estimate import Estimate
+from unrender.trees import Tree
+
+
+class Optimizer(Protocol):
+    """Turns estimates into steps. Immutable; all that changes is in the state."""
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """What the estimator must provide: subset of {"gradient", "variance", "hessian", "hvp"}."""
+        ...
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> Any:
+        """The state before the first step: a dataclass of arrays.
+
+        `learning_rates` holds the parameters that have their own; the others take the optimizer's.
+        """
+        ...
+
+    def update(self, estimate: Estimate, state: Any, parameters: Tree) -> tuple[Tree, Any]:
+        """The steps to add to the parameters, and the next state."""
+        ...

@@ -1,0 +1,22 @@
+"""What a preconditioner is."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from unrender.arrays import Array
+
+
+class Preconditioner(Protocol):
+    """A symmetric positive linear map S of one parameter's gradients and steps.
+
+    The loop hands S g to the optimizer and adds S (step): descent in the coordinates u where the parameter is x = S u.
+    """
+
+    def check(self, key: str, shape: tuple[int, ...]) -> None:
+        """Raise `InputError` where this map does not suit a parameter of that shape."""
+        ...
+
+    def apply(self, x: Array) -> Array:
+        """S x, of the shape and kind of `x`."""
+        ...

@@ -1,0 +1,32 @@
+"""One unknown of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.preconditioners.base import Preconditioner
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A scene parameter to recover.
+
+    Args:
+        key: as `mitsuba.traverse` names it, e.g. ``"back.bsdf.reflectance.data"``.
+        initial: where the descent starts: a number, a colour, an image file, an array of the parameter's shape (a number
+            or a colour fills it), or None for the scene's own value. An image file is scaled to the parameter's resolution;
+            8-bit files are taken as sRGB and linearised.
+        bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
+        learning_rate: this parameter's own; None takes the optimizer's.
+        preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
+    """
+
+    key: str
+    initial: float | tuple[float, ...] | list[Any] | str | Path | np.ndarray | None = None
+    bounds: tuple[float | None, float | None] | None = None
+    learning_rate: float | None = None
+    preconditioner: Preconditioner | None = None

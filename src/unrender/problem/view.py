@@ -1,0 +1,25 @@
+"""One picture of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class View:
+    """A reference picture and the sensor that sees the scene as it did.
+
+    Args:
+        reference: file, or array (H, W, 3), linear RGB. 8-bit files are taken as sRGB and linearised.
+        sensor: index of the scene's sensor.
+        weight: factor of this view's loss, > 0.
+        mask: file or array (H, W), in [0, 1]; factor of each pixel's loss. None for all ones.
+    """
+
+    reference: str | Path | np.ndarray
+    sensor: int = 0
+    weight: float = 1.0
+    mask: str | Path | np.ndarray | None = None

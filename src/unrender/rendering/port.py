@@ -1,0 +1,117 @@
+"""What the methods may ask of a renderer. They see nothing else of it.
+
+Mitsuba answers in `rendering/mitsuba_renderer.py`; `rendering/analytic.py` answers in NumPy with known integrals and known
+gradients. Arrays are the renderer's own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and are
+never changed in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from unrender.arrays import Array
+from unrender.trees import Tree
+
+Space = Literal["path", "primary"]
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """What a renderer says of one of its parameters.
+
+    Attributes:
+        shape: of the array that stands for it.
+        differentiable: whether `adjoint` can return its gradient.
+        carried: whether one set of paths serves two values of it (path space).
+        reason: one line; why it is not differentiable or not carried, else "".
+        lowest: the smallest value that makes physical sense, or None.
+        highest: the largest, or None.
+    """
+
+    shape: tuple[int, ...]
+    differentiable: bool = True
+    carried: bool = True
+    reason: str = ""
+    lowest: float | None = None
+    highest: float | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Which samples to take.
+
+    Attributes:
+        sensor: index of the sensor.
+        spp: samples per pixel, in all groups together; a multiple of `groups`.
+        seed: an integer in [0, 2**32), from `Key.uint32()`.
+        groups: how many independent images the samples are split into (2 for crossed halves).
+        pixels: flat pixel indices (row-major), or None for the whole film.
+    """
+
+    sensor: int
+    spp: int
+    seed: int
+    groups: int = 1
+    pixels: Array | None = None
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The answer to a `Shot`.
+
+    Attributes:
+        images: per group, the mean of its samples: (H, W, 3), or (N, 3) for N chosen pixels.
+        previous: likewise for the previous parameters on the same samples; None unless a pair was asked for.
+        paths: the renderer's own; hand it to `adjoint` to walk the same paths again.
+    """
+
+    images: tuple[Array, ...]
+    previous: tuple[Array, ...] | None
+    paths: Any
+
+
+class Renderer(Protocol):
+    """A scene with parameters that can be rendered and differentiated."""
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Every parameter of the scene by key."""
+        ...
+
+    def values(self, keys: list[str]) -> Tree:
+        """The scene's own values."""
+        ...
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """(height, width) of each sensor's film."""
+        ...
+
+    def array(self, values: np.ndarray) -> Array:
+        """This renderer's array with these values."""
+        ...
+
+    def select(self, keys: list[str], space: Space | None) -> None:
+        """Announce which parameters will be optimised, before the first render.
+
+        Raises `InputError` for one that is unknown or not differentiable; with `space="path"` for one that is not carried.
+        """
+        ...
+
+    def image(self, parameters: Tree, shot: Shot) -> Rendering:
+        """Render. Unbiased."""
+        ...
+
+    def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
+        """Render two states with the same samples: one set of paths (`"path"`) or one set of random numbers
+        (`"primary"`). Both images are unbiased."""
+        ...
+
+    def adjoint(self, parameters: Tree, paths: Any, weights: tuple[Array, ...]) -> Tree:
+        """The gradient of the mean over groups g of sum(weights[g] * images[g]), on the paths of a rendering.
+
+        Unbiased where `weights[g]` is independent of group g.
+        """
+        ...
