@@ -1,0 +1,108 @@
+"""The gradient by path replay, weighted by the loss derivative of an image that knows nothing of those paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from unrender import arrays, trees
+from unrender.errors import InputError
+from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.images.base import ImageEstimator
+from unrender.images.plain import Plain
+from unrender.keys import Key
+from unrender.pixels.all import All
+from unrender.problem.problem import Problem
+from unrender.rendering.port import Shot
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class PathGradientState:
+    """The image estimator's state."""
+
+    image: Any
+
+
+@dataclass(frozen=True)
+class PathGradient:
+    """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).
+
+    Independence comes from crossed halves: each pixel's samples form two halves A and B; A's adjoint is weighted by
+    the loss derivative at B's image and the reverse. Two traces serve what the usual loop traces three times. With a control
+    variate the halves' images share the memory, which is independent of both.
+
+    Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image; otherwise biased by the noise of
+    the image that the loss sees, which a control variate reduces step by step.
+
+    Args:
+        image: what the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
+        pixels: which pixels a step looks at.
+        spp: samples per pixel and view of the image, >= 1.
+        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1; None for crossed halves when `spp` is even, and
+            `spp` paths of its own when it is odd.
+    """
+
+    image: ImageEstimator = field(default_factory=Plain)
+    pixels: All = field(default_factory=All)
+    spp: int = 4
+    adjoint_spp: int | None = None
+
+    def __post_init__(self):
+        for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
+            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+                raise InputError(f"PathGradient: {name} must be a whole number of at least 1, got {value!r}")
+        if not isinstance(self.pixels, All):
+            raise InputError(f"PathGradient: pixels must be unrender.pixels.All(), got {self.pixels!r}")
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """A gradient."""
+        return frozenset({GRADIENT})
+
+    @property
+    def crossed(self) -> bool:
+        """Whether the halves are crossed, rather than paths traced for the adjoint alone."""
+        return self.adjoint_spp is None and self.spp % 2 == 0
+
+    def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
+        """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
+        problem.renderer.select(list(parameters), self.image.space)
+        return PathGradientState(self.image.init(problem, parameters))
+
+    def estimate(
+        self, problem: Problem, parameters: Tree, state: PathGradientState, key: Key
+    ) -> tuple[Estimate, PathGradientState]:
+        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, and what the
+        image estimator tells, per view."""
+        groups = 2 if self.crossed else 1
+        gradient: Tree | None = None
+        losses, kept, pictures, samples = [], [], {}, 0
+        told: dict[str, dict[int, Any]] = {}
+        for view in range(len(problem.views)):
+            key_view = key.fold(view)
+            image, keep = self.image.estimate(
+                problem, parameters, state.image, view, self.spp, groups, key_view.fold(0)
+            )
+            kept.append(keep)
+            picture = image.mean()
+            losses.append(problem.loss_value(view, picture))
+            paths, traced = image.paths, 0
+            if not self.crossed:
+                traced = self.adjoint_spp or self.spp
+                shot = Shot(problem.views[view].sensor, traced, key_view.fold(1).uint32())
+                paths = problem.renderer.image(parameters, shot).paths
+            weights = tuple(problem.loss_derivative(view, i) for i in reversed(image.images))
+            part = problem.renderer.adjoint(parameters, paths, weights)
+            gradient = part if gradient is None else trees.add(gradient, part)
+            samples += (self.spp + traced) * int(picture.shape[0]) * int(picture.shape[1])
+            pictures[view] = picture
+            for name, value in image.info.items():
+                told.setdefault(name, {})[view] = value
+        assert gradient is not None
+        next_state = PathGradientState(self.image.advance(parameters, state.image, tuple(kept)))
+        arrays.evaluate(gradient, losses, next_state, told)
+        loss = sum(arrays.number(value) for value in losses)
+        info = {"samples": samples, "images": pictures, **told}
+        return Estimate(loss, gradient, info=info), next_state
+

@@ -1,0 +1,6 @@
+"""What the loss sees: the image as rendered, or one that remembers."""
+
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+
+__all__ = ["Plain", "RecursiveControlVariate"]

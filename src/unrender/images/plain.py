@@ -1,0 +1,46 @@
+"""The image as it is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from unrender.images.base import ImageEstimate
+from unrender.keys import Key
+from unrender.problem.problem import Problem
+from unrender.rendering.port import Shot, Space
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class PlainState:
+    """Nothing is kept."""
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One independent rendering per step. Unbiased."""
+
+    @property
+    def space(self) -> Space | None:
+        """No samples are shared."""
+        return None
+
+    def init(self, problem: Problem, parameters: Tree) -> PlainState:
+        """See `ImageEstimator.init`."""
+        del problem, parameters
+        return PlainState()
+
+    def estimate(
+        self, problem: Problem, parameters: Tree, state: PlainState, view: int, spp: int, groups: int, key: Key
+    ) -> tuple[ImageEstimate, None]:
+        """See `ImageEstimator.estimate`."""
+        del state
+        shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
+        rendering = problem.renderer.image(parameters, shot)
+        return ImageEstimate(rendering.images, rendering.paths), None
+
+    def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:
+        """See `ImageEstimator.advance`."""
+        del parameters, kept
+        return state

@@ -1,0 +1,157 @@
+"""Recursive control variates: an image that keeps what earlier steps rendered.
+
+Nicolet et al. 2023, "Recursive Control Variates for Inverse Rendering".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from unrender import arrays, statistics, trees
+from unrender.arrays import Array
+from unrender.errors import InputError
+from unrender.images.base import ImageEstimate
+from unrender.keys import Key
+from unrender.problem.problem import Problem
+from unrender.rendering.port import Shot, Space
+from unrender.statistics import welford
+from unrender.statistics.recursion import advance
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class ViewMemory:
+    """What is kept of one view; every array (H, W, 3).
+
+    Attributes:
+        image: the control variate ⟨F_n⟩_CV.
+        relative_variance: of `image`, in units of one step's ⟨F_n⟩_n, by the recurrence (10).
+        current, previous, joint: running statistics of ⟨F_n⟩_n, of ⟨F_{n-1}⟩_n, and of both.
+    """
+
+    image: Array
+    relative_variance: Array
+    current: welford.State
+    previous: welford.State
+    joint: welford.State
+
+
+@dataclass(frozen=True)
+class RecursiveControlVariateState:
+    """State between steps.
+
+    Attributes:
+        parameters: of the last step; None before the first.
+        views: what is kept of each view; empty before the first step.
+    """
+
+    parameters: Tree | None = None
+    views: tuple[ViewMemory, ...] = ()
+
+
+@dataclass(frozen=True)
+class RecursiveControlVariate:
+    """⟨F_n⟩_CV = ⟨F_n⟩_n + w_n (⟨F_{n-1}⟩_CV − ⟨F_{n-1}⟩_n), Eq. 6, per view, pixel and colour channel.
+
+    The weight (Eq. 8) comes from statistics of earlier steps only: they are updated after use, which leaves the small bias
+    that section 3.2 of the paper describes (the weight still knows the samples inside ⟨F_{n-1}⟩_CV). Consistent: with
+    unchanging parameters the image converges to the exact one.
+
+    Args:
+        space: "path" shares paths between the two states (one trace; materials and emitters); "primary" shares random
+            numbers (two traces; any parameter, less correlation).
+        alpha: decay of the running means, in [0, 1).
+        beta: decay of the running (co)variances, in [0, 1).
+        update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
+
+    The state starts anew when a parameter changes its shape.
+
+    Var[⟨F_n⟩_CV] is kept relative to Var[⟨F_n⟩_n], which the recurrence (10) leaves as it is. Kept absolute, it would
+    freeze the first, worst estimate of the variance: a pixel whose first samples happen to agree would get variance 0, weight
+    1, and its first value for ever.
+    """
+
+    space: Space = "path"
+    alpha: float = 0.9
+    beta: float = 0.999
+    update_before_use: bool = False
+
+    def __post_init__(self):
+        if self.space not in ("path", "primary"):
+            raise InputError(f'RecursiveControlVariate: space must be "path" or "primary", got {self.space!r}')
+        for name in ("alpha", "beta"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"RecursiveControlVariate: {name} must be in [0, 1), got {getattr(self, name)!r}")
+
+    def init(self, problem: Problem, parameters: Tree) -> RecursiveControlVariateState:
+        """See `ImageEstimator.init`."""
+        del problem, parameters
+        return RecursiveControlVariateState()
+
+    def estimate(
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: RecursiveControlVariateState,
+        view: int,
+        spp: int,
+        groups: int,
+        key: Key,
+    ) -> tuple[ImageEstimate, ViewMemory]:
+        """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone."""
+        shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
+        fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
+        previous = parameters if fresh or state.parameters is None else state.parameters
+        rendering = problem.renderer.image_pair(parameters, previous, shot, self.space)
+        assert rendering.previous is not None
+        if fresh:
+            estimate = ImageEstimate(rendering.images, rendering.paths)
+            return estimate, self._start(estimate.mean())
+        memory = state.views[view]
+        F, H = _mean(rendering.images), _mean(rendering.previous)
+        used = self._observe(memory, F, H) if self.update_before_use else memory
+        var_previous = welford.covariance(used.previous)
+        weight = statistics.control_weight(
+            welford.covariance(used.joint), var_previous, memory.relative_variance * var_previous
+        )
+        images = tuple(advance(memory.image, f, h, weight) for f, h in zip(rendering.images, rendering.previous))
+        seen = used if self.update_before_use else self._observe(memory, F, H)
+        var_current, var_previous = welford.covariance(seen.current), welford.covariance(seen.previous)
+        variance = statistics.control_variate_variance(
+            weight,
+            var_current,
+            var_previous,
+            welford.covariance(seen.joint),
+            memory.relative_variance * var_previous,
+        )
+        relative = arrays.where(var_current > 0, variance / var_current, 1.0)
+        estimate = ImageEstimate(images, rendering.paths, {"control_weight": weight, "variance": variance})
+        return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
+
+    def advance(
+        self, parameters: Tree, state: RecursiveControlVariateState, kept: tuple[Any, ...]
+    ) -> RecursiveControlVariateState:
+        """See `ImageEstimator.advance`."""
+        del state
+        return RecursiveControlVariateState(parameters, kept)
+
+    def _start(self, image: Array) -> ViewMemory:
+        """Eq. 7: the first image is its own control variate."""
+        empty = welford.init(image)
+        return ViewMemory(image, image * 0.0 + 1.0, empty, empty, empty)
+
+    def _observe(self, memory: ViewMemory, F: Array, H: Array) -> ViewMemory:
+        return replace(
+            memory,
+            current=welford.update(memory.current, F, F, self.alpha, self.beta),
+            previous=welford.update(memory.previous, H, H, self.alpha, self.beta),
+            joint=welford.update(memory.joint, F, H, self.alpha, self.beta),
+        )
+
+
+def _mean(images: tuple[Array, ...]) -> Array:
+    result = images[0]
+    for image in images[1:]:
+        result = result + image
+    return result / len(images)

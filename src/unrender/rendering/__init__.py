@@ -1,0 +1,1 @@
+"""Renderers: the port that methods see, Mitsuba's answer, and an analytic one."""

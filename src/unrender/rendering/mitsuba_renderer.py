@@ -1,0 +1,234 @@
+"""Mitsuba's answer to the renderer port."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.errors import InputError
+from unrender.rendering import camera
+from unrender.rendering.path_pair import DELTA_MASK, DELTA_SIMPLE, PathPair
+from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
+from unrender.rendering.scene_pair import SceneDescription, ScenePair, from_tensor, to_tensor
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class Paths:
+    """What `adjoint` needs to walk the paths of a rendering again.
+
+    Attributes:
+        shot: the samples taken.
+        radiance: per lane.
+    """
+
+    shot: Shot
+    radiance: Any
+
+
+class MitsubaRenderer:
+    """A Mitsuba scene, held twice (current and previous state), with path replay gradients.
+
+    Args:
+        description: an XML file, a Mitsuba dictionary, or a function that returns one.
+        max_depth: longest path in segments, >= 1.
+
+    Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
+    vertex positions (3 V,). Geometry moves only through Mitsuba's `prb` kernel, whose gradient leaves out visibility.
+
+    Raises `InputError` where Mitsuba refuses the description.
+    """
+
+    def __init__(self, description: SceneDescription, max_depth: int = 6):
+        self.max_depth = max_depth
+        self.pair = ScenePair(description)
+        self._info: dict[str, ParameterInfo] = dict(self.pair.info())
+        self._keys: list[str] = []
+        self._native: dict[str, Any] = {}
+        self._leaves: dict[str, Any] = {}
+        self._loaded: Tree = {}
+        self._loaded_previous: Tree = {}
+        self._geometric = False
+        self._kernel: Any = PathPair(max_depth)
+        self._frozen: dict[tuple, Callable[..., Any]] = {}
+        self._sampler = mi.load_dict({"type": "independent"})
+
+    # ------------------------------------------------------------------ what there is
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Every parameter of the scene by its `mitsuba.traverse` key."""
+        return self._info
+
+    def values(self, keys: list[str]) -> Tree:
+        """The scene's own values, as loaded (or as last rendered, for a key that was selected)."""
+        return {key: to_tensor(self.pair.current_parameters[key]) for key in keys}
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """(height, width) of each sensor's film, after cropping."""
+        sizes = [sensor.film().crop_size() for sensor in self.pair.current.sensors()]
+        return [(int(s[1]), int(s[0])) for s in sizes]
+
+    def array(self, values: np.ndarray) -> Any:
+        """`mi.TensorXf` with these values."""
+        return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+
+    def select(self, keys: list[str], space: Space | None) -> None:
+        """Announce the parameters to recover. See `Renderer.select`."""
+        for key in keys:
+            if key not in self._info:
+                near = difflib.get_close_matches(key, self._info, n=1)
+                raise InputError(f"parameter {key}: the scene has none of that name" + (f"; did you mean {near[0]}?" if near else ""))
+            info = self._info[key]
+            if not info.differentiable:
+                raise InputError(f"parameter {key}: it cannot be recovered by gradients, since {info.reason}")
+            if space == "path" and not info.carried:
+                raise InputError(
+                    f'parameter {key}: {info.reason}, which space="path" cannot carry; use '
+                    'RecursiveControlVariate(space="primary")'
+                )
+        if space is not None:
+            self.pair.check_separate(keys)
+        if keys != self._keys:
+            self._keys = list(keys)
+            self._native = {key: self.pair.current_parameters[key] for key in keys}
+            rides = [self.pair.carriage(key) for key in keys]
+            self._geometric = any(ride.geometric for ride in rides)
+            changing = [r.bsdf for r in rides if r.bsdf is not None and mi.has_flag(r.bsdf.flags(), mi.BSDFFlags.Delta)]
+            self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
+            self._delta_table = self._delta_kinds(changing)
+            self._leaves, self._loaded, self._loaded_previous = {}, {}, {}
+            self._frozen.clear()
+
+    def _delta_kinds(self, changing: list[Any]) -> Any:
+        pointers = self.pair.current.shapes_dr().bsdf()
+        table = np.zeros(int(dr.reinterpret_array(mi.UInt32, pointers).numpy().max(initial=0)) + 1, np.uint32)
+        for bsdf in changing:
+            number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)).numpy()[0])
+            if number < len(table):
+                table[number] = DELTA_MASK if bsdf.class_name() == "MaskBSDF" else DELTA_SIMPLE
+        return mi.UInt32(table)
+
+    # ------------------------------------------------------------------ rendering
+
+    def image(self, parameters: Tree, shot: Shot) -> Rendering:
+        """Render. Unbiased; box filter."""
+        self._set_current(parameters)
+        frozen = self._function(shot, "image")
+        radiance = frozen(self.pair.current, None, None, *self._arguments(shot))
+        dr.eval(radiance)
+        return Rendering(self._develop(radiance, shot), None, Paths(shot, radiance))
+
+    def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
+        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
+        self._set_current(current)
+        self._set_previous(previous)
+        if space == "primary":
+            radiance = self._function(shot, "image")(self.pair.current, None, None, *self._arguments(shot))
+            radiance_previous = self._function(shot, "previous image")(self.pair.previous, None, None, *self._arguments(shot))
+        else:
+            tables = dict(self.pair.tables(), delta=self._delta_table)
+            frozen = self._function(shot, "pair")
+            radiance, radiance_previous = frozen(self.pair.current, self.pair.previous, tables, *self._arguments(shot))
+        dr.eval(radiance, radiance_previous)
+        images = self._develop(radiance, shot), self._develop(radiance_previous, shot)
+        return Rendering(*images, Paths(shot, radiance))
+
+    def adjoint(self, parameters: Tree, paths: Paths, weights: tuple[Any, ...]) -> Tree:
+        """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `Renderer.adjoint`."""
+        self._set_current(parameters)
+        shot = paths.shot
+        for leaf in self._leaves.values():
+            dr.clear_grad(leaf)
+        frozen = self._function(shot, "adjoint")
+        frozen(self.pair.current, None, None, *self._arguments(shot), paths.radiance, list(weights))
+        gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
+        dr.eval(gradient)
+        return gradient
+
+    def _arguments(self, shot: Shot) -> tuple[Any, Any]:
+        return mi.UInt32(shot.seed), shot.pixels
+
+    def _count(self, shot: Shot) -> int:
+        if shot.pixels is not None:
+            return dr.width(shot.pixels)
+        height, width = self.resolutions()[shot.sensor]
+        return height * width
+
+    def _develop(self, radiance: Any, shot: Shot) -> tuple[Any, ...]:
+        shape = (self._count(shot), 3) if shot.pixels is not None else (*self.resolutions()[shot.sensor], 3)
+        return camera.develop(radiance, shot.spp, shot.groups, shape)
+
+    def _function(self, shot: Shot, what: str) -> Callable[..., Any]:
+        """The frozen kernel for shots of this form: traced once, replayed at each step."""
+        count = self._count(shot)
+        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None)
+        if key not in self._frozen:
+            self._frozen[key] = dr.freeze(self._trace(what, shot.sensor, shot.spp, count))
+        return self._frozen[key]
+
+    def _trace(self, what: str, sensor: int, spp: int, count: int) -> Callable[..., Any]:
+        kernel = self._geometric_kernel() if self._geometric else self._kernel
+
+        def trace(scene, previous, tables, seed, pixels, radiance=None, weights=None):
+            # `previous` is read through pointers only: as an argument it becomes an input of the frozen kernel.
+            with dr.suspend_grad():
+                ray, ray_weight = camera.rays(scene.sensors()[sensor], self._sampler, seed, spp, pixels, count)
+                if what == "adjoint":
+                    δL = camera.expose(tuple(weights), spp, count) * ray_weight
+                    kernel.sample(dr.ADMode.Backward, scene, None, self._sampler, ray, δL, radiance)
+                    return None
+                L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, self._sampler, ray, pair=what == "pair")
+                return (L * ray_weight, Lₚ * ray_weight) if what == "pair" else L * ray_weight
+
+        return trace
+
+    def _geometric_kernel(self) -> Any:
+        return PrbKernel(self.max_depth)
+
+    # ------------------------------------------------------------------ the two states
+
+    def _set_current(self, parameters: Tree) -> None:
+        """Bring the current scene to `parameters`, as fresh leaves of the gradient: attached always, since frozen kernels
+        would be traced anew if that changed between the primal and the adjoint pass."""
+        changed = False
+        for key, value in parameters.items():
+            if self._loaded.get(key) is not value:
+                leaf = from_tensor(value, self._native[key])
+                dr.enable_grad(leaf)
+                self.pair.current_parameters[key] = leaf
+                self._leaves[key] = leaf
+                self._loaded[key] = value
+                changed = True
+        if changed:
+            self.pair.current_parameters.update()
+
+    def _set_previous(self, parameters: Tree) -> None:
+        changed = False
+        for key, value in parameters.items():
+            if self._loaded_previous.get(key) is not value:
+                self.pair.previous_parameters[key] = from_tensor(value, self._native[key])
+                self._loaded_previous[key] = value
+                changed = True
+        if changed:
+            self.pair.previous_parameters.update()
+
+
+class PrbKernel:
+    """Mitsuba's `prb` behind the interface of `PathPair`, for parameters that move geometry: its adjoint carries the
+    continuous part of their derivative. Visibility is left out, so those gradients are biased."""
+
+    def __init__(self, max_depth: int):
+        self._integrator = mi.load_dict({"type": "prb", "max_depth": max_depth})
+
+    def sample(self, mode, scene, tables, sampler, ray, δL=None, state_in=None, pair=False) -> tuple[Any, Any]:
+        """See `PathPair.sample`; never a pair."""
+        del tables, pair
+        active = mi.Bool(True)
+        L = self._integrator.sample(mode, scene, sampler, ray, δL, state_in, active)[0]
+        return L, None

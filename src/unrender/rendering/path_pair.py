@@ -1,0 +1,213 @@
+"""The surface path tracer: next-event estimation, multiple importance sampling, roulette, for one state or two, and its adjoint.
+
+Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. A subscript ₚ
+marks the previous state, which rides on the current state's paths (Nicolet et al. 2023, section 5 and appendix B).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+ROULETTE_FLOOR = 0.25
+"""Roulette looks at the current throughput alone, so that the adjoint can replay it without the previous state. This floor
+keeps paths alive that only the previous state still uses: both images stay unbiased whatever the ratio of throughputs."""
+
+
+class PathPair:
+    """Settings of the path tracer.
+
+    Args:
+        max_depth: the longest path in segments, as in Mitsuba (1: directly visible emitters only), >= 1.
+        rr_depth: the depth from which roulette may end a path.
+        changing_delta: whether a BSDF with a parameter to recover has perfectly specular lobes (a few evaluations more per bounce).
+
+    Differences from Mitsuba's `path` that matter to the estimates, none to their means: a sampled direction is weighted by the
+    BSDF's whole density and value (not by the sampled lobe's own), so that both states share one density; the visibility of
+    an emitter is tested apart from its radiance, so that an emitter that is black in one state still counts in the other.
+    """
+
+    def __init__(self, max_depth: int, rr_depth: int = 5, changing_delta: bool = False):
+        # No dataclass: Dr.Jit would take it for state of the loop below.
+        self.max_depth = max_depth
+        self.rr_depth = rr_depth
+        self.changing_delta = changing_delta
+
+    @dr.syntax
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: Any,
+        tables: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any = None,
+        state_in: Any = None,
+        pair: bool = False,
+    ) -> tuple[Any, Any]:
+        """Trace one path per lane.
+
+        Args:
+            mode: `Primal`, or `Backward` to replay the paths of a primal pass and back-propagate `δL` into the parameters
+                of `scene` (path replay, Vicini et al. 2021). Call under `dr.suspend_grad()`.
+            scene: the current scene.
+            tables: of `ScenePair.tables()`; used with `pair` only.
+            sampler: seeded; the same seed replays the same paths.
+            ray: camera rays.
+            δL: adjoint radiance per lane, with `Backward`.
+            state_in: radiance per lane that the primal pass returned, with `Backward`.
+            pair: whether to return the previous state's radiance too; with `Primal` only.
+
+        Returns:
+            radiance of the current and of the previous state per lane. Both unbiased.
+        """
+        primal = mode == dr.ADMode.Primal
+        bsdf_ctx = mi.BSDFContext()
+
+        # --------------------- Configure loop state ----------------------
+        ray = mi.Ray3f(dr.detach(ray))
+        depth = mi.UInt32(0)
+        L = mi.Spectrum(0 if primal else state_in)
+        Lₚ = mi.Spectrum(0)
+        δL = mi.Spectrum(δL if δL is not None else 0)
+        β = mi.Spectrum(1)
+        βₚ = mi.Spectrum(1)
+        η = mi.Float(1)
+        active = mi.Bool(True)
+
+        si_last = dr.zeros(mi.SurfaceInteraction3f)
+        pdf_last = mi.Float(1)
+        delta_last = mi.Bool(True)
+
+        while dr.hint(active, max_iterations=self.max_depth, label=f"path pair ({mode.name})"):
+            si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
+            bsdf = si.bsdf(ray)
+
+            # ---------------------- Direct emission ----------------------
+            ds = mi.DirectionSample3f(scene, si=si, ref=si_last)
+            mis = mis_weight(pdf_last, scene.pdf_emitter_direction(si_last, ds, ~delta_last))
+            with dr.resume_grad(when=not primal):
+                Le = β * mis * ds.emitter.eval(si, active)
+            if dr.hint(pair, mode="scalar"):
+                siₚ = mi.SurfaceInteraction3f(si)
+                siₚ.shape = remap(mi.ShapePtr, tables["shape"], si.shape)
+                Lₚ += βₚ * mis * remap(mi.EmitterPtr, tables["emitter"], ds.emitter).eval(siₚ, active)
+
+            # ---------------------- Emitter sampling ----------------------
+            active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
+            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            ds, _ = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
+            active_em &= ds.pdf != 0
+            active_em &= ~scene.ray_test(si.spawn_ray_to(ds.p), active_em)
+            inv_pdf = dr.select(active_em, dr.rcp(ds.pdf), 0)
+            wo = si.to_local(ds.d)
+            with dr.resume_grad(when=not primal):
+                f, pdf = bsdf.eval_pdf(bsdf_ctx, si, wo, active_em)
+                mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+                em = scene.eval_emitter_direction(si, ds, active_em) * inv_pdf
+                Ld = dr.select(active_em, β * mis_em * f * em, 0)
+            if dr.hint(pair, mode="scalar"):
+                bsdfₚ = remap(mi.BSDFPtr, tables["bsdf"], bsdf)
+                emitterₚ = remap(mi.EmitterPtr, tables["emitter"], ds.emitter)
+                fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, wo, active_em)
+                emₚ = emitterₚ.eval_direction(siₚ, ds, active_em) * inv_pdf
+                Lₚ += dr.select(active_em, βₚ * mis_em * fₚ * emₚ, 0)
+
+            # ------------------ Detached BSDF sampling -------------------
+            sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
+            bs, weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next)
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            smooth = active_next & ~delta
+            with dr.resume_grad(when=not primal):
+                f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
+            inv_pdf = dr.select(smooth & (pdf > 0), dr.rcp(pdf), 0)
+            weight = dr.select(delta, weight, dr.detach(f) * inv_pdf)
+            if dr.hint(pair, mode="scalar"):
+                weightₚ = weight
+                if dr.hint(self.changing_delta, mode="scalar"):
+                    weightₚ = self._delta_weight(tables, bsdf, bsdfₚ, si, siₚ, bs, weight, sample_1, sample_2, delta & active_next)
+                fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth)
+                βₚ *= dr.select(delta, weightₚ, fₚ * inv_pdf)
+
+            # ---- Update loop variables based on current interaction -----
+            L = (L + Le + Ld) if primal else (L - Le - Ld)
+            if dr.hint(not primal, mode="scalar"):
+                with dr.resume_grad():
+                    # L now holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
+                    value = f
+                    if dr.hint(self.changing_delta, mode="scalar"):
+                        # A delta lobe has no value to evaluate, only a weight: sample it again, attached.
+                        _, weight_d = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next & delta)
+                        null = delta & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+                        weight_d = dr.select(null, bsdf.eval_null_transmission(si, null), weight_d)
+                        value = dr.select(delta, weight_d, f)
+                    Lo = Le + Ld + L * relative(value)
+                    dr.backward_from(δL * Lo)
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            η *= bs.eta
+            β *= weight
+            si_last = dr.detach(si, True)
+            pdf_last = pdf
+            delta_last = delta
+
+            # -------------------- Stopping criterion ---------------------
+            β_max = dr.max(β)
+            if dr.hint(pair, mode="scalar"):
+                active_next &= (β_max > 0) | (dr.max(βₚ) > 0)
+            else:
+                active_next &= β_max > 0
+            q = dr.clip(β_max * dr.square(η), ROULETTE_FLOOR, 0.95)
+            roulette = depth >= self.rr_depth
+            rr_weight = dr.select(roulette, dr.rcp(q), 1)
+            β *= rr_weight
+            βₚ *= rr_weight
+            active_next &= ~roulette | (sampler.next_1d() < q)
+            depth[si.is_valid()] += 1
+            active = active_next
+
+        return L, Lₚ
+
+    def _delta_weight(self, tables, bsdf, bsdfₚ, si, siₚ, bs, weight, sample_1, sample_2, active):  # noqa: PLR0913
+        """The previous state's weight of a sampled perfectly specular lobe.
+
+        A changing conductor, dielectric or plastic: the lobe's value in the previous state, had by sampling that lobe alone,
+        over the current probability of choosing it. A changing mask: the ratio of null transmissions. Others are equal in
+        both states (`ScenePair` refuses the rest).
+        """
+        kind = dr.gather(mi.UInt32, tables["delta"], dr.reinterpret_array(mi.UInt32, bsdf), active)
+        result = mi.Spectrum(weight)
+        inv_pdf = dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
+        lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
+        for lobe in lobes:
+            chosen = active & (kind == DELTA_SIMPLE) & mi.has_flag(bs.sampled_type, lobe)
+            ctx = mi.BSDFContext()
+            ctx.type_mask = +lobe
+            bsₚ, weightₚ = bsdfₚ.sample(ctx, siₚ, sample_1, sample_2, chosen)
+            result = dr.select(chosen, weightₚ * bsₚ.pdf * inv_pdf, result)
+        chosen = active & (kind == DELTA_MASK) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        now = bsdf.eval_null_transmission(si, chosen)
+        before = bsdfₚ.eval_null_transmission(siₚ, chosen)
+        return dr.select(chosen & (now > 0), weight * before / now, result)
+
+
+DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
+"""Entries of `tables["delta"]`: how a BSDF's perfectly specular lobes follow a change of its parameters."""
+
+
+def remap(pointer: type, table: Any, source: Any) -> Any:
+    """The previous state's object for the current state's `source`, of type `pointer` (`mi.BSDFPtr`, ...)."""
+    return dr.reinterpret_array(pointer, dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, source)))
+
+
+def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
+    """The power heuristic with exponent 2, detached."""
+    a, b = dr.square(pdf_a), dr.square(pdf_b)
+    return dr.detach(dr.select(a > 0, a / (a + b), 0))
+
+
+def relative(value: Any) -> Any:
+    """value / detach(value), 0 where it is zero: one, with the derivative of the logarithm."""
+    primal = dr.detach(value)
+    return dr.select(primal != 0, value / primal, 0)

@@ -1,0 +1,268 @@
+"""One scene description, loaded twice: the *current* and the *previous* state, and the tables that lead from one to the other.
+
+Paths are traced in the current scene only. At a hit, the BSDF, emitter or shape of the previous state is found by a gather
+from pointer id to pointer id. No adapter plugin is needed, and every BSDF that Mitsuba can nest is served.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.errors import InputError
+from unrender.rendering.port import ParameterInfo
+from unrender.variant import ensure
+
+SceneDescription = str | Path | dict | Callable[[], Any]
+"""An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
+meshes are made twice)."""
+
+# Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
+# depend on the parameter.
+_SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
+_WRAPPERS = {"TwoSidedBRDF"}
+
+
+def load(description: SceneDescription) -> Any:
+    """One Mitsuba scene. Meshes are not merged, so that two loads have their shapes in the same order.
+
+    Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
+    """
+    ensure()
+    if callable(description):
+        description = description()
+    try:
+        if isinstance(description, (str, Path)):
+            path = Path(description)
+            if not path.is_file():
+                raise InputError(f"scene {path}: no such file")
+            scene = mi.load_file(str(path), parallel=False, optimize=False)
+        elif isinstance(description, dict):
+            scene = mi.load_dict(description, parallel=False, optimize=False)
+        else:
+            raise InputError(f"scene: expected an .xml path or a Mitsuba dictionary, got {type(description).__name__}")
+    except InputError:
+        raise
+    except Exception as error:
+        name = str(description) if isinstance(description, (str, Path)) else "dictionary"
+        raise InputError(f"scene {name}: Mitsuba could not load it: {_one_line(error)}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
+    if not scene.sensors():
+        raise InputError("scene: it has no sensor, and nothing can be rendered without one")
+    return scene
+
+
+def _one_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines)[:400] or type(error).__name__
+
+
+@dataclass(frozen=True)
+class Carriage:
+    """How a parameter reaches the picture, read off the scene graph.
+
+    Attributes:
+        geometric: moves shapes, sensors or emitters, so that paths themselves change.
+        bsdf: the outermost BSDF it belongs to, or None.
+        reason: why one path cannot serve two values of it, "" if it can.
+    """
+
+    geometric: bool
+    bsdf: Any
+    reason: str
+
+
+class ScenePair:
+    """Two loads of one description.
+
+    Args:
+        description: what to load.
+
+    Attributes:
+        current, previous: `mitsuba.Scene`.
+        current_parameters, previous_parameters: their `mitsuba.SceneParameters`.
+    """
+
+    def __init__(self, description: SceneDescription):
+        self.description = description
+        self.current = load(description)
+        self.current_parameters = mi.traverse(self.current)
+        self._previous: Any = None
+        self._previous_parameters: Any = None
+        self._tables: dict[str, Any] | None = None
+
+    @property
+    def previous(self) -> Any:
+        """The second load, made when first asked for."""
+        if self._previous is None:
+            self._previous = load(self.description)
+            self._previous_parameters = mi.traverse(self._previous)
+        return self._previous
+
+    @property
+    def previous_parameters(self) -> Any:
+        """`mitsuba.SceneParameters` of the second load."""
+        _ = self.previous
+        return self._previous_parameters
+
+    def check_separate(self, keys: list[str]) -> None:
+        """Raise `InputError` where the two loads share the object that holds a parameter."""
+        for key in keys:
+            if self.current_parameters.properties[key][2] is self.previous_parameters.properties[key][2]:
+                raise InputError(
+                    f"parameter {key}: the scene dictionary holds a ready-made Mitsuba object, which two states would "
+                    "share; give the scene as a function that returns the dictionary"
+                )
+
+    def tables(self) -> dict[str, Any]:
+        """Pointer tables {"bsdf" | "emitter" | "shape": UInt32}, from registry ids of current to those of previous."""
+        if self._tables is None:
+            current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
+            self._tables = {
+                "bsdf": _table(current.bsdf(), previous.bsdf()),
+                "emitter": _table(self.current.emitters_dr(), self.previous.emitters_dr()),
+                "shape": _table(current, previous),
+            }
+        return self._tables
+
+    def carriage(self, key: str) -> Carriage:
+        """How the parameter `key` reaches the picture."""
+        return carriage(self.current_parameters, key)
+
+    def info(self) -> Mapping[str, ParameterInfo]:
+        """`ParameterInfo` of every parameter of the scene."""
+        return {key: self._info(key) for key in self.current_parameters.keys()}
+
+    def _info(self, key: str) -> ParameterInfo:
+        flags = self.current_parameters.flags(key)
+        value = self.current_parameters[key]
+        try:
+            shape = native_shape(value)
+        except TypeError:
+            return ParameterInfo((), False, False, f"its type {type(value).__name__} has no derivatives")
+        if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
+            return ParameterInfo(shape, False, False, "Mitsuba marks it as not differentiable")
+        if not dr.is_float_v(value):
+            return ParameterInfo(shape, False, False, "it holds integers")
+        ride = self.carriage(key)
+        low, high = _physical_range(self.current_parameters, key)
+        return ParameterInfo(shape, True, not ride.reason, ride.reason, low, high)
+
+
+def _table(current: Any, previous: Any) -> Any:
+    source = dr.reinterpret_array(mi.UInt32, current).numpy()
+    target = dr.reinterpret_array(mi.UInt32, previous).numpy()
+    if source.shape != target.shape:
+        raise InputError("scene: two loads of the description differ in their shapes or emitters")
+    table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
+    table[source] = target
+    return mi.UInt32(table)
+
+
+def carriage(parameters: Any, key: str) -> Carriage:
+    """How the parameter `key` of a traversed scene reaches the picture, from the chain of objects that holds it."""
+    node = parameters.properties[key][2]
+    leaf = key.rsplit(".", 1)[-1]
+    chain: list[Any] = []
+    while node is not None and node in parameters.hierarchy:
+        chain.append(node)
+        node = parameters.hierarchy[node][0]
+    bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
+    if bsdfs:
+        return Carriage(False, bsdfs[-1], _delta_reason(bsdfs, chain))
+    if any(isinstance(n, mi.Emitter) for n in chain):
+        if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
+            return Carriage(True, None, "it moves an emitter")
+        return Carriage(False, None, "")
+    if any(isinstance(n, mi.Medium) for n in chain):
+        return Carriage(False, None, "it belongs to a medium")
+    if any(isinstance(n, mi.Sensor) for n in chain):
+        return Carriage(True, None, "it moves the sensor")
+    if any(isinstance(n, mi.Shape) for n in chain):
+        if leaf.startswith(("vertex_color", "face_color")) or leaf.startswith(("vertex_", "face_")) and leaf not in (
+            "vertex_positions", "vertex_normals", "vertex_texcoords"
+        ):  # fmt: skip
+            return Carriage(False, None, "")  # a mesh attribute, read through the shape pointer
+        return Carriage(True, None, "it moves a shape")
+    return Carriage(True, None, "it is neither a material's nor an emitter's")
+
+
+def _delta_reason(bsdfs: list[Any], chain: list[Any]) -> str:
+    """Why the delta lobes of this nest of BSDFs (innermost first) cannot follow a change of the parameter."""
+    outer = bsdfs[-1]
+    if not mi.has_flag(outer.flags(), mi.BSDFFlags.Delta):
+        return ""
+    names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
+    if names == ["MaskBSDF"] or (names[-1] == "MaskBSDF" and not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta)):
+        return ""
+    if len(names) == 1 and names[0] in _SIMPLE_DELTA:
+        bends = not any(isinstance(c, mi.Texture) for c in chain)  # the index of refraction is no texture
+        return "it bends the direction of a perfectly specular lobe" if bends else ""
+    return "its BSDF mixes perfectly specular lobes whose share one path cannot follow"
+
+
+def _physical_range(parameters: Any, key: str) -> tuple[float | None, float | None]:
+    """The range that makes physical sense, from the names Mitsuba gives to its parameters."""
+    node = parameters.properties[key][2]
+    names = key.split(".")
+    role = next((n for n in reversed(names) if n not in ("value", "data", "color0", "color1", "scale")), "")
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    if isinstance(node, mi.Emitter):
+        return (0.0, None) if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data") else (None, None)
+    if not isinstance(node, mi.BSDF):
+        return None, None
+    if role in ("alpha", "alpha_u", "alpha_v", "roughness"):
+        return 0.02, 1.0
+    if role in ("eta", "k"):
+        return 0.0, None
+    if role == "normalmap":
+        return 0.0, 1.0
+    if role in (
+        "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "diffuse_transmittance",
+        "transmittance", "base_color", "metallic", "specular", "anisotropic", "spec_tint", "sheen", "sheen_tint",
+        "clearcoat", "clearcoat_gloss", "spec_trans", "flatness", "diff_trans", "opacity", "weight",
+    ):  # fmt: skip
+        return 0.0, 1.0
+    return None, None
+
+
+def native_shape(value: Any) -> tuple[int, ...]:
+    """The shape of the tensor that stands for a Mitsuba value. Raises `TypeError` for what is no array."""
+    if isinstance(value, (int, float)):
+        return ()
+    if not dr.is_array_v(value) or dr.is_matrix_v(value) or dr.is_special_v(value):
+        raise TypeError(type(value).__name__)
+    if dr.is_tensor_v(value):
+        return tuple(value.shape)
+    if dr.depth_v(value) == 1:
+        return () if len(value) == 1 else (len(value),)
+    if dr.depth_v(value) == 2 and dr.width(value) == 1:
+        return (len(value),)
+    raise TypeError(type(value).__name__)
+
+
+def to_tensor(value: Any) -> Any:
+    """The tensor (`mi.TensorXf`, detached) that stands for a Mitsuba value."""
+    shape = native_shape(value)
+    if isinstance(value, (int, float)):
+        return mi.TensorXf(np.float32(value))
+    if dr.is_tensor_v(value):
+        return mi.TensorXf(dr.detach(value))
+    return mi.TensorXf(dr.ravel(dr.detach(value)), shape)
+
+
+def from_tensor(tensor: Any, like: Any) -> Any:
+    """The Mitsuba value of the type of `like` for a tensor; the inverse of `to_tensor`."""
+    if dr.is_tensor_v(like):
+        return type(like)(tensor.array, tuple(tensor.shape))
+    if dr.depth_v(like) == 1:
+        return type(like)(tensor.array)
+    return dr.unravel(type(like), type(like[0])(tensor.array))

@@ -1,0 +1,22 @@
+"""What can listen to a run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from unrender.training.loop import Run
+    from unrender.training.result import Result
+
+
+class Callback:
+    """Listens to a run. Override what is of interest; time spent here is not counted as the run's."""
+
+    def on_start(self, run: Run) -> None:
+        """Before the first step."""
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        """After each step, with its line of the history. `run.stop()` ends the run."""
+
+    def on_end(self, run: Run, result: Result) -> None:
+        """After the last step."""
