@@ -89,7 +89,7 @@ def scalar(value: float, like: Array) -> Array:
     """A number that changes from step to step, in a form that does not compile a new kernel each time."""
     if not is_drjit(like):
         return value
-    return dr.opaque(dr.leaf_array_t(like), value)
+    return dr.opaque(type(like), value, ()) if dr.is_tensor_v(like) else dr.opaque(dr.leaf_t(like), value)
 
 
 def evaluate(*arrays: Any) -> None:
