@@ -1,0 +1,49 @@
+# make demo        recover a scene from images, this library against the plain loop, at equal time; a page with the result
+# make test        lint, types, and every test but the slow ones
+# make test-all    the slow ones too
+# make lint        lint and types alone
+# make clean       remove what these wrote (the virtual environment stays)
+#
+# Everything is set up on the way, in .venv. Settings: PYTHON=python3.12  WORKERS=4 (test processes)  SECONDS=30 (per method)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-all lint clean
+
+FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
+	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
+PYTHON ?= $(shell $(FIND_PYTHON))
+BIN := .venv/bin
+SECONDS := 30
+PYTEST = $(BIN)/python -m pytest -q
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+
+help:
+	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
+
+demo: .venv/ready
+	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo
+	@echo "The result: file://$(CURDIR)/out/demo/compare.html"
+
+test: lint
+	$(PYTEST) -m "not slow"
+
+test-all: lint
+	$(PYTEST)
+
+lint: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+clean:
+	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Made anew whenever the dependencies change. pyright fetches its own program when it is first called: let that be now.
+.venv/ready: pyproject.toml scripts/prerequisites.py src/unrender/llvm.py src/unrender/packages.py
+	@test -n "$(PYTHON)" || { echo "no Python from 3.10 to 3.14 found: install one, or run: make PYTHON=/path/to/python3" >&2; exit 3; }
+	@$(PYTHON) -I scripts/prerequisites.py
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@$(BIN)/pyright --version
+	@touch $@

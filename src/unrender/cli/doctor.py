@@ -1,0 +1,181 @@
+"""`unrender doctor`: what this machine has, whether a gradient comes out right, and what to install."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from unrender import llvm, variant
+from unrender.errors import VariantError
+
+TOLERANCE = 1e-3
+"""The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
+
+_STEP = 0.05
+_RESOLUTION = 16
+_SPP = 64
+_SEED = 1
+
+
+def doctor(console: Console | None = None) -> int:
+    """Print versions, hardware, the backend chosen, a gradient checked against finite differences, and what is missing.
+
+    Returns:
+        The exit status: 0 if everything that is needed works, else 3.
+    """
+    console = console or Console()
+    problem: str | None = None
+    backend = "none"
+    error: float | None = None
+    try:
+        backend = variant.use()
+        error = gradient_error()
+    except VariantError as unusable:
+        problem = str(unusable)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in [*_versions(), *_hardware(), ("backend", backend)]:
+        table.add_row(name, escape(value))
+    if error is not None:
+        good = error <= TOLERANCE
+        verdict = "[green]right[/]" if good else "[red]wrong[/]"
+        table.add_row("gradient", f"{verdict}: relative error {error:.1e} against finite differences")
+        if not good:
+            problem = f"the gradient is off by {error:.1e}, more than {TOLERANCE:g}; please report it with these lines"
+    console.print(table)
+    for line in _missing():
+        console.print(f"[yellow]missing[/] {escape(line)}", soft_wrap=True)
+    if problem:
+        console.print(f"[red]problem[/] {escape(problem)}", soft_wrap=True)
+        return 3
+    console.print("[green]Everything needed is here.[/]")
+    return 0
+
+
+def gradient_error() -> float:
+    """The relative error of path replay backpropagation's derivative of a Cornell box's mean brightness by the red
+    wall's albedo, summed over its channels, against central differences on the same paths.
+
+    A variant must be set. The brightness is a cubic polynomial of the albedo at this depth, so the differences' own
+    error is some 1e-4.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    description = mi.cornell_box()
+    description["sensor"]["film"].update(width=_RESOLUTION, height=_RESOLUTION)
+    # Four segments are fewer than Russian roulette's five, which would choose other paths for another albedo.
+    description["integrator"] = {"type": "prb", "max_depth": 4}
+    scene = mi.load_dict(description)
+    parameters = mi.traverse(scene)
+    integrator, key = scene.integrator(), "red.reflectance.value"
+    albedo = mi.Color3f(parameters[key])
+
+    def brightness(shift: float) -> float:
+        parameters[key] = albedo + shift
+        parameters.update()
+        return float(dr.mean(integrator.render(scene, seed=_SEED, spp=_SPP), axis=None).array[0])
+
+    expected = (brightness(_STEP) - brightness(-_STEP)) / (2 * _STEP)
+    parameters[key] = mi.Color3f(albedo)
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    shape = (_RESOLUTION, _RESOLUTION, 3)
+    weights = dr.full(mi.TensorXf, 1 / (_RESOLUTION * _RESOLUTION * 3), shape)
+    integrator.render_backward(scene, parameters, weights, seed=_SEED, spp=_SPP)
+    found = float(dr.sum(mi.Color3f(dr.grad(parameters[key])))[0])
+    return abs(found - expected) / abs(expected)
+
+
+def _versions() -> list[tuple[str, str]]:
+    rows = [("python", f"{platform.python_version()} ({sys.executable})"), ("system", _system())]
+    rows += [
+        (name, _version(name) or "not installed as a package") for name in ("unrender", "mitsuba", "drjit", "numpy")
+    ]
+    return [*rows, ("LLVM", _llvm())]
+
+
+def _system() -> str:
+    if sys.platform == "darwin":
+        return f"macOS {platform.mac_ver()[0]}"
+    try:
+        return platform.freedesktop_os_release()["PRETTY_NAME"]
+    except (OSError, KeyError):
+        return platform.platform()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _llvm() -> str:
+    path = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "chosen by Dr.Jit")
+    if "drjit" not in sys.modules:
+        return "not loaded"
+    version = variant.llvm_version()
+    if version is None:
+        return f"none ({path})" if llvm.ENVIRONMENT_VARIABLE in os.environ else "none"
+    remark = f", newer than {llvm.NEWEST}, the newest that was tried" if version[0] > llvm.NEWEST else ""
+    return f"{'.'.join(map(str, version))} ({path}{remark})"
+
+
+def _hardware() -> list[tuple[str, str]]:
+    problem = variant.gpu_problem()
+    gpu = _first_line("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return [
+        ("CPU", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
+        ("GPU", (gpu or "CUDA works") if problem is None else f"not used: {problem}" + (f" ({gpu})" if gpu else "")),
+    ]
+
+
+def _processor() -> str:
+    try:
+        if match := re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return match[1]
+    except OSError:
+        pass
+    return _first_line("sysctl", "-n", "machdep.cpu.brand_string") or platform.processor() or platform.machine()
+
+
+def _first_line(program: str, *arguments: str) -> str | None:
+    """The first line that a program prints; None where there is no such program, or it fails."""
+    if not shutil.which(program):
+        return None
+    try:
+        answer = subprocess.run([program, *arguments], capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip().partition("\n")[0] or None
+
+
+def _missing() -> list[str]:
+    """One line per extra of the package that is not fully installed."""
+    try:
+        required = metadata.requires("unrender") or []
+    except metadata.PackageNotFoundError:
+        return []
+    absent: dict[str, list[str]] = {}
+    for requirement in required:
+        name = re.match(r"[\w.-]+", requirement)
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
+        if name and extra and _version(name[0]) is None:
+            absent.setdefault(extra[1], []).append(name[0])
+    return [
+        f"(optional) {', '.join(names)}; install: pip install 'unrender[{extra}]'"
+        for extra, names in sorted(absent.items())
+    ]

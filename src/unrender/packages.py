@@ -1,0 +1,101 @@
+"""Which command installs on this machine what `pip` cannot bring: LLVM, and the C libraries that Dr.Jit links to.
+
+Only the standard library, and nothing of `unrender`: the set-up script runs this file before anything is installed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+
+NEEDS = ("llvm", "libatomic.so.1", "libstdc++.so.6", "venv")
+"""What can be asked for."""
+
+APT_LLVM = ("libllvm19", "libllvm20", "libllvm21", "libllvm22", "libllvm18", "libllvm17t64", "libllvm17")
+"""Debian's and Ubuntu's packages of an LLVM that works, best known first."""
+
+_APT = {"libatomic.so.1": "libatomic1", "libstdc++.so.6": "libstdc++6", "venv": "python3-venv"}
+_DNF = {"llvm": "llvm-libs", "libatomic.so.1": "libatomic", "libstdc++.so.6": "libstdc++", "venv": "python3"}
+_PACMAN = {"llvm": "llvm-libs", "libatomic.so.1": "gcc-libs", "libstdc++.so.6": "gcc-libs", "venv": "python"}
+_BREW = {"llvm": "llvm@19", "venv": "python"}
+_CONDA = {"llvm": "libllvm19", "libatomic.so.1": "libgcc", "libstdc++.so.6": "libstdcxx", "venv": "python"}
+
+
+def manager(environment: Mapping[str, str] = os.environ) -> str | None:
+    """The package manager to name: conda inside one of its environments, else the system's; None where none is
+    known."""
+    if environment.get("CONDA_PREFIX"):
+        return "conda"
+    return next((name for name in ("apt-get", "dnf", "pacman", "brew") if shutil.which(name)), None)
+
+
+def command(needs: Sequence[str], by: str | None = None) -> str:
+    """The one shell command that installs `needs` (of `NEEDS`) with the package manager `by` (default: `manager()`)."""
+    by = by or manager()
+    sudo = "" if is_root() else "sudo "
+    if by == "apt-get":
+        return _apt_command(needs, sudo)
+    tables = {"dnf": _DNF, "pacman": _PACMAN, "brew": _BREW, "conda": _CONDA}
+    if by not in tables:
+        return "conda install -c conda-forge " + _names(needs, _CONDA)
+    names = _names(needs, tables[by])
+    prefixes = {
+        "dnf": f"{sudo}dnf install ",
+        "pacman": f"{sudo}pacman -S ",
+        "brew": "brew install ",
+        "conda": "conda install -c conda-forge ",
+    }
+    return prefixes[by] + names
+
+
+def apt_packages(needs: Sequence[str]) -> list[str] | None:
+    """Debian's packages for `needs`; None where apt knows no LLVM that works (its lists are empty, or the release is
+    old)."""
+    packages = [_APT[need] for need in needs if need != "llvm"]
+    if "llvm" in needs:
+        llvm = _known_to_apt(APT_LLVM)
+        if llvm is None:
+            return None
+        packages.insert(0, llvm)
+    return packages
+
+
+def is_root() -> bool:
+    """Whether this process may install packages as it is."""
+    return hasattr(os, "geteuid") and os.geteuid() == 0
+
+
+def _apt_command(needs: Sequence[str], sudo: str) -> str:
+    packages = apt_packages(needs)
+    if packages is None and _known_to_apt(("coreutils",)) is None:
+        # No lists at all, as in a fresh container: the first choice is what all current releases have.
+        packages = [APT_LLVM[0]] + [_APT[need] for need in needs if need != "llvm"]
+    if packages is not None:
+        return f"{sudo}apt-get update && {sudo}apt-get install -y {' '.join(packages)}"
+    script = f"curl -fsSO https://apt.llvm.org/llvm.sh && {sudo}bash llvm.sh 19"
+    others = [_APT[need] for need in needs if need != "llvm"]
+    return script + (f" && {sudo}apt-get install -y {' '.join(others)}" if others else "")
+
+
+def _known_to_apt(packages: Sequence[str]) -> str | None:
+    """The first of `packages` that apt could install now."""
+    try:
+        answer = subprocess.run(
+            ["apt-cache", "policy", *packages],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+            env={**os.environ, "LC_ALL": "C"},
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    known = set(re.findall(r"^(\S+):\n.*\n  Candidate: (?!\(none\))", answer.stdout, re.MULTILINE))
+    return next((package for package in packages if package in known), None)
+
+
+def _names(needs: Sequence[str], table: Mapping[str, str]) -> str:
+    return " ".join(dict.fromkeys(table[need] for need in needs if need in table))

@@ -1,0 +1,61 @@
+"""What `unrender doctor` says, and its exit status."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pytest
+from rich.console import Console
+
+from unrender import variant
+from unrender.cli import doctor
+from unrender.errors import VariantError
+
+
+@pytest.fixture(autouse=True)
+def without_gpu(monkeypatch: pytest.MonkeyPatch):
+    """So that the session's variant stays."""
+    monkeypatch.setattr(variant, "gpu_problem", lambda: "none [of these]")
+
+
+def run() -> tuple[int, str]:
+    console = Console(file=io.StringIO(), width=200)
+    status = doctor.doctor(console)
+    return status, console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_trial_gradient_is_right():
+    error = doctor.gradient_error()
+    assert error < doctor.TOLERANCE
+
+
+def test_a_machine_that_works_gets_zero():
+    status, said = run()
+    assert status == 0
+    for word in ("python", "mitsuba", "LLVM", "CPU", "llvm_ad_rgb", "none [of these]", "right: relative error"):
+        assert word in said
+
+
+@pytest.mark.parametrize("error", [0.5, math.nan])
+def test_a_wrong_gradient_gets_three(error: float, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "gradient_error", lambda: error)
+    status, said = run()
+    assert status == 3
+    assert "wrong" in said
+
+
+def test_a_machine_that_cannot_run_gets_three_and_the_command(monkeypatch: pytest.MonkeyPatch):
+    def refuse() -> str:
+        raise VariantError("no LLVM; install: apt-get install -y libllvm19")
+
+    monkeypatch.setattr(variant, "use", refuse)
+    status, said = run()
+    assert status == 3
+    assert "install: apt-get install -y libllvm19" in said
+
+
+def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch):
+    required = ["numpy", "no-such-thing>=2; extra == 'dev'", "pytest; extra == 'dev'"]
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: required)
+    assert doctor._missing() == ["(optional) no-such-thing; install: pip install 'unrender[dev]'"]
