@@ -1,0 +1,1 @@
+"""What is to be recovered, and from which images."""

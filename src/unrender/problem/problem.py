@@ -1,0 +1,310 @@
+"""What is to be recovered, from which images, under which loss."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from unrender import arrays
+from unrender.arrays import Array
+from unrender.errors import InputError
+from unrender.losses import L2, Loss
+from unrender.preconditioners.base import Preconditioner
+from unrender.problem import pictures, values
+from unrender.problem.field import FieldError, did_you_mean
+from unrender.problem.parameter import Parameter
+from unrender.problem.view import View
+from unrender.rendering.port import ParameterInfo, Renderer
+from unrender.trees import Tree
+
+Bounds = tuple[float | None, float | None]
+
+
+@runtime_checkable
+class _Renderer(Renderer, Protocol): ...
+
+
+@runtime_checkable
+class _Preconditioner(Preconditioner, Protocol): ...
+
+
+@runtime_checkable
+class _Loss(Loss, Protocol): ...
+
+
+class Problem:
+    """A scene, what in it is unknown, and the pictures that tell.
+
+    Everything is checked and read here, once; afterwards a problem does not change.
+
+    Args:
+        scene: an .xml file, a Mitsuba dictionary, a function that returns one, or a `Renderer`.
+        parameters: the unknowns, at least one, with different keys.
+        views: the pictures, at least one.
+        loss: per pixel and channel; None is L2(). The total is the sum over views of weight * mean over pixels and channels
+            of mask * loss.
+        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light).
+        truth: {key: value} of parameters whose true value is known, to measure the error; values as for
+            `Parameter.initial`.
+        name: for people; None takes the scene file's.
+
+    Attributes:
+        parameters: tuple of `Parameter`, as given.
+        views: tuple of `View`, their reference a float32 array (H, W, 3), their mask (H, W) or None.
+        renderer: what renders the scene.
+        notices: one line for each thing done to the input that its giver should know of.
+        bounds: {key: (low, high)}, the parameter's own or the physical range that the renderer knows; None is open.
+        learning_rates: {key: rate} of the parameters that have their own.
+        preconditioners: {key: preconditioner} of the parameters that have one.
+        truth: {key: array} of the parameters' shapes.
+
+    Raises:
+        InputError: in one line, which field is wrong and what was expected.
+    """
+
+    def __init__(
+        self,
+        scene: str | Path | dict[str, Any] | Callable[[], Any] | Renderer,
+        parameters: Sequence[Parameter],
+        views: Sequence[View],
+        loss: Loss | None = None,
+        max_depth: int = 6,
+        *,
+        truth: Mapping[str, Any] | None = None,
+        name: str | None = None,
+    ):
+        if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
+            raise FieldError(("max_depth",), "max_depth", f"expected a whole number of at least 1, got {max_depth!r}")
+        self.loss: Loss = L2() if loss is None else loss
+        if isinstance(self.loss, type) or not isinstance(self.loss, _Loss):
+            raise FieldError(("loss",), "loss", f"expected one of unrender.losses, such as L2(), got {self.loss!r}")
+        self.max_depth = max_depth
+        self.parameters = _sequence(parameters, Parameter, "parameters")
+        given_views = _sequence(views, View, "views")
+        self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
+        self.notices: list[str] = []
+        self.renderer: Renderer = _open(scene, max_depth)
+
+        known = self.renderer.parameters()
+        self.bounds: dict[str, Bounds] = {}
+        self.learning_rates: dict[str, float] = {}
+        self.preconditioners: dict[str, Preconditioner] = {}
+        self._initial: dict[str, np.ndarray] = {}
+        for index, parameter in enumerate(self.parameters):
+            self._take_parameter(index, parameter, known)
+        self.views = tuple(self._take_view(index, view) for index, view in enumerate(given_views))
+        self.truth = {key: self._take_truth(key, value) for key, value in (truth or {}).items()}
+        self._references: dict[int, Array] = {}
+        self._masks: dict[int, Array | None] = {}
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Problem:
+        """The problem that a TOML file describes. Raises `InputError` that names the line."""
+        from unrender.problem.file import read
+
+        return read(path)
+
+    # ------------------------------------------------------------------ what methods ask
+
+    def initial(self) -> Tree:
+        """Where the descent starts: the renderer's arrays, inside the bounds."""
+        return {key: self.renderer.array(value) for key, value in self._initial.items()}
+
+    def reference(self, view: int) -> Array:
+        """The view's picture as the renderer's array (H, W, 3)."""
+        if view not in self._references:
+            self._references[view] = self.renderer.array(np.asarray(self.views[view].reference))
+        return self._references[view]
+
+    def mask(self, view: int) -> Array | None:
+        """The view's mask as the renderer's array (H, W, 1), or None where every pixel counts."""
+        if view not in self._masks:
+            mask = self.views[view].mask
+            self._masks[view] = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
+        return self._masks[view]
+
+    def loss_value(self, view: int, image: Array) -> Array:
+        """The view's share of the loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
+        values, mask = self.loss.value(image, self.reference(view)), self.mask(view)
+        return arrays.mean(values if mask is None else values * mask) * self.views[view].weight
+
+    def loss_derivative(self, view: int, image: Array) -> Array:
+        """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
+        slope, mask = self.loss.derivative(image, self.reference(view)), self.mask(view)
+        factor = self.views[view].weight / math.prod(arrays.shape(self.reference(view)))
+        return (slope if mask is None else slope * mask) * factor
+
+    def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
+        """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""
+        return {
+            key: float(np.sqrt(np.mean(np.square(arrays.numpy(parameters[key]) - truth, dtype=np.float64))))
+            for key, truth in self.truth.items()
+        }
+
+    # ------------------------------------------------------------------ taking in what was given
+
+    def _take_parameter(self, index: int, parameter: Parameter, known: Mapping[str, ParameterInfo]) -> None:
+        key, owner = parameter.key, f"parameter {parameter.key}"
+
+        def wrong(field: str, what: str) -> FieldError:
+            return FieldError(("parameters", index, field), owner, what)
+
+        if not isinstance(key, str) or key not in known:
+            raise wrong("key", f"the scene has no parameter of that name{_near_key(str(key), known)}")
+        if key in self._initial:
+            raise wrong("key", "given twice")
+        info = known[key]
+        if not info.differentiable:
+            raise wrong("key", f"it cannot be recovered by gradients: {info.reason}")
+        try:
+            low, high = self.bounds[key] = _bounds(parameter.bounds, info)
+        except InputError as error:
+            raise wrong("bounds", f"bounds: {error}") from error
+        if parameter.learning_rate is not None:
+            rate = parameter.learning_rate
+            if not _is_number(rate) or rate <= 0:
+                raise wrong("learning_rate", f"learning_rate: expected a number above 0, got {rate!r}")
+            self.learning_rates[key] = float(rate)
+        if (preconditioner := parameter.preconditioner) is not None:
+            if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
+                what = f"expected one of unrender.preconditioners or None, got {preconditioner!r}"
+                raise wrong("preconditioner", f"preconditioner: {what}")
+            try:
+                preconditioner.check(key, info.shape)
+            except InputError as error:
+                raise wrong("preconditioner", f"preconditioner: {_without(owner, error)}") from error
+            self.preconditioners[key] = preconditioner
+        try:
+            if parameter.initial is None:
+                start, notice = arrays.numpy(self.renderer.values([key])[key]).astype(np.float32), ""
+                if not np.isfinite(start).all():
+                    raise InputError("the scene's own value is not finite; give another")
+            else:
+                start, notice = values.fill(parameter.initial, info.shape)
+        except InputError as error:
+            raise wrong("initial", f"initial: {error}") from error
+        if notice:
+            self.notices.append(f"{owner}: initial {notice}")
+        inside = np.clip(start, low, high) if (low, high) != (None, None) else start
+        if (moved := int(np.sum(inside != start))) > 0:
+            what = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
+            self.notices.append(f"{owner}: {what}")
+        self._initial[key] = inside.astype(np.float32)
+
+    def _take_view(self, index: int, view: View) -> View:
+        owner = f"view {index}"
+
+        def wrong(field: str, what: str) -> FieldError:
+            return FieldError(("views", index, field), owner, what)
+
+        sizes = self.renderer.resolutions()
+        if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(sizes):
+            have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only sensor"
+            raise wrong("sensor", f"sensor: expected {have}, got {view.sensor!r}")
+        if not _is_number(view.weight) or view.weight <= 0:
+            raise wrong("weight", f"weight: expected a number above 0, got {view.weight!r}")
+        height, width = sizes[view.sensor]
+        try:
+            picture = pictures.read(view.reference)
+            _check_size(picture.values, height, width, view.sensor)
+        except InputError as error:
+            raise wrong("reference", f"reference: {error}") from error
+        if picture.notice:
+            self.notices.append(f"{owner}: reference {picture.notice}")
+        reference = np.array(np.broadcast_to(picture.values, (height, width, 3)))
+        mask = None
+        if view.mask is not None:
+            try:
+                mask = pictures.read(view.mask, linearise=False).values
+                _check_size(mask, height, width, view.sensor)
+                mask = mask.mean(axis=2)
+                if mask.min() < 0 or mask.max() > 1:
+                    raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
+                if not mask.any():
+                    raise InputError("it is 0 everywhere: no pixel would count")
+            except InputError as error:
+                raise wrong("mask", f"mask: {error}") from error
+        return replace(view, reference=reference, mask=mask, weight=float(view.weight))
+
+    def _take_truth(self, key: str, value: Any) -> np.ndarray:
+        if key not in self._initial:
+            raise InputError(f"truth {key}: not one of the parameters{did_you_mean(key, self._initial)}")
+        try:
+            return values.fill(value, self._initial[key].shape)[0]
+        except InputError as error:
+            raise InputError(f"truth {key}: {error}") from error
+
+
+def _open(scene: Any, max_depth: int) -> Renderer:
+    if isinstance(scene, _Renderer) and not isinstance(scene, type):
+        return scene
+    if not isinstance(scene, (str, Path, dict)) and not callable(scene):
+        got = type(scene).__name__
+        raise FieldError(("scene",), "scene", f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
+    from unrender.variant import ensure
+
+    ensure()
+    from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+
+    try:
+        return MitsubaRenderer(scene, max_depth)
+    except InputError as error:
+        raise FieldError(("scene",), "scene", _without("scene", error)) from error
+
+
+def _sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
+    items = (given,) if isinstance(given, kind) else given
+    if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
+        raise FieldError((name,), name, f"expected a list of {kind.__name__}, got {type(given).__name__}")
+    if not items:
+        raise FieldError((name,), name, f"expected at least one {kind.__name__}, got none")
+    for index, item in enumerate(items):
+        if not isinstance(item, kind):
+            what = f"expected a {kind.__name__}, got {type(item).__name__}"
+            raise FieldError((name, index), f"{name}[{index}]", what)
+    return tuple(items)
+
+
+def _bounds(given: Any, info: ParameterInfo) -> Bounds:
+    if given is None:
+        return info.lowest, info.highest
+    if isinstance(given, (str, bytes)) or not isinstance(given, Sequence) or len(given) != 2:
+        raise InputError(f"expected (low, high), either may be None, got {given!r}")
+    for side in given:
+        if side is not None and not _is_number(side):
+            raise InputError(f"expected finite numbers or None, got {side!r}")
+    low, high = (None if side is None else float(side) for side in given)
+    if low is not None and high is not None and low >= high:
+        raise InputError(f"low must be less than high, got {low:g} and {high:g}")
+    return low, high
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)
+
+
+def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> None:
+    if values.shape[:2] != (height, width):
+        raise InputError(
+            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
+            f"but the film of sensor {sensor} is {width}x{height}"
+        )
+
+
+def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
+    able = [name for name, info in known.items() if info.differentiable]
+    if near := did_you_mean(key, able) or did_you_mean(key, known):
+        return near
+    return f"; it has {', '.join(able[:6])}{' and others' if len(able) > 6 else ''}" if able else ""
+
+
+def _without(owner: str, error: InputError) -> str:
+    text = str(error)
+    for start in (f"{owner}: ", f"{owner} "):
+        text = text.removeprefix(start)
+    return text

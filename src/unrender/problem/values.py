@@ -1,0 +1,85 @@
+"""What a parameter starts from: a number, a colour, a picture or an array becomes an array of its shape."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.errors import InputError
+from unrender.problem import pictures
+
+
+def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+    """`initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
+
+    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C); an array must have the
+    shape.
+
+    Raises:
+        InputError: it does not fit, cannot be read, or is not finite.
+    """
+    if isinstance(initial, (str, Path)):
+        return _from_file(initial, shape)
+    try:
+        array = np.asarray(initial)
+        if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+            raise TypeError
+        with np.errstate(over="ignore"):
+            array = array.astype(np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"expected a number, a colour, a picture file or an array, got {_short(initial)}") from error
+    if not np.isfinite(array).all():
+        raise InputError("must be finite, got NaN or infinite values")
+    if array.shape == shape:
+        return array.copy(), ""
+    scalar = array.shape in ((), (1,))
+    colour = array.ndim == 1 and len(shape) > 1 and array.shape[0] == shape[-1]
+    if scalar or colour:
+        return np.array(np.broadcast_to(array.reshape(-1) if colour else array.reshape(()), shape)), ""
+    raise InputError(f"expected {_expected(shape)}, got an array of shape {array.shape}")
+
+
+def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+    if Path(path).suffix.lower() == ".npy" and Path(path).is_file():
+        try:
+            array = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"{path}: not a readable NumPy array") from error
+        try:
+            return fill(array, shape)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    picture = pictures.read(path)
+    if len(shape) != 3:
+        raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
+    height, width, channels = shape
+    values, remarks = picture.values, [picture.notice.partition(": ")[2]] if picture.notice else []
+    if channels == 1 and values.shape[2] == 3:
+        values = pictures.luminance(values)
+        remarks.append("reduced to its luminance")
+    elif channels in (3, 4) and values.shape[2] == 1:
+        values = np.repeat(values, 3, axis=2)
+    if channels == 4:
+        values = np.concatenate([values, np.ones_like(values[..., :1])], axis=2)
+    if values.shape[2] != channels:
+        raise InputError(f"{path}: a picture cannot fill a parameter of {channels} channels")
+    if values.shape[:2] != (height, width):
+        remarks.append(f"scaled from {values.shape[1]}x{values.shape[0]} to {width}x{height}")
+        values = pictures.resize(values, height, width)
+    return np.ascontiguousarray(values, np.float32), f"{Path(path).name}: {', '.join(remarks)}" if remarks else ""
+
+
+def _expected(shape: tuple[int, ...]) -> str:
+    if not shape:
+        return "a number"
+    kinds = ["a number", f"an array of shape {shape}"]
+    if len(shape) > 1 or shape == (3,):
+        kinds.insert(1, f"{shape[-1]} numbers" if shape[-1] != 3 else "a colour (3 numbers)")
+    return ", ".join(dict.fromkeys(kinds[:-1] if shape == (3,) else kinds))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
