@@ -1,20 +1,18 @@
 """Losses per pixel and channel: value and derivative, and whether the derivative is linear in the image.
 
-Why linearity matters: an image estimate I with E[I] = F gives E[∂ℓ(I)] = ∂ℓ(F) only where ∂ℓ is linear. Otherwise the gradient is
-biased by the image's noise, however many steps are averaged (Nicolet et al. 2023, section 4).
+Why linearity matters: an image estimate I with E[I] = F gives E[∂ℓ(I)] = ∂ℓ(F) only where ∂ℓ is linear. Otherwise the
+gradient is biased by the image's noise, however many steps are averaged (Nicolet et al. 2023, section 4).
 
 The loss of a problem is the sum over views of weight · mean over pixels and channels of mask · value.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from unrender import arrays
+from unrender import arrays, checks
 from unrender.arrays import Array
-from unrender.errors import InputError
 
 
 class Loss(Protocol):
@@ -84,7 +82,7 @@ class RelativeL2:
     epsilon: float = 1e-2
 
     def __post_init__(self):
-        _require_positive("RelativeL2", "epsilon", self.epsilon)
+        checks.number("RelativeL2", "epsilon", self.epsilon, above=0.0)
 
     @property
     def linear(self) -> bool:
@@ -112,7 +110,7 @@ class Huber:
     delta: float = 0.1
 
     def __post_init__(self):
-        _require_positive("Huber", "delta", self.delta)
+        checks.number("Huber", "delta", self.delta, above=0.0)
 
     @property
     def linear(self) -> bool:
@@ -128,8 +126,3 @@ class Huber:
     def derivative(self, image: Array, reference: Array) -> Array:
         """See `Loss.derivative`."""
         return arrays.clip(image - reference, -self.delta, self.delta)
-
-
-def _require_positive(loss: str, name: str, value: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise InputError(f"{loss}: {name} must be a finite number > 0, got {value!r}")

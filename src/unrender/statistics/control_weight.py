@@ -1,7 +1,8 @@
 """How much of the past to keep, and how noisy the result is (Nicolet et al. 2023, Eqs 8 and 10).
 
 F is the current state's estimate, H the previous state's from the same samples, and ⟨·⟩_CV the recursion
-⟨F_n⟩_CV = F + w (⟨F_{n-1}⟩_CV − H). ⟨F_{n-1}⟩_CV is independent of F and H. All arguments are arrays of one shape, or numbers.
+⟨F_n⟩_CV = F + w (⟨F_{n-1}⟩_CV − H). ⟨F_{n-1}⟩_CV is independent of F and H. All arguments are arrays of one shape, or
+numbers.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from unrender.arrays import Array
 def control_weight(cov: Array, var_previous: Array, var_cv: Array) -> Array:
     """w = Cov[F, H] / (Var[H] + Var[⟨F_{n-1}⟩_CV]), clamped to [0, 1]: Eq. 8, the w of least variance.
 
-    0 where nothing is known yet: where the denominator is 0, or anything is NaN. The three may be scaled by one common factor.
+    0 where nothing is known yet: where the denominator is 0, or anything is NaN. The three may be scaled by one
+    common factor.
 
     Args:
         cov: Cov[F, H].

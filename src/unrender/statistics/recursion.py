@@ -9,8 +9,8 @@ from unrender.arrays import Array
 def advance(memory: Array, current: Array, previous: Array, weight: Array) -> Array:
     """M_n = F + w (M_{n-1} − H): Eq. 6 of Nicolet et al. 2023.
 
-    Unbiased for E[F] where E[M_{n-1}] = E[H] and `weight` is independent of all three; a weight estimated from earlier samples
-    is not quite independent of M_{n-1}.
+    Unbiased for E[F] where E[M_{n-1}] = E[H] and `weight` is independent of all three; a weight estimated from
+    earlier samples is not quite independent of M_{n-1}.
 
     Args:
         memory: M_{n-1}, the estimate for the previous state. Elements that are not finite are forgotten: M_n = F there.

@@ -1,7 +1,8 @@
 """Exponentially weighted running covariance in one pass (after Nicolet et al. 2023, Appendix A).
 
-What is computed. Let m_k be the exponentially weighted mean of x_1 … x_k, weights a_{k,j} ∝ α^{k−j} that sum to one, likewise
-for y. Each sample from the second on leaves an innovation, its distance to the mean of the samples before it, and
+What is computed. Let m_k be the exponentially weighted mean of x_1 … x_k, weights a_{k,j} ∝ α^{k−j} that sum to one,
+likewise for y. Each sample from the second on leaves an innovation, its distance to the mean of the samples before
+it, and
 
     cov_n = Σ_{k=2..n} b_k (x_k − m^x_{k−1}) (y_k − m^y_{k−1}) / (1 + s_{k−1}),     s_k = Σ_j a_{k,j}²,
 
@@ -9,18 +10,18 @@ with weights b_k ∝ β^{n−k} that sum to one. An innovation holds the noise o
 independent: its expected product is Cov[x, y] (1 + s). So for independent, identically distributed pairs cov_n is
 **unbiased from the second sample on**, whatever α and β.
 
-How it differs from the paper's listing 2. The listing multiplies x_n − m^x_n (the mean with the sample) by y_n − m^y_{n−1} (the
-mean without it) and debiases the two means at n and n − 1. As x_n − m_n = α (1−α^{n−1})/(1−α^n) · (x_n − m_{n−1}), that product has
-the expectation 2α/(1+α) · Cov for every n >= 2, 5 % too little at α = 0.9. Its first sample has no mean before it, contributes
-0/0 or at best 0, yet is counted by the divisor 1 − β^n: another factor (1−β^{n−1})/(1−β^n), one half at n = 2. Both factors are removed
-here. They are common to the variances and the covariance of a pair, so control weights are the listing's own, but the
-statistic is a covariance at every step.
+How it differs from the paper's listing 2. The listing multiplies x_n − m^x_n (the mean with the sample) by y_n −
+m^y_{n−1} (the mean without it) and debiases the two means at n and n − 1. As x_n − m_n = α (1−α^{n−1})/(1−α^n) · (x_n
+− m_{n−1}), that product has the expectation 2α/(1+α) · Cov for every n >= 2, 5 % too little at α = 0.9. Its first
+sample has no mean before it, contributes 0/0 or at best 0, yet is counted by the divisor 1 − β^n: another factor
+(1−β^{n−1})/(1−β^n), one half at n = 2. Both factors are removed here. They are common to the variances and the
+covariance of a pair, so control weights are the listing's own, but the statistic is a covariance at every step.
 
-Drift. Identically distributed is what an optimisation's images are not: the mean lags 1/(1−α) steps behind. Means that move by δx and δy
-a step add δx δy (1+α) / (2 (1−α)²) to the covariance, 95 δx δy at α = 0.9. Two states of one scene drift alike, so Var F, Var H and Cov are
-raised by the same amount and the control weight is too large where the drift per step exceeds about a tenth of the standard
-deviation; the recursion stays as unbiased as it was, its weight is less than optimal. A smaller α tracks closer, and costs
-nothing in bias and little in noise.
+Drift. Identically distributed is what an optimisation's images are not: the mean lags 1/(1−α) steps behind. Means
+that move by δx and δy a step add δx δy (1+α) / (2 (1−α)²) to the covariance, 95 δx δy at α = 0.9. Two states of one
+scene drift alike, so Var F, Var H and Cov are raised by the same amount and the control weight is too large where the
+drift per step exceeds about a tenth of the standard deviation; the recursion stays as unbiased as it was, its weight
+is less than optimal. A smaller α tracks closer, and costs nothing in bias and little in noise.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from unrender.arrays import Array
 class State:
     """What has been seen of a stream of pairs (x, y).
 
-    The three weights are device numbers, not Python's: they change from step to step and must not become literals of a kernel.
+    The three weights are device numbers, not Python's: they change from step to step and must not become literals of
+    a kernel.
 
     Attributes:
         mean_x: weighted mean of x so far, its shape.
@@ -88,7 +90,7 @@ def update(state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0
 def covariance(state: State) -> Array:
     """The covariance of x and y, per element; 0 before two samples.
 
-    Unbiased for independent, identically distributed pairs; see the module for what drift adds. Never negative where x and y are
-    the same, and at most the geometric mean of the two variances (equal α and β).
+    Unbiased for independent, identically distributed pairs; see the module for what drift adds. Never negative where
+    x and y are the same, and at most the geometric mean of the two variances (equal α and β).
     """
     return state.moment / arrays.where(state.moment_weight > 0, state.moment_weight, 1.0)

@@ -1,0 +1,8 @@
+"""What turns estimates into steps."""
+
+from unrender.optimizers import schedules
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.sgd import SGD
+
+__all__ = ["SGD", "Adam", "Optimizer", "schedules"]

@@ -1,0 +1,86 @@
+"""Adam (Kingma and Ba 2015)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from unrender import arrays, checks, trees
+from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.optimizers import rates
+from unrender.optimizers.schedules import Schedule
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class AdamState:
+    """State between steps.
+
+    Attributes:
+        step: steps made so far.
+        learning_rates: of each parameter, before the schedule.
+        first_moment: exponentially weighted mean of the gradient, not debiased.
+        second_moment: of its square.
+    """
+
+    step: int
+    learning_rates: dict[str, float]
+    first_moment: Tree
+    second_moment: Tree
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Steps −η m̂ / (√v̂ + ε): the debiased mean of the gradient over the root of its debiased mean square, per
+    element.
+
+    At a first gradient g the step is −η sign(g), whatever the loss's scale. Elements whose gradient is 0 keep moving
+    by their momentum for some steps.
+
+    Args:
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        beta_1: decay of the mean, in [0, 1).
+        beta_2: decay of the mean square, in [0, 1).
+        epsilon: ε, in units of the gradient, > 0.
+        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+    """
+
+    learning_rate: float = 0.01
+    beta_1: float = 0.9
+    beta_2: float = 0.999
+    epsilon: float = 1e-8
+    schedule: Schedule | None = None
+
+    def __post_init__(self):
+        rates.check("Adam", self.learning_rate, self.schedule)
+        checks.number("Adam", "beta_1", self.beta_1, above=0.0, below=1.0, inclusive=True)
+        checks.number("Adam", "beta_2", self.beta_2, above=0.0, below=1.0, inclusive=True)
+        checks.number("Adam", "epsilon", self.epsilon, above=0.0)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """A gradient."""
+        return frozenset({GRADIENT})
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AdamState:
+        """See `Optimizer.init`."""
+        own = rates.per_parameter("Adam", parameters, self.learning_rate, learning_rates)
+        return AdamState(0, own, trees.zeros_like(parameters), trees.zeros_like(parameters))
+
+    def update(self, estimate: Estimate, state: AdamState, parameters: Tree) -> tuple[Tree, AdamState]:
+        """See `Optimizer.update`. Lazy on Dr.Jit: evaluate steps and state together."""
+        del parameters
+        gradient = estimate.gradient
+        first = trees.map(lambda m, g: self.beta_1 * m + (1.0 - self.beta_1) * g, state.first_moment, gradient)
+        second = trees.map(lambda v, g: self.beta_2 * v + (1.0 - self.beta_2) * (g * g), state.second_moment, gradient)
+        made = state.step + 1
+        factor = rates.factor("Adam", self.schedule, state.step) / (1.0 - self.beta_1**made)
+        debias = 1.0 / math.sqrt(1.0 - self.beta_2**made)
+
+        def step(key: str):
+            rate = arrays.scalar(-state.learning_rates[key] * factor, first[key])
+            root = arrays.sqrt(second[key]) * arrays.scalar(debias, first[key])
+            return rate * (first[key] / (root + self.epsilon))
+
+        return {key: step(key) for key in first}, replace(state, step=made, first_moment=first, second_moment=second)

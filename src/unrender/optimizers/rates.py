@@ -1,0 +1,42 @@
+"""Each parameter's learning rate, and what the schedule makes of it."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from unrender import checks
+from unrender.errors import InputError
+from unrender.optimizers.schedules import Schedule
+
+
+def check(owner: str, learning_rate: Any, schedule: Any) -> None:
+    """Raise `InputError` unless `learning_rate` is a positive number and `schedule` a schedule or None."""
+    checks.number(owner, "learning_rate", learning_rate, above=0.0)
+    if schedule is not None and not callable(schedule):
+        raise InputError(f"{owner}: schedule must be one of unrender.optimizers.schedules or None, got {schedule!r}")
+
+
+def per_parameter(owner: str, keys: Iterable[str], common: float, own: Mapping[str, float] | None) -> dict[str, float]:
+    """{key: learning rate}: the parameter's own where it has one, else `common`.
+
+    Raises `InputError` for a rate of an unknown parameter, or one that is not positive.
+    """
+    keys, own = list(keys), dict(own or {})
+    for key, rate in own.items():
+        if key not in keys:
+            near = difflib.get_close_matches(key, keys, 1)
+            hint = f'; did you mean "{near[0]}"?' if near else ""
+            raise InputError(f'{owner}: learning rate given for unknown parameter "{key}"{hint}')
+        checks.number(owner, f'learning rate of "{key}"', rate, above=0.0)
+    return {key: float(own.get(key, common)) for key in keys}
+
+
+def factor(owner: str, schedule: Schedule | None, step: int) -> float:
+    """The schedule's factor at `step`. Raises `InputError` where it is negative or not finite."""
+    value = 1.0 if schedule is None else float(schedule(step))
+    if not (math.isfinite(value) and value >= 0.0):
+        raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {value!r} at step {step}")
+    return value

@@ -1,0 +1,6 @@
+"""Linear maps that turn one parameter's gradient into a better direction."""
+
+from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.large_steps import LargeSteps
+
+__all__ = ["LargeSteps", "Preconditioner"]

@@ -1,0 +1,78 @@
+"""Smooth steps on textures and grids.
+
+After Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender import arrays, checks
+from unrender.arrays import Array
+from unrender.errors import InputError
+from unrender.preconditioners import grid
+
+
+@dataclass(frozen=True)
+class LargeSteps:
+    """S = (I + λ L)^-1 with the graph Laplacian L of the texture's grid, each channel by itself.
+
+    Gradient noise and steps are blurred over about √λ texels (the kernel of S falls by e over √λ), while constants
+    pass unchanged and no detail is out of reach: S has full rank, so the descent has the same minima. S is symmetric,
+    its eigenvalues lie in [1/(1 + 4 d λ), 1] on d axes.
+
+    Suits textures (H, W, C) and grids (Z, Y, X, C). The result is computed on the host in float32 and has the
+    argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU.
+
+    Args:
+        strength: λ, >= 0; 0 does nothing. 1 to 100 is usual.
+        wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per
+            axis: an environment map (H, W, C) wraps as (False, True).
+    """
+
+    strength: float = 10.0
+    wrap: bool | tuple[bool, ...] = False
+
+    def __post_init__(self):
+        checks.number("LargeSteps", "strength", self.strength, above=0.0, inclusive=True)
+        wrap = tuple(self.wrap) if isinstance(self.wrap, list) else self.wrap  # TOML gives lists, which have no hash
+        object.__setattr__(self, "wrap", wrap)
+        axes = wrap if isinstance(wrap, tuple) else (wrap,)
+        if not axes or not all(isinstance(wraps, bool) for wraps in axes):
+            raise InputError(f"LargeSteps: wrap must be true, false, or one of these per axis, got {wrap!r}")
+
+    def check(self, key: str, shape: tuple[int, ...]) -> None:
+        """See `Preconditioner.check`."""
+        if len(shape) not in (3, 4) or int(np.prod(shape[:-1])) < 2 or shape[-1] < 1:
+            raise InputError(
+                f"{key}: preconditioner LargeSteps needs a texture (H, W, C) or a grid (Z, Y, X, C) of more than one "
+                f"texel, got shape {tuple(shape)}"
+            )
+        if isinstance(self.wrap, tuple) and len(self.wrap) != len(shape) - 1:
+            raise InputError(
+                f"{key}: preconditioner LargeSteps: wrap must have {len(shape) - 1} entries for shape {tuple(shape)}, "
+                f"got {len(self.wrap)}"
+            )
+
+    def apply(self, x: Array) -> Array:
+        """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
+        shape = arrays.shape(x)
+        self.check("parameter", shape)
+        wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (len(shape) - 1)
+        result = grid.solver(float(self.strength), shape[:-1], wrap).solve(arrays.numpy(x))
+        return type(x)(_aligned(result)) if arrays.is_drjit(x) else result.astype(x.dtype)
+
+
+def _aligned(x: np.ndarray) -> np.ndarray:
+    """A copy that begins at a multiple of 64 bytes.
+
+    On the CPU, Dr.Jit shares NumPy's memory and compiles one kernel for aligned, another for other memory: where NumPy
+    happens to put an array must not decide.
+    """
+    room = np.empty(x.nbytes + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    result = room[start : start + x.nbytes].view(x.dtype).reshape(x.shape)
+    result[...] = x
+    return result
