@@ -16,15 +16,22 @@ class FieldError(InputError):
 
     Args:
         place: the way to the field.
-        owner: what people call its owner, e.g. "parameter wall.data" or "view 0".
         what: one line: what is wrong and what would be right.
+        owner: what people call the field, e.g. "parameter wall.data: bounds"; None writes the place.
     """
 
-    def __init__(self, place: Place, owner: str, what: str):
-        super().__init__(f"{owner}: {what}")
+    def __init__(self, place: Place, what: str, owner: str | None = None):
+        super().__init__(f"{owner or dotted(place)}: {what}")
         self.place = place
-        self.owner = owner
         self.what = what
+
+
+def dotted(place: Place) -> str:
+    """("parameters", 0, "bounds") as parameters[0].bounds."""
+    text = ""
+    for part in place:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

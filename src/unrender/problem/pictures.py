@@ -32,12 +32,12 @@ def read(source: Any, linearise: bool = True) -> Picture:
     """The picture in a file or an array.
 
     Args:
-        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Alpha is dropped. Floating-point
-            values are linear; 8- and 16-bit integers are taken as sRGB in [0, 1].
+        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Alpha is dropped.
+            Floating-point values are linear; 8- and 16-bit integers are taken as sRGB in [0, 1].
         linearise: whether to undo the sRGB curve of 8- and 16-bit values; masks want them as they are.
 
     Raises:
-        InputError: no such file, unreadable, of another shape, or not finite. The message leaves the role to the caller.
+        InputError: no such file, unreadable, of another shape, or not finite.
     """
     if isinstance(source, (str, Path)):
         path = Path(source)

@@ -46,8 +46,8 @@ class Problem:
         scene: an .xml file, a Mitsuba dictionary, a function that returns one, or a `Renderer`.
         parameters: the unknowns, at least one, with different keys.
         views: the pictures, at least one.
-        loss: per pixel and channel; None is L2(). The total is the sum over views of weight * mean over pixels and channels
-            of mask * loss.
+        loss: per pixel and channel; None is L2(). The total is the sum over views of weight * mean over pixels and
+            channels of mask * loss.
         max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light).
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
@@ -79,10 +79,10 @@ class Problem:
         name: str | None = None,
     ):
         if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-            raise FieldError(("max_depth",), "max_depth", f"expected a whole number of at least 1, got {max_depth!r}")
+            raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {max_depth!r}")
         self.loss: Loss = L2() if loss is None else loss
         if isinstance(self.loss, type) or not isinstance(self.loss, _Loss):
-            raise FieldError(("loss",), "loss", f"expected one of unrender.losses, such as L2(), got {self.loss!r}")
+            raise FieldError(("loss",), f"expected one of unrender.losses, such as L2(), got {self.loss!r}")
         self.max_depth = max_depth
         self.parameters = _sequence(parameters, Parameter, "parameters")
         given_views = _sequence(views, View, "views")
@@ -151,33 +151,33 @@ class Problem:
     def _take_parameter(self, index: int, parameter: Parameter, known: Mapping[str, ParameterInfo]) -> None:
         key, owner = parameter.key, f"parameter {parameter.key}"
 
-        def wrong(field: str, what: str) -> FieldError:
-            return FieldError(("parameters", index, field), owner, what)
+        def wrong(field: str, what: str | Exception) -> FieldError:
+            return FieldError(("parameters", index, field), str(what), f"{owner}: {field}")
 
+        place = ("parameters", index, "key")
         if not isinstance(key, str) or key not in known:
-            raise wrong("key", f"the scene has no parameter of that name{_near_key(str(key), known)}")
+            raise FieldError(place, f"the scene has no parameter {key}{_near_key(str(key), known)}")
         if key in self._initial:
-            raise wrong("key", "given twice")
+            raise FieldError(place, f"{key} is given twice")
         info = known[key]
         if not info.differentiable:
-            raise wrong("key", f"it cannot be recovered by gradients: {info.reason}")
+            raise FieldError(place, f"{key} cannot be recovered by gradients: {info.reason}")
         try:
             low, high = self.bounds[key] = _bounds(parameter.bounds, info)
         except InputError as error:
-            raise wrong("bounds", f"bounds: {error}") from error
+            raise wrong("bounds", error) from error
         if parameter.learning_rate is not None:
             rate = parameter.learning_rate
             if not _is_number(rate) or rate <= 0:
-                raise wrong("learning_rate", f"learning_rate: expected a number above 0, got {rate!r}")
+                raise wrong("learning_rate", f"expected a number above 0, got {rate!r}")
             self.learning_rates[key] = float(rate)
         if (preconditioner := parameter.preconditioner) is not None:
             if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
-                what = f"expected one of unrender.preconditioners or None, got {preconditioner!r}"
-                raise wrong("preconditioner", f"preconditioner: {what}")
+                raise wrong("preconditioner", f"expected one of unrender.preconditioners, got {preconditioner!r}")
             try:
                 preconditioner.check(key, info.shape)
             except InputError as error:
-                raise wrong("preconditioner", f"preconditioner: {_without(owner, error)}") from error
+                raise wrong("preconditioner", str(error).removeprefix(f"{key}: preconditioner ")) from error
             self.preconditioners[key] = preconditioner
         try:
             if parameter.initial is None:
@@ -187,7 +187,7 @@ class Problem:
             else:
                 start, notice = values.fill(parameter.initial, info.shape)
         except InputError as error:
-            raise wrong("initial", f"initial: {error}") from error
+            raise wrong("initial", error) from error
         if notice:
             self.notices.append(f"{owner}: initial {notice}")
         inside = np.clip(start, low, high) if (low, high) != (None, None) else start
@@ -199,21 +199,21 @@ class Problem:
     def _take_view(self, index: int, view: View) -> View:
         owner = f"view {index}"
 
-        def wrong(field: str, what: str) -> FieldError:
-            return FieldError(("views", index, field), owner, what)
+        def wrong(field: str, what: str | Exception) -> FieldError:
+            return FieldError(("views", index, field), str(what), f"{owner}: {field}")
 
         sizes = self.renderer.resolutions()
         if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only sensor"
-            raise wrong("sensor", f"sensor: expected {have}, got {view.sensor!r}")
+            raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
         if not _is_number(view.weight) or view.weight <= 0:
-            raise wrong("weight", f"weight: expected a number above 0, got {view.weight!r}")
+            raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
         height, width = sizes[view.sensor]
         try:
             picture = pictures.read(view.reference)
             _check_size(picture.values, height, width, view.sensor)
         except InputError as error:
-            raise wrong("reference", f"reference: {error}") from error
+            raise wrong("reference", error) from error
         if picture.notice:
             self.notices.append(f"{owner}: reference {picture.notice}")
         reference = np.array(np.broadcast_to(picture.values, (height, width, 3)))
@@ -228,16 +228,16 @@ class Problem:
                 if not mask.any():
                     raise InputError("it is 0 everywhere: no pixel would count")
             except InputError as error:
-                raise wrong("mask", f"mask: {error}") from error
+                raise wrong("mask", error) from error
         return replace(view, reference=reference, mask=mask, weight=float(view.weight))
 
     def _take_truth(self, key: str, value: Any) -> np.ndarray:
         if key not in self._initial:
-            raise InputError(f"truth {key}: not one of the parameters{did_you_mean(key, self._initial)}")
+            raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, self._initial)}")
         try:
             return values.fill(value, self._initial[key].shape)[0]
         except InputError as error:
-            raise InputError(f"truth {key}: {error}") from error
+            raise FieldError(("truth", key), str(error)) from error
 
 
 def _open(scene: Any, max_depth: int) -> Renderer:
@@ -245,7 +245,7 @@ def _open(scene: Any, max_depth: int) -> Renderer:
         return scene
     if not isinstance(scene, (str, Path, dict)) and not callable(scene):
         got = type(scene).__name__
-        raise FieldError(("scene",), "scene", f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
+        raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
     from unrender.variant import ensure
 
     ensure()
@@ -254,19 +254,19 @@ def _open(scene: Any, max_depth: int) -> Renderer:
     try:
         return MitsubaRenderer(scene, max_depth)
     except InputError as error:
-        raise FieldError(("scene",), "scene", _without("scene", error)) from error
+        raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
 
 
 def _sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
     items = (given,) if isinstance(given, kind) else given
     if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
-        raise FieldError((name,), name, f"expected a list of {kind.__name__}, got {type(given).__name__}")
+        raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(given).__name__}")
     if not items:
-        raise FieldError((name,), name, f"expected at least one {kind.__name__}, got none")
+        raise FieldError((name,), f"expected at least one {kind.__name__}, got none")
     for index, item in enumerate(items):
         if not isinstance(item, kind):
             what = f"expected a {kind.__name__}, got {type(item).__name__}"
-            raise FieldError((name, index), f"{name}[{index}]", what)
+            raise FieldError((name, index), what)
     return tuple(items)
 
 
@@ -276,9 +276,12 @@ def _bounds(given: Any, info: ParameterInfo) -> Bounds:
     if isinstance(given, (str, bytes)) or not isinstance(given, Sequence) or len(given) != 2:
         raise InputError(f"expected (low, high), either may be None, got {given!r}")
     for side in given:
-        if side is not None and not _is_number(side):
-            raise InputError(f"expected finite numbers or None, got {side!r}")
+        if side is not None and (isinstance(side, bool) or not isinstance(side, (int, float)) or math.isnan(side)):
+            raise InputError(f"expected two numbers or None, got {side!r}")
     low, high = (None if side is None else float(side) for side in given)
+    if low == math.inf or high == -math.inf:
+        raise InputError(f"low must be less than high, got {low} and {high}")
+    low, high = None if low == -math.inf else low, None if high == math.inf else high
     if low is not None and high is not None and low >= high:
         raise InputError(f"low must be less than high, got {low:g} and {high:g}")
     return low, high
@@ -301,10 +304,3 @@ def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     if near := did_you_mean(key, able) or did_you_mean(key, known):
         return near
     return f"; it has {', '.join(able[:6])}{' and others' if len(able) > 6 else ''}" if able else ""
-
-
-def _without(owner: str, error: InputError) -> str:
-    text = str(error)
-    for start in (f"{owner}: ", f"{owner} "):
-        text = text.removeprefix(start)
-    return text

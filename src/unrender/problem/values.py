@@ -14,8 +14,8 @@ from unrender.problem import pictures
 def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     """`initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
 
-    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C); an array must have the
-    shape.
+    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C); an array must have
+    the shape.
 
     Raises:
         InputError: it does not fit, cannot be read, or is not finite.
@@ -74,10 +74,10 @@ def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, st
 def _expected(shape: tuple[int, ...]) -> str:
     if not shape:
         return "a number"
-    kinds = ["a number", f"an array of shape {shape}"]
-    if len(shape) > 1 or shape == (3,):
-        kinds.insert(1, f"{shape[-1]} numbers" if shape[-1] != 3 else "a colour (3 numbers)")
-    return ", ".join(dict.fromkeys(kinds[:-1] if shape == (3,) else kinds))
+    if shape == (3,):
+        return "a number or a colour (3 numbers)"
+    colour = "a colour (3 numbers), " if len(shape) > 1 and shape[-1] == 3 else ""
+    return f"a number, {colour}or an array of shape {shape}"
 
 
 def _short(value: Any) -> str:
