@@ -149,7 +149,7 @@ class PathPair:
             η *= bs.eta
             β *= weight
             si_last = dr.detach(si, True)
-            pdf_last = pdf
+            pdf_last = dr.select(delta, 1, pdf)  # no emitter sample competes with a delta lobe
             delta_last = delta
 
             # -------------------- Stopping criterion ---------------------

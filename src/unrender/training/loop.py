@@ -19,6 +19,7 @@ from unrender.gradients.estimate import Estimate, Estimator
 from unrender.keys import Key
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
+from unrender.problem.render import as_tree
 from unrender.training.bounds import project
 from unrender.training.callbacks import Callback
 from unrender.training.noise import GradientNoise
@@ -99,7 +100,7 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense.
     """
     _check(estimator, optimizer, steps, seconds)
-    parameters = problem.initial()
+    parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.initial().items()}
     state = estimator.init(problem, parameters)
     memory = optimizer.init(parameters, problem.learning_rates)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, parameters)
@@ -179,14 +180,7 @@ def estimate(
         parameters: {key: array} for all parameters of the problem, or None for the initial ones.
         seed: of its random numbers.
     """
-    point = problem.initial()
-    if parameters is not None:
-        if set(parameters) != set(point):
-            raise InputError(f"estimate: parameters must be {sorted(point)}, got {sorted(parameters)}")
-        for key, value in parameters.items():
-            if np.shape(value) != arrays.shape(point[key]):
-                raise InputError(f"estimate: {key} must have shape {arrays.shape(point[key])}, got {np.shape(value)}")
-        point = {key: problem.renderer.array(np.asarray(parameters[key], np.float32)) for key in point}
+    point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))
     return Estimate(
@@ -242,9 +236,8 @@ def _apply(problem: Problem, estimate: Estimate, memory: Any, optimizer: Optimiz
     gradient = {k: maps[k].apply(g) if k in maps else g for k, g in estimate.gradient.items()}
     seen = Estimate(estimate.loss, gradient, estimate.variance, estimate.hessian, estimate.hvp, estimate.info)
     steps, memory = optimizer.update(seen, memory, parameters)
-    bounds = problem.bounds
     moved = {k: x + (maps[k].apply(steps[k]) if k in maps else steps[k]) for k, x in parameters.items()}
-    moved = {k: project(x, *bounds.get(k, (None, None))) for k, x in moved.items()}
+    moved = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
     arrays.evaluate(moved, memory)
     return moved, memory
 

@@ -1,0 +1,93 @@
+"""Pictures of a problem's views as NumPy arrays: to look at, to report, to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from unrender import arrays
+from unrender.errors import InputError
+from unrender.keys import Key
+from unrender.problem.problem import Problem
+from unrender.rendering.port import Shot
+from unrender.trees import Tree
+
+_LANES = 1 << 21
+"""Paths per pass: what fits a small machine's memory."""
+
+
+def render(
+    problem: Problem,
+    parameters: Mapping[str, np.ndarray] | None = None,
+    view: int = 0,
+    spp: int = 64,
+    seed: int = 0,
+) -> np.ndarray:
+    """Render one view, in as many passes as memory asks for. Unbiased; box filter.
+
+    Args:
+        problem: whose scene.
+        parameters: {key: array} of all the problem's parameters; None for the initial ones.
+        view: index of the view.
+        spp: samples per pixel, >= 1.
+        seed: of the random numbers.
+
+    Returns:
+        float32 (H, W, 3), linear RGB.
+    """
+    if not isinstance(spp, int) or spp < 1:
+        raise InputError(f"render: spp must be a whole number of at least 1, got {spp!r}")
+    if not 0 <= view < len(problem.views):
+        raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
+    point = as_tree(problem, parameters)
+    problem.renderer.select(list(point), None)
+    sensor = problem.views[view].sensor
+    height, width = problem.renderer.resolutions()[sensor]
+    per_pass = max(1, min(spp, _LANES // (height * width)))
+    total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
+    while done < spp:
+        take = min(per_pass, spp - done)
+        shot = Shot(sensor, take, key.fold(done).uint32())
+        total += take * arrays.numpy(problem.renderer.image(point, shot).images[0])
+        done += take
+    return (total / spp).astype(np.float32)
+
+
+def render_pair(
+    problem: Problem,
+    current: Mapping[str, np.ndarray],
+    previous: Mapping[str, np.ndarray],
+    spp: int,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both images of view 0, on one set of paths traced in the current state. Each unbiased; box filter.
+
+    Args:
+        problem: whose scene; its parameters must be ones that `space="path"` carries.
+        current, previous: {key: array} of all the problem's parameters.
+        spp: samples per pixel, >= 1.
+        seed: of the random numbers.
+
+    Returns:
+        float32 (H, W, 3) of the current state, and of the previous one.
+    """
+    points = as_tree(problem, current), as_tree(problem, previous)
+    problem.renderer.select(list(points[0]), "path")
+    shot = Shot(problem.views[0].sensor, spp, Key(seed).uint32())
+    rendering = problem.renderer.image_pair(*points, shot, "path")
+    assert rendering.previous is not None
+    return arrays.numpy(rendering.images[0]), arrays.numpy(rendering.previous[0])
+
+
+def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:
+    """`parameters` as the renderer's arrays; None for the initial ones. Raises `InputError` where keys or shapes differ."""
+    point = problem.initial()
+    if parameters is None:
+        return point
+    if set(parameters) != set(point):
+        raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
+    for key, value in parameters.items():
+        if np.shape(value) != arrays.shape(point[key]):
+            raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
+    return {key: problem.renderer.array(np.asarray(parameters[key])) for key in point}
