@@ -1,0 +1,217 @@
+"""Methods by name: an estimator and an optimizer that go together, with the options that people set.
+
+To add one, write its options as a class of documented fields, a function that builds it, and a line in `METHODS`; the
+command line and its help follow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt
+
+from unrender import optimizers
+from unrender.errors import InputError
+from unrender.gradients.estimate import Estimator
+from unrender.gradients.path import PathGradient
+from unrender.images.base import ImageEstimator
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.optimizers import schedules
+from unrender.optimizers.base import Optimizer
+from unrender.problem.field import did_you_mean
+
+SCHEDULES: dict[str, type] = {
+    "constant": schedules.Constant,
+    "exponential": schedules.Exponential,
+    "cosine": schedules.Cosine,
+    "steps": schedules.Steps,
+    "warmup": schedules.Warmup,
+}
+_CALL = re.compile(r"\s*([A-Za-z_]+)\s*(?:\(([^()]*)\))?\s*")
+
+
+class Options(BaseModel):
+    """Options of a method. Each field has a description, a default and a range."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class AdamOptions(Options):
+    """What every method has that descends with Adam."""
+
+    learning_rate: PositiveFloat = Field(0.01, description="step size of the parameters that have none of their own")
+    beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="Adam's decay of the mean gradient")
+    beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="Adam's decay of the mean squared gradient")
+    schedule: str | None = Field(
+        None, description="learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+    )
+
+    def optimizer(self) -> Optimizer:
+        """Adam with these options."""
+        return optimizers.Adam(
+            self.learning_rate, beta_1=self.beta_1, beta_2=self.beta_2, schedule=parse_schedule(self.schedule)
+        )
+
+
+class PathOptions(AdamOptions):
+    """What every method has that follows path gradients."""
+
+    spp: PositiveInt = Field(8, description="samples per pixel; where even, the adjoint shares their paths")
+    adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
+
+    def estimator(self, image: ImageEstimator) -> Estimator:
+        """The path gradient of what the loss sees in `image`."""
+        return PathGradient(image, spp=self.spp, adjoint_spp=self.adjoint_spp)
+
+
+class RecursiveControlVariateOptions(PathOptions):
+    """Options of `rcv`."""
+
+    spp: PositiveInt = Field(2, description="samples per pixel; where even, the adjoint shares their paths")
+    space: Literal["path", "primary"] = Field(
+        "path", description="what two steps share: paths (materials, emitters), or random numbers (any parameter)"
+    )
+    alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
+    beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A named way to recover a problem's parameters.
+
+    Attributes:
+        name: as on the command line.
+        summary: one line.
+        options: the class of its options.
+        build: makes the two parts from options.
+    """
+
+    name: str
+    summary: str
+    options: type[Options]
+    build: Callable[[Any], tuple[Estimator, Optimizer]]
+
+    def configure(self, settings: Mapping[str, Any]) -> Options:
+        """The options with `settings` in place of defaults; text is converted ("4" to 4, "none" to None).
+
+        Raises:
+            InputError: an unknown option (with the nearest known one), or a value of the wrong type or out of range.
+        """
+        fields = self.options.model_fields
+        for name in settings:
+            if name not in fields:
+                hint = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
+                raise InputError(f"method {self.name} has no option {name}{hint}")
+        none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
+        try:
+            return self.options.model_validate({**settings, **none})
+        except pydantic.ValidationError as error:
+            detail = error.errors()[0]
+            name = str(detail["loc"][0])
+            expected = f"expected {self.expected(name)}, got {detail['input']!r}"
+            raise InputError(f"method {self.name}: option {name}: {expected}") from error
+
+    def expected(self, name: str) -> str:
+        """What values an option takes, in words: "a whole number above 0"."""
+        schema = self.options.model_json_schema()["properties"][name]
+        choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
+        return " or ".join(choices)
+
+    def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
+        """Estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
+        options = self.configure(settings or {})
+        try:
+            return self.build(options)
+        except InputError as error:
+            raise InputError(f"method {self.name}: {error}") from error
+
+
+def _plain(options: PathOptions) -> tuple[Estimator, Optimizer]:
+    return options.estimator(Plain()), options.optimizer()
+
+
+def _rcv(options: RecursiveControlVariateOptions) -> tuple[Estimator, Optimizer]:
+    image = RecursiveControlVariate(options.space, options.alpha, options.beta)
+    return options.estimator(image), options.optimizer()
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("plain", "a fresh rendering each step, crossed halves, Adam", PathOptions, _plain),
+        Method(
+            "rcv",
+            "recursive control variates: the image keeps what earlier steps rendered (Nicolet et al. 2023), Adam",
+            RecursiveControlVariateOptions,
+            _rcv,
+        ),
+    )
+}
+"""Every method by name."""
+
+
+def method(name: str) -> Method:
+    """The method of that name. Raises `InputError` with the nearest known name."""
+    if name not in METHODS:
+        known = ", ".join(METHODS)
+        raise InputError(f"unknown method {name}{did_you_mean(name, METHODS) or f'; there are {known}'}")
+    return METHODS[name]
+
+
+def parse_schedule(text: str | None) -> schedules.Schedule | None:
+    """The schedule that `text` names: "cosine(300)", "warmup(20) then exponential(100)"; None for none.
+
+    Raises:
+        InputError: an unknown name, or arguments that do not fit.
+    """
+    if text is None:
+        return None
+    first, *rest = re.split(r"\bthen\b", text, maxsplit=1)
+    match = _CALL.fullmatch(first)
+    name = match[1].lower() if match else ""
+    if match is None or name not in SCHEDULES:
+        what = match[1] if match else text
+        known = ", ".join(SCHEDULES)
+        raise InputError(f"schedule: unknown {what!r}{did_you_mean(name, SCHEDULES) or f'; there are {known}'}")
+    kind = SCHEDULES[name]
+    fields = [field for field in dataclasses.fields(kind) if field.name != "then"]
+    given = [part.strip() for part in match[2].split(",")] if match[2] and match[2].strip() else []
+    required = [field.name for field in fields if field.default is dataclasses.MISSING]
+    if not len(required) <= len(given) <= len(fields):
+        raise InputError(f"schedule: expected {name}({', '.join(field.name for field in fields)}), got {text!r}")
+    arguments: dict[str, Any] = {field.name: _number(part) for field, part in zip(fields, given, strict=False)}
+    if rest:
+        if name != "warmup":
+            raise InputError(f'schedule: only warmup can have something after "then", got {text!r}')
+        arguments["then"] = parse_schedule(rest[0])
+    try:
+        return kind(**arguments)
+    except InputError as error:
+        raise InputError(f"schedule: {error}") from error
+
+
+def _number(text: str) -> int | float:
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"schedule: expected a number, got {text!r}") from error
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """A part of a JSON schema."""
+    if "enum" in schema:
+        return " or ".join(schema["enum"])
+    words = {"integer": "a whole number", "number": "a number", "null": "none"}.get(schema.get("type", ""), "text")
+    names = {"exclusiveMinimum": "above", "minimum": "of at least", "exclusiveMaximum": "below", "maximum": "up to"}
+    limits = [f"{word} {schema[name]:g}" for name, word in names.items() if name in schema]
+    return f"{words} {' and '.join(limits)}".rstrip()
