@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from unrender import variant
+from unrender.errors import VariantError
 
 variant.prepare()  # before any test module imports Dr.Jit
 
@@ -17,7 +18,10 @@ def mitsuba_variant() -> str:
     """The variant of this test session: the CPU's, so that numbers are the same everywhere, or `UNRENDER_VARIANT`."""
     import drjit as dr
 
-    name = variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))
+    try:
+        name = variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))
+    except VariantError as error:
+        pytest.exit(str(error), returncode=3)  # once, not once per test
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
         # Each worker would start a thread per core, and they would wait for each other.

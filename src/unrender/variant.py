@@ -212,10 +212,10 @@ def _llvm_found(version: tuple[int, ...] | None, given: str | None) -> str:
             return f"Dr.Jit cannot load {llvm.ENVIRONMENT_VARIABLE}={given}"
         found = f"LLVM {major}" if major else ("no LLVM" if path.exists() else "no such file")
         return f"{llvm.ENVIRONMENT_VARIABLE}={given} is {found}"
-    if version is not None:
+    if version is not None and llvm.choose():
         return f"Dr.Jit was imported before unrender and loaded LLVM {version[0]}"
     newest = max((llvm.version_by_name(path) or 0 for path in llvm.candidates()), default=0)
-    return f"LLVM {newest} is the newest one found" if newest else "no LLVM library was found"
+    return f"LLVM {newest} is the newest one here" if newest else "no LLVM library was found"
 
 
 @contextlib.contextmanager
