@@ -19,9 +19,10 @@ covariance of a pair, so control weights are the listing's own, but the statisti
 
 Drift. Identically distributed is what an optimisation's images are not: the mean lags 1/(1−α) steps behind. Means
 that move by δx and δy a step add δx δy (1+α) / (2 (1−α)²) to the covariance, 95 δx δy at α = 0.9. Two states of one
-scene drift alike, so Var F, Var H and Cov are raised by the same amount and the control weight is too large where the
-drift per step exceeds about a tenth of the standard deviation; the recursion stays as unbiased as it was, its weight
-is less than optimal. A smaller α tracks closer, and costs nothing in bias and little in noise.
+scene drift alike, so Var F, Var H and Cov are raised by the same amount. The recursion stays as unbiased as it was, but
+its weight grows too large once the drift of a step exceeds about a tenth of the standard deviation, up to an image
+noisier than a plain one. A smaller α follows faster (α = 0.5 adds 3 δx δy) and costs little: noise of the mean is
+divided out on average, and β decides how many innovations count.
 """
 
 from __future__ import annotations
