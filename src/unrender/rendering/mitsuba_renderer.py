@@ -146,7 +146,7 @@ class MitsubaRenderer:
         for leaf in self._leaves.values():
             dr.clear_grad(leaf)
         frozen = self._function(shot, "adjoint")
-        frozen(self.pair.current, None, None, *self._arguments(shot), paths.radiance, list(weights))
+        frozen(self.pair.current, None, {"delta": self._delta_table}, *self._arguments(shot), paths.radiance, list(weights))
         gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
         dr.eval(gradient)
         return gradient
@@ -177,13 +177,14 @@ class MitsubaRenderer:
 
         def trace(scene, previous, tables, seed, pixels, radiance=None, weights=None):
             # `previous` is read through pointers only: as an argument it becomes an input of the frozen kernel.
+            sampler = self._sampler.clone()  # a seeded one would die, and free memory, while the next kernel is recorded
             with dr.suspend_grad():
-                ray, ray_weight = camera.rays(scene.sensors()[sensor], self._sampler, seed, spp, pixels, count)
+                ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
                 if what == "adjoint":
                     δL = camera.expose(tuple(weights), spp, count) * ray_weight
-                    kernel.sample(dr.ADMode.Backward, scene, None, self._sampler, ray, δL, radiance)
+                    kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, δL, radiance)
                     return None
-                L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, self._sampler, ray, pair=what == "pair")
+                L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, sampler, ray, pair=what == "pair")
                 return (L * ray_weight, Lₚ * ray_weight) if what == "pair" else L * ray_weight
 
         return trace

@@ -53,7 +53,7 @@ class PathPair:
             mode: `Primal`, or `Backward` to replay the paths of a primal pass and back-propagate `δL` into the parameters
                 of `scene` (path replay, Vicini et al. 2021). Call under `dr.suspend_grad()`.
             scene: the current scene.
-            tables: of `ScenePair.tables()`; used with `pair` only.
+            tables: of `ScenePair.tables()`, used with `pair`; its "delta" entry, used with `changing_delta`.
             sampler: seeded; the same seed replays the same paths.
             ray: camera rays.
             δL: adjoint radiance per lane, with `Backward`.
@@ -64,6 +64,7 @@ class PathPair:
             radiance of the current and of the previous state per lane. Both unbiased.
         """
         primal = mode == dr.ADMode.Primal
+        follow_delta = self.changing_delta and (pair or not primal)
         bsdf_ctx = mi.BSDFContext()
 
         # --------------------- Configure loop state ----------------------
@@ -120,14 +121,17 @@ class PathPair:
             bs, weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next)
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             smooth = active_next & ~delta
+            if dr.hint(follow_delta, mode="scalar"):
+                kind = dr.gather(mi.UInt32, tables["delta"], dr.reinterpret_array(mi.UInt32, bsdf), active_next)
             with dr.resume_grad(when=not primal):
                 f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
             inv_pdf = dr.select(smooth & (pdf > 0), dr.rcp(pdf), 0)
             weight = dr.select(delta, weight, dr.detach(f) * inv_pdf)
             if dr.hint(pair, mode="scalar"):
                 weightₚ = weight
-                if dr.hint(self.changing_delta, mode="scalar"):
-                    weightₚ = self._delta_weight(tables, bsdf, bsdfₚ, si, siₚ, bs, weight, sample_1, sample_2, delta & active_next)
+                if dr.hint(follow_delta, mode="scalar"):
+                    lobe = self._delta_value(kind, bsdfₚ, siₚ, bs, sample_1, sample_2, active_next & delta)
+                    weightₚ = dr.select(kind == DELTA_EQUAL, weight, lobe * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0))
                 fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth)
                 βₚ *= dr.select(delta, weightₚ, fₚ * inv_pdf)
 
@@ -137,12 +141,9 @@ class PathPair:
                 with dr.resume_grad():
                     # L now holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
                     value = f
-                    if dr.hint(self.changing_delta, mode="scalar"):
-                        # A delta lobe has no value to evaluate, only a weight: sample it again, attached.
-                        _, weight_d = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next & delta)
-                        null = delta & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                        weight_d = dr.select(null, bsdf.eval_null_transmission(si, null), weight_d)
-                        value = dr.select(delta, weight_d, f)
+                    if dr.hint(follow_delta, mode="scalar"):
+                        lobe = self._delta_value(kind, bsdf, si, bs, sample_1, sample_2, active_next & delta)
+                        value = dr.select(delta, lobe, f)
                     Lo = Le + Ld + L * relative(value)
                     dr.backward_from(δL * Lo)
             ray = si.spawn_ray(si.to_world(bs.wo))
@@ -169,27 +170,22 @@ class PathPair:
 
         return L, Lₚ
 
-    def _delta_weight(self, tables, bsdf, bsdfₚ, si, siₚ, bs, weight, sample_1, sample_2, active):  # noqa: PLR0913
-        """The previous state's weight of a sampled perfectly specular lobe.
+    def _delta_value(self, kind, bsdf, si, bs, sample_1, sample_2, active):  # noqa: PLR0913
+        """The value of the perfectly specular lobe that was sampled, which no BSDF evaluation returns.
 
-        A changing conductor, dielectric or plastic: the lobe's value in the previous state, had by sampling that lobe alone,
-        over the current probability of choosing it. A changing mask: the ratio of null transmissions. Others are equal in
-        both states (`ScenePair` refuses the rest).
+        A conductor's, dielectric's or plastic's is had by sampling that lobe alone, with probability one; a mask's null lobe from
+        its null transmission. 1 for BSDFs whose specular lobes do not change. Its derivative is that of the lobe, not of the
+        probability of choosing it, which the weight of an attached sample would add.
         """
-        kind = dr.gather(mi.UInt32, tables["delta"], dr.reinterpret_array(mi.UInt32, bsdf), active)
-        result = mi.Spectrum(weight)
-        inv_pdf = dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
-        lobes = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
-        for lobe in lobes:
+        value = mi.Spectrum(1)
+        for lobe in mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null:
             chosen = active & (kind == DELTA_SIMPLE) & mi.has_flag(bs.sampled_type, lobe)
             ctx = mi.BSDFContext()
             ctx.type_mask = +lobe
-            bsₚ, weightₚ = bsdfₚ.sample(ctx, siₚ, sample_1, sample_2, chosen)
-            result = dr.select(chosen, weightₚ * bsₚ.pdf * inv_pdf, result)
+            again, weight = bsdf.sample(ctx, si, sample_1, sample_2, chosen)
+            value = dr.select(chosen, weight * dr.detach(again.pdf), value)
         chosen = active & (kind == DELTA_MASK) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        now = bsdf.eval_null_transmission(si, chosen)
-        before = bsdfₚ.eval_null_transmission(siₚ, chosen)
-        return dr.select(chosen & (now > 0), weight * before / now, result)
+        return dr.select(chosen, bsdf.eval_null_transmission(si, chosen), value)
 
 
 DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
