@@ -1,0 +1,128 @@
+"""Curves of a run and of several runs: what is known at a time, the median over seeds, when a level is reached."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.report import pictures
+from unrender.report.folder import RunFolder
+
+_BUCKETS = 200
+_SMOOTHED_POINTS = 500
+_TIMES = 2000
+
+
+@dataclass(frozen=True)
+class Series:
+    """A quantity of one run; arrays of one length, seconds and samples ascending, values NaN nowhere (infinity may be).
+
+    It keeps each value until the next one is known.
+    """
+
+    seconds: np.ndarray
+    samples: np.ndarray
+    values: np.ndarray
+
+    def at(self, where: np.ndarray, over: str = "seconds") -> np.ndarray:
+        """The value last known at each place of the axis `over` ("seconds" or "samples"); the first one before that."""
+        axis = getattr(self, over)
+        return self.values[np.maximum(np.searchsorted(axis, where, side="right") - 1, 0)]
+
+    def reached(self, level: float) -> float | None:
+        """The first time, in seconds, at which the value is at most `level`; None if it never is."""
+        below = np.flatnonzero(self.values <= level)
+        return float(self.seconds[below[0]]) if below.size else None
+
+
+@dataclass(frozen=True)
+class Band:
+    """Several runs of one method: median, minimum and maximum over them along an axis; arrays of one length."""
+
+    x: np.ndarray
+    median: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def reached(self, level: float) -> float | None:
+        """Where the median first is at most `level`; None if it never is."""
+        below = np.flatnonzero(self.median <= level)
+        return float(self.x[below[0]]) if below.size else None
+
+
+def parameter_error(run: RunFolder, key: str) -> Series | None:
+    """A parameter's root mean square error from start to end of the run; None where its truth is unknown."""
+    if key not in run.truth:
+        return None
+    history = run.history
+    recorded = history.parameter_error.get(key)
+    records = recorded.records if recorded is not None else np.array([], int)
+    seconds = history.seconds[records]
+    samples = history.samples[records]
+    values = recorded.values if recorded is not None else np.array([])
+    first = pictures.root_mean_square(run.initial[key], run.truth[key])
+    last = pictures.root_mean_square(run.parameters[key], run.truth[key])
+    if first is not None:
+        seconds, samples, values = np.r_[0.0, seconds], np.r_[0.0, samples], np.r_[first, values]
+    if last is not None and len(history) and (len(records) == 0 or records[-1] < len(history) - 1):
+        seconds = np.r_[seconds, history.seconds[-1]]
+        samples, values = np.r_[samples, history.samples[-1]], np.r_[values, last]
+    return Series(seconds, samples, values) if len(values) else None
+
+
+def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
+    """The mean over parameters of error / error at the start: 1 at first, 0 when all is found."""
+    known = [series for key in keys if (series := parameter_error(run, key)) is not None]
+    found = [series for series in known if 0 < series.values[0] < np.inf]
+    if not found:
+        return None
+    seconds = np.unique(np.concatenate([series.seconds for series in found]))
+    samples = found[0].samples[np.maximum(np.searchsorted(found[0].seconds, seconds, side="right") - 1, 0)]
+    return Series(seconds, samples, np.mean([series.at(seconds) / series.values[0] for series in found], axis=0))
+
+
+def image_error(run: RunFolder) -> float | None:
+    """Of the result's pictures: root mean square over pixels and channels, mean over views; None without pictures."""
+    errors = [pictures.root_mean_square(view.result, view.reference) for view in run.views.values()]
+    known = [error for error in errors if error is not None]
+    return float(np.mean(known)) if known else None
+
+
+def smoothed_loss(run: RunFolder, window: float) -> Series | None:
+    """The loss, each value the median of the records of the last `window` seconds. Skipped steps are left out."""
+    known = np.isfinite(run.history.loss)
+    seconds, samples, loss = run.history.seconds[known], run.history.samples[known], run.history.loss[known]
+    if not len(loss):
+        return None
+    ends = np.unique(np.linspace(0, len(loss) - 1, min(len(loss), _SMOOTHED_POINTS)).astype(int))
+    starts = np.searchsorted(seconds, seconds[ends] - window, side="right")
+    values = [np.median(loss[min(a, b) : b + 1]) for a, b in zip(starts, ends, strict=True)]
+    return Series(seconds[ends], samples[ends], np.array(values))
+
+
+def band(series: Sequence[Series], over: str, end: float, count: int | None = None) -> Band:
+    """Median and spread of several runs from 0 to `end`, at `count` even places or wherever one of them changes."""
+    if count is None:
+        places = np.unique(np.concatenate([getattr(one, over) for one in series] + [np.array([0.0, end])]))
+        places = places[places <= end]
+        places = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _TIMES)).astype(int))]
+    else:
+        places = np.linspace(0.0, end, count)
+    values = np.stack([one.at(places, over) for one in series])
+    return Band(places, np.median(values, axis=0), values.min(axis=0), values.max(axis=0))
+
+
+def bucketed(x: np.ndarray, y: np.ndarray) -> Band:
+    """A long noisy curve thinned for drawing: median, minimum and maximum within at most 200 stretches of x."""
+    known = np.isfinite(y)
+    x, y = x[known], y[known]
+    if len(x) <= _BUCKETS:
+        return Band(x, y, y, y)
+    bucket = np.minimum((x / (x[-1] or 1.0) * _BUCKETS).astype(int), _BUCKETS - 1)
+    starts = np.flatnonzero(np.r_[True, np.diff(bucket) > 0])
+    parts = np.split(y, starts[1:])
+    middle = [np.median(part) for part in np.split(x, starts[1:])]
+    median, low, high = ([f(part) for part in parts] for f in (np.median, np.min, np.max))
+    return Band(np.array(middle), np.array(median), np.array(low), np.array(high))

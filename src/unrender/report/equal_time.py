@@ -1,0 +1,202 @@
+"""What several methods reached at equal time, as numbers: tables, ratios, times to a level, curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from unrender.errors import InputError
+from unrender.report import curves
+from unrender.report.curves import Band, Series
+from unrender.report.folder import RunFolder
+from unrender.report.groups import Group
+
+SHARES = (0.25, 0.5, 1.0)
+"""Of the shortest run's time: where methods are compared."""
+LOSS_WINDOW = 0.05
+"""Of the shortest run's time: over how long a loss is a median."""
+_POINTS = 200
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Over the runs of one method. None where nothing is known."""
+
+    median: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One method at one time.
+
+    Attributes:
+        share, seconds: when, as a share of the shortest run's time and in seconds.
+        error: of the metric.
+        ratio: of the median to the first method's, None where that is 0 or not finite.
+    """
+
+    share: float
+    seconds: float
+    error: Spread
+    ratio: float | None
+
+
+@dataclass(frozen=True)
+class Reached:
+    """When one method reached the first method's best.
+
+    Attributes:
+        seconds: when the median over its runs did, None if never.
+        fastest, slowest: single runs that did.
+        count, runs: how many of how many did.
+        speedup: the first method's time over this one's; None where either is unknown or zero.
+    """
+
+    seconds: float | None
+    fastest: float | None
+    slowest: float | None
+    count: int
+    runs: int
+    speedup: float | None
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One method by one metric."""
+
+    moments: tuple[Moment, ...]
+    reached: Reached
+    over_seconds: Band
+    over_samples: Band
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What is compared.
+
+    Attributes:
+        name: "loss", "relative parameter error", or a parameter's key.
+        title: for people.
+        best_of_first: the least that the median of the first method's runs came to.
+        improves: whether that is less than where it began.
+        standings: {method's label: standing}.
+    """
+
+    name: str
+    title: str
+    best_of_first: float
+    improves: bool
+    standings: dict[str, Standing]
+
+    def least(self, moment: int) -> str | None:
+        """Whose median is least at one of `SHARES`; None where there is but one method."""
+        medians = {label: of.moments[moment].error.median for label, of in self.standings.items()}
+        known = {label: value for label, value in medians.items() if value is not None}
+        return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All numbers.
+
+    Attributes:
+        groups: the methods; the first one is the measure of the others.
+        seconds: of the shortest run.
+        metrics: the first one counts most.
+        image_error: {label: root mean square error of the result's pictures}, each run at its own end.
+        chosen: {label: the run whose last value of the first metric is the (lower) median}.
+    """
+
+    groups: tuple[Group, ...]
+    seconds: float
+    metrics: tuple[Metric, ...]
+    image_error: dict[str, Spread]
+    chosen: dict[str, RunFolder]
+
+
+def measure(groups: tuple[Group, ...]) -> Comparison:
+    """Compare methods up to the shortest run's time."""
+    end = min(float(run.history.seconds[-1]) for group in groups for run in group.runs)
+    first_run = groups[0].runs[0]
+    keys = [key for key in first_run.parameters if all(key in run.truth for group in groups for run in group.runs)]
+    found = []
+    if len(keys) > 1:
+        found.append(
+            _metric(
+                "relative parameter error",
+                "Parameter error, relative to the start (mean over parameters)",
+                lambda run: curves.relative_error(run, keys),
+                groups,
+                end,
+            )
+        )
+    for key in keys:
+        title = f"Parameter error (RMSE): {key}"
+        found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, end))
+    found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, end))
+    # With several parameters the mean over them comes first, then the loss, then each on its own.
+    order = [found[0], found[-1], *found[1:-1]] if len(found) > 1 else found
+    metrics = tuple(metric for metric in order if metric is not None)
+    if not metrics:
+        raise InputError(
+            f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
+        )
+    images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
+    return Comparison(groups, end, metrics, images, {g.label: _chosen(g, keys) for g in groups})
+
+
+def _metric(
+    name: str, title: str, series: Callable[[RunFolder], Series | None], groups: Sequence[Group], end: float
+) -> Metric | None:
+    """None where some method has no value of it."""
+    found = {group.label: [s for run in group.runs if (s := series(run)) is not None] for group in groups}
+    if not all(found.values()):
+        return None
+    full = {label: curves.band(of, "seconds", min(float(s.seconds[-1]) for s in of)) for label, of in found.items()}
+    first = next(iter(full.values()))
+    level = float(first.median.min())
+    improves = level < float(first.median[0])
+    at_first = first.reached(level)
+    standings = {}
+    for label, of in found.items():
+        moments = tuple(_moment(share, end, of, next(iter(found.values()))) for share in SHARES)
+        reached = _reached(of, full[label], level, at_first if improves else None)
+        longest = min(float(s.samples[-1]) for s in of)
+        over_seconds = curves.band(of, "seconds", float(full[label].x[-1]), _POINTS)
+        standings[label] = Standing(moments, reached, over_seconds, curves.band(of, "samples", longest, _POINTS))
+    return Metric(name, title, level, improves, standings)
+
+
+def _moment(share: float, end: float, of: Sequence[Series], first: Sequence[Series]) -> Moment:
+    when = np.array([share * end])
+    own, measure_of = ([float(s.at(when)[0]) for s in runs] for runs in (of, first))
+    a, b = median(own), median(measure_of)
+    return Moment(share, share * end, _spread(own), a / b if b > 0 and math.isfinite(a) and math.isfinite(b) else None)
+
+
+def _reached(of: Sequence[Series], whole: Band, level: float, at_first: float | None) -> Reached:
+    when, each = whole.reached(level), [t for s in of if (t := s.reached(level)) is not None]
+    speedup = at_first / when if when and at_first else None
+    return Reached(when, min(each, default=None), max(each, default=None), len(each), len(of), speedup)
+
+
+def _spread(values: Sequence[float | None]) -> Spread:
+    known = [value for value in values if value is not None]
+    return Spread(median(known), min(known), max(known)) if known else Spread(None, None, None)
+
+
+def _chosen(group: Group, keys: Sequence[str]) -> RunFolder:
+    def last(run: RunFolder) -> float:
+        found = curves.relative_error(run, keys)
+        if found is not None:
+            return float(found.values[-1])
+        image = curves.image_error(run)
+        return image if image is not None else math.inf
+
+    return sorted(group.runs, key=last)[(len(group.runs) - 1) // 2]

@@ -1,0 +1,254 @@
+"""Pictures that belong together: views and recovered maps of one run, or of several methods beside one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.report import pictures, words
+from unrender.report.folder import ViewPictures
+from unrender.report.pictures import ColourBar, Picture
+
+_VALUES_IN_A_TABLE = 16
+
+
+@dataclass(frozen=True)
+class Slider:
+    """Two pictures on one place, and a handle between them."""
+
+    left: Picture
+    right: Picture
+    left_label: str
+    right_label: str
+    caption: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One picture and what it is; `bar` where its colours stand for numbers."""
+
+    picture: Picture
+    caption: str
+    note: str = ""
+    bar: ColourBar | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Stacks of pictures, side by side where the screen is wide.
+
+    Attributes:
+        title: of all of them.
+        note: on their exposure or scale.
+        stacks: each from top to bottom.
+        led: whether the first stack is the large one.
+    """
+
+    title: str
+    note: str
+    stacks: tuple[tuple[Slider | Figure, ...], ...]
+    led: bool
+
+
+def is_map(array: np.ndarray) -> bool:
+    """Whether a parameter is shown as a picture: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
+    if array.ndim == 2:
+        return array.size > _VALUES_IN_A_TABLE and min(array.shape) > 1
+    return array.ndim in (3, 4) and array.shape[-1] in (1, 3, 4) and sum(n > 1 for n in array.shape[:-1]) >= 2
+
+
+def view_of_run(view: int, shown: ViewPictures) -> Panel:
+    """Reference against result, the start, what is left of the error, and the control weight where there is one."""
+    factor = pictures.exposure(shown.reference)
+    error = pictures.absolute_error(shown.result, shown.reference)
+    before = None if shown.initial is None else pictures.absolute_error(shown.initial, shown.reference)
+    high = pictures.top(error if before is None else before)
+    stacks: list[tuple[Slider | Figure, ...]] = [
+        (
+            Slider(
+                pictures.colour(shown.reference, factor, f"View {view}: the reference"),
+                pictures.colour(shown.result, factor, f"View {view}: the result"),
+                "Reference",
+                "Result",
+            ),
+        )
+    ]
+    if shown.initial is not None and before is not None:
+        picture = pictures.colour(shown.initial, factor, f"View {view}: before the first step")
+        stacks.append((Figure(picture, "Start"),))
+        stacks.append((_error(before, high, "Error at the start", f"View {view}: error before the first step"),))
+    if shown.control_weight is None:
+        stacks.append((Figure(pictures.colour(shown.result, factor, f"View {view}: the result"), "Result"),))
+    else:
+        weight = np.mean(shown.control_weight, axis=-1)
+        picture = pictures.false_colour(weight, 0.0, 1.0, pictures.VALUES, f"View {view}: control weight per pixel")
+        bar = pictures.colour_bar(0.0, 1.0, pictures.VALUES, "Control weight")
+        note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
+        stacks.append((Figure(picture, "Control weight", note, bar),))
+    stacks.append((_error(error, high, "Error of the result", f"View {view}: error of the result"),))
+    return Panel(f"View {view}", _exposure_note(factor), tuple(stacks), True)
+
+
+def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
+    """Each method's result against the reference, and its error, all on one exposure and one scale."""
+    reference = next(iter(shown.values())).reference
+    factor = pictures.exposure(reference)
+    errors = {label: pictures.absolute_error(of.result, of.reference) for label, of in shown.items()}
+    high = max(pictures.top(error) for error in errors.values())
+    stacks = tuple(
+        (
+            Slider(
+                pictures.colour(reference, factor, f"View {view}: the reference"),
+                pictures.colour(of.result, factor, f"View {view}: the result of {label}"),
+                "Reference",
+                label,
+            ),
+            _error(errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
+        )
+        for label, of in shown.items()
+    )
+    return Panel(f"View {view}", _exposure_note(factor), stacks, False)
+
+
+def map_of_run(key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None) -> Panel:
+    """A recovered texture or volume against its truth, or against its start where the truth is unknown."""
+    scale = Scale(result if truth is None or not is_map(truth) else truth)
+    stacks: list[tuple[Slider | Figure, ...]] = []
+    planes = _planes(result)
+    for label, plane in planes.items():
+        start, wanted = _planes(initial).get(label), _planes(truth).get(label)
+        errors = {
+            caption: pictures.absolute_error(one, wanted)
+            for caption, one in (("Error at the start", start), ("Error", plane))
+            if one is not None and wanted is not None and one.shape == wanted.shape
+        }
+        high = pictures.top(next(iter(errors.values()))) if errors else 1.0
+        column: list[Slider | Figure] = [_against(scale, key, label, plane, start, wanted)]
+        if wanted is not None and start is not None:
+            column.append(Figure(scale.picture(start, f"{key} {label}: before the first step"), "Start", "", scale.bar))
+        for what, error in errors.items():
+            if what == "Error":
+                column.append(Figure(scale.picture(plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar))
+            column.append(_error(error, high, what, f"{key} {label}: {what.lower()}"))
+        if len(planes) == 1:
+            stacks += [(item,) for item in column]
+        else:
+            stacks.append(tuple(column))
+    return Panel(key, _map_note(result, scale), tuple(stacks), len(planes) == 1)
+
+
+def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray) -> Panel:
+    """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
+    scale = Scale(truth)
+    label, wanted = next(iter(_planes(truth).items()))
+    found = {name: _planes(result).get(label) for name, result in results.items()}
+    errors = {
+        name: pictures.absolute_error(plane, wanted)
+        for name, plane in found.items()
+        if plane is not None and plane.shape == wanted.shape
+    }
+    high = max([pictures.top(error) for error in errors.values()], default=1.0)
+    stacks = []
+    for name, plane in found.items():
+        if plane is None:
+            continue
+        column: list[Slider | Figure] = [_against(scale, key, label, plane, None, wanted, name)]
+        if name in errors:
+            column.append(_error(errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
+        stacks.append(tuple(column))
+    return Panel(key, _map_note(truth, scale), tuple(stacks), False)
+
+
+class Scale:
+    """How one parameter's values become colours; fixed by one array, used for all that are compared with it.
+
+    One channel: false colour over the range of `fixed_by`. Three: sRGB, exposed only where a value passes 1.
+    """
+
+    def __init__(self, fixed_by: np.ndarray):
+        finite = fixed_by[np.isfinite(fixed_by)]
+        self.low, self.high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        self.scalar = fixed_by.ndim == 2 or fixed_by.shape[-1] == 1
+        self.factor = 1.0 if self.scalar or self.high <= 1.0 else pictures.exposure(fixed_by[..., :3])
+        if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
+            self.low, self.high = min(0.0, self.low), max(1.0, self.high)
+
+    def colours(self, plane: np.ndarray) -> np.ndarray:
+        """(H, W, C) values as (H, W, 3) in [0, 1], ready to be seen."""
+        if plane.shape[-1] == 1:
+            return pictures.mapped(plane[..., 0], self.low, self.high, pictures.VALUES)
+        return pictures.srgb(plane[..., :3] * self.factor)
+
+    def picture(self, plane: np.ndarray, alt: str) -> Picture:
+        """The same as a picture of the page."""
+        if plane.shape[-1] == 1:
+            return pictures.false_colour(plane[..., 0], self.low, self.high, pictures.VALUES, alt)
+        return pictures.colour(plane[..., :3], self.factor, alt)
+
+    @property
+    def bar(self) -> ColourBar | None:
+        """The legend, where there is one channel."""
+        return pictures.colour_bar(self.low, self.high, pictures.VALUES, "Value") if self.scalar else None
+
+
+def plane(array: np.ndarray) -> np.ndarray | None:
+    """(H, W, C) of a map: the texture itself or a volume's first middle slice; None for what is no map."""
+    return next(iter(_planes(array).values()), None)
+
+
+def _planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
+    """{label: (H, W, C)}: the texture itself, or a volume's middle slices along its axes."""
+    if array is None or not is_map(array):
+        return {}
+    if array.ndim == 2:
+        return {"": array[..., None]}
+    if array.ndim == 3:
+        return {"": array}
+    found = {}
+    for axis, name in enumerate("zyx"):
+        plane = np.take(array, array.shape[axis] // 2, axis=axis)
+        if min(plane.shape[:2]) > 1:
+            found[f"middle slice along {name}"] = plane
+    return found or {"slice": array.reshape(-1, *array.shape[2:])}
+
+
+def _against(
+    scale: Scale,
+    key: str,
+    label: str,
+    plane: np.ndarray,
+    start: np.ndarray | None,
+    wanted: np.ndarray | None,
+    name: str = "Recovered",
+) -> Slider | Figure:
+    found = scale.picture(plane, f"{key} {label}: {name}")
+    caption = label.capitalize()
+    if wanted is not None:
+        return Slider(scale.picture(wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
+    if start is not None:
+        return Slider(scale.picture(start, f"{key} {label}: start"), found, "Start", name, caption)
+    return Figure(found, caption or name, "", scale.bar)
+
+
+def _error(error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
+    note = f"mean {words.number(_finite_mean(error))}"
+    return Figure(pictures.false_colour_error(error, high, alt), caption, note, pictures.error_bar(high))
+
+
+def _finite_mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def _exposure_note(factor: float) -> str:
+    return f"Exposure ×{words.number(factor)}"
+
+
+def _map_note(array: np.ndarray, scale: Scale) -> str:
+    shape = " × ".join(str(n) for n in array.shape)
+    if scale.scalar:
+        return f"{shape}; colours from {words.number(scale.low)} to {words.number(scale.high)}"
+    return f"{shape}; in sRGB" + (f" at exposure ×{words.number(scale.factor)}" if scale.factor != 1.0 else "")

@@ -1,0 +1,200 @@
+"""Line charts as SVG within the page: the geometry is made here, the drawing and the colours are the template's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from unrender.report import words
+
+WIDTH, HEIGHT = 420, 270
+LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
+_LOGARITHMIC_FROM = 4.0
+_COLOURS = 6
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve; x ascending, all arrays of one length.
+
+    Attributes:
+        name: for the legend.
+        x, y: the curve.
+        low, high: the band around it, or None.
+        colour: which colour of the page, from 0.
+    """
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    colour: int = 0
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A way from values to places in [0, 1], and the marks on it."""
+
+    low: float
+    high: float
+    logarithmic: bool
+    ticks: tuple[tuple[float, str], ...]
+
+    def place(self, values: np.ndarray) -> np.ndarray:
+        """Values beyond the ends stay at the ends."""
+        low, high = self.low, self.high
+        if self.logarithmic:
+            values, low, high = np.log(np.maximum(values, low)), math.log(low), math.log(high)
+        return np.clip((values - low) / (high - low), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line in the chart's own coordinates."""
+
+    name: str
+    path: str
+    band: str
+    colour: int
+
+
+@dataclass(frozen=True)
+class Chart:
+    """What the template draws.
+
+    Attributes:
+        title, x_label: words.
+        description: for those who cannot see it.
+        curves: in drawing order.
+        x_ticks, y_ticks: (place, label).
+        logarithmic: of the vertical axis.
+        more: how many lines were left out.
+    """
+
+    title: str
+    x_label: str
+    description: str
+    curves: tuple[Curve, ...]
+    x_ticks: tuple[tuple[float, str], ...]
+    y_ticks: tuple[tuple[float, str], ...]
+    logarithmic: bool
+    more: int = 0
+    width: int = WIDTH
+    height: int = HEIGHT
+    frame: dict[str, int] = field(
+        default_factory=lambda: {"left": LEFT, "right": WIDTH - RIGHT, "top": TOP, "bottom": HEIGHT - BOTTOM}
+    )
+
+
+def over(axis: str) -> tuple[str, Callable[[float], str]]:
+    """The label of the axis "seconds" or "samples", and what writes its values."""
+    return ("Seconds", words.number) if axis == "seconds" else ("Samples (paths)", words.count)
+
+
+def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
+    """A chart of at most six lines, or None where there is nothing to draw.
+
+    Args:
+        title: of the vertical axis.
+        lines: parts that are not finite leave a gap.
+        axis: the horizontal one, "seconds" or "samples", from 0.
+        end: where it ends.
+    """
+    x_label, mark = over(axis)
+    drawn = [line for line in lines if np.isfinite(line.y).any()]
+    more, drawn = max(0, len(drawn) - _COLOURS), drawn[:_COLOURS]
+    if not drawn:
+        return None
+    end = end if end > 0 else 1.0
+    x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, mark))
+    y_axis = _vertical(drawn)
+    return Chart(
+        title,
+        x_label,
+        "; ".join(f"{line.name}: from {_end(line, 0)} to {_end(line, -1)}" for line in drawn),
+        tuple(_curve(line, x_axis, y_axis) for line in drawn),
+        tuple((float(_across(x_axis, np.array([v]))[0]), label) for v, label in x_axis.ticks),
+        tuple((float(_down(y_axis, np.array([v]))[0]), label) for v, label in y_axis.ticks),
+        y_axis.logarithmic,
+        more,
+    )
+
+
+def is_logarithmic(values: np.ndarray) -> bool:
+    """Whether these values, all finite, are better seen on a logarithmic axis."""
+    return bool(values.size and values.min() > 0 and values.max() / values.min() >= _LOGARITHMIC_FROM)
+
+
+def _vertical(lines: Sequence[Line]) -> Axis:
+    parts = [line.y for line in lines] + [b for line in lines for b in (line.low, line.high) if b is not None]
+    values = np.concatenate([part[np.isfinite(part)] for part in parts])
+    middle = np.concatenate([line.y[np.isfinite(line.y)] for line in lines])
+    if is_logarithmic(middle):
+        # A band that touches zero must not stretch the axis without end.
+        low, high = max(values[values > 0].min(), middle.min() / 10), values.max()
+        low, high = low / (high / low) ** 0.04, high * (high / low) ** 0.04
+        return Axis(low, high, True, _logarithmic_ticks(low, high))
+    low, high = min(values.min(), 0.0) if values.min() < 0.5 * values.max() else values.min(), values.max()
+    span = (high - low) or abs(high) or 1.0
+    low, high = (low if low == 0 else low - 0.05 * span), high + 0.05 * span
+    return Axis(low, high, False, _even_ticks(low, high, 5, words.number))
+
+
+def _even_ticks(low: float, high: float, count: int, mark: Callable[[float], str]) -> tuple[tuple[float, str], ...]:
+    rough = (high - low) / count
+    size = 10.0 ** math.floor(math.log10(rough))
+    step = next(size * factor for factor in (1, 2, 2.5, 5, 10) if size * factor >= rough * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    values = [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
+    return tuple((value, mark(value)) for value in values)
+
+
+def _logarithmic_ticks(low: float, high: float) -> tuple[tuple[float, str], ...]:
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    values: list[float] = []
+    for factors in ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 5, 7)):
+        values = [v for d in decades for v in (10.0**d * f for f in factors) if low <= v <= high]
+        if len(values) >= 3:
+            break
+    every = -(-len(values) // 7)
+    return tuple((value, words.number(value)) for value in values[::every])
+
+
+def _across(axis: Axis, x: np.ndarray) -> np.ndarray:
+    return LEFT + axis.place(x) * (WIDTH - LEFT - RIGHT)
+
+
+def _down(axis: Axis, y: np.ndarray) -> np.ndarray:
+    return HEIGHT - BOTTOM - axis.place(y) * (HEIGHT - TOP - BOTTOM)
+
+
+def _curve(line: Line, x_axis: Axis, y_axis: Axis) -> Curve:
+    band = ""
+    if line.low is not None and line.high is not None:
+        known = np.isfinite(line.low) & np.isfinite(line.high)
+        across = _across(x_axis, line.x[known])
+        there = zip(across, _down(y_axis, line.high[known]), strict=True)
+        back = zip(across[::-1], _down(y_axis, line.low[known])[::-1], strict=True)
+        band = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in [*there, *back]) + "Z" if known.sum() > 1 else ""
+    return Curve(line.name, _path(line, x_axis, y_axis), band, line.colour % _COLOURS)
+
+
+def _path(line: Line, x_axis: Axis, y_axis: Axis) -> str:
+    """Pieces of consecutive finite points; one point alone becomes a dot (a line of no length with a round cap)."""
+    finite = np.isfinite(line.y)
+    across, down = _across(x_axis, line.x), _down(y_axis, np.where(finite, line.y, 1.0))
+    pieces: list[list[str]] = [[]]
+    for known, x, y in zip(finite, across, down, strict=True):
+        if known:
+            pieces[-1].append(f"{x:.1f} {y:.1f}")
+        elif pieces[-1]:
+            pieces.append([])
+    return "".join("M" + "L".join(piece if len(piece) > 1 else piece * 2) for piece in pieces if piece)
+
+
+def _end(line: Line, which: int) -> str:
+    return f"{line.y[np.isfinite(line.y)][which]:.3g}"

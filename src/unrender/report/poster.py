@@ -1,0 +1,103 @@
+"""compare.png: pictures of the first view, the first recovered map, and the curves; for a README or a talk."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+from unrender.report import panels, pictures, plots, words
+from unrender.report.curves import Band
+from unrender.report.equal_time import Comparison, Metric
+
+_COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
+_COLUMNS = 6
+_WIDTH = 10.0
+_CURVES_HEIGHT = 3.4
+
+
+def poster(comparison: Comparison) -> bytes:
+    """A PNG on white ground: a row of pictures, a row of maps (where there are any), a row of curves."""
+    rows = [row[:_COLUMNS] for row in (_pictures(comparison), _maps(comparison)) if row]
+    heights = [_WIDTH / len(row) * row[0][1].shape[0] / row[0][1].shape[1] + 0.3 for row in rows] + [_CURVES_HEIGHT]
+    figure = Figure(figsize=(_WIDTH, sum(heights)), dpi=150, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
+    for i, row in enumerate(rows):
+        columns = grid[i].subgridspec(1, len(row))
+        for j, (title, picture) in enumerate(row):
+            at = figure.add_subplot(columns[j])
+            at.imshow(picture, interpolation="nearest" if max(picture.shape) < 400 else "auto", aspect="auto")
+            at.set_title(_plain(title), fontsize=9)
+            at.set_axis_off()
+    below = grid[len(rows)].subgridspec(1, 2)
+    left = figure.add_subplot(below[0])
+    right = figure.add_subplot(below[1], sharey=left)
+    metric = comparison.metrics[0]
+    _draw(left, metric, "seconds")
+    _draw(right, metric, "samples")
+    right.tick_params(labelleft=False)
+    left.set_title(_plain(metric.title), fontsize=9, loc="left")
+    left.legend(frameon=False, fontsize=9)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
+    first = next(iter(comparison.chosen.values()))
+    if not first.views:
+        return []
+    view, of = next(iter(first.views.items()))
+    factor = pictures.exposure(of.reference)
+    found = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
+    found += [(label, run.views[view].result) for label, run in comparison.chosen.items()]
+    return [(title, pictures.srgb(picture * factor)) for title, picture in found]
+
+
+def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
+    first = next(iter(comparison.chosen.values()))
+    key = next((key for key, truth in first.truth.items() if panels.is_map(truth)), None)
+    if key is None:
+        return []
+    found = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
+    found += [(label, run.parameters[key]) for label, run in comparison.chosen.items()]
+    show = panels.Scale(first.truth[key])
+    return [(title, show.colours(plane)) for title, array in found if (plane := panels.plane(array)) is not None]
+
+
+def _draw(axes: Axes, metric: Metric, over: str) -> None:
+    drawn = []
+    for i, (name, standing) in enumerate(metric.standings.items()):
+        band: Band = getattr(standing, f"over_{over}")
+        finite = np.where(np.isfinite(band.median), band.median, np.nan)
+        high = np.where(np.isfinite(band.high), band.high, finite)
+        colour = _COLOURS[i % len(_COLOURS)]
+        axes.plot(band.x, finite, color=colour, label=_plain(name), linewidth=1.6)
+        axes.fill_between(band.x, band.low, high, color=colour, alpha=0.18, linewidth=0)
+        drawn.append(finite[np.isfinite(finite)])
+    values = np.concatenate(drawn)
+    if plots.is_logarithmic(values):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: words.number(value)))
+    label, mark = plots.over(over)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: mark(value)))
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel(label, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="#edeae4")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _plain(text: str) -> str:
+    """Untrusted text without matplotlib's mathematics, and without a leading underscore, which hides from legends."""
+    short = text if len(text) <= 60 else text[:57] + "…"
+    return short.lstrip("_").replace("$", r"\$")

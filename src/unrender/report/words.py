@@ -1,0 +1,41 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_UNKNOWN = "–"
+
+
+def number(value: float | None) -> str:
+    """Three significant digits: 0.0213, 1.5, −2.27·10⁻⁹, ∞; a dash for what is not known."""
+    if value is None or value != value:
+        return _UNKNOWN
+    sign, size = ("−" if value < 0 else ""), abs(value)
+    if size == float("inf"):
+        return f"{sign}∞"
+    if size == 0 or 1e-4 <= size < 1e5:
+        text = f"{size:.3g}"
+        return sign + (f"{size:.0f}" if "e" in text else text)
+    mantissa, exponent = f"{size:.2e}".split("e")
+    mantissa, power = mantissa.rstrip("0").rstrip("."), "10" + str(int(exponent)).translate(_SUPERSCRIPTS)
+    return sign + (power if mantissa == "1" else f"{mantissa}·{power}")
+
+
+def count(value: float) -> str:
+    """500, 20 k, 1.5 M."""
+    for size, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value:.3g}"
+
+
+def duration(seconds: float | None) -> str:
+    """12.3 s, 3 min 20 s, 1 h 05 min; a dash for what is not known."""
+    if seconds is None:
+        return _UNKNOWN
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.3g} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -1,0 +1,157 @@
+"""Comparing runs: numbers with a closed form, and what is refused or said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from report_folders import KEY, Page, write_run
+
+from unrender import report
+from unrender.errors import InputError
+from unrender.report import groups
+from unrender.report.folder import read
+
+
+def compared(tmp_path: Path, runs: list[Path]) -> dict[str, Any]:
+    report.compare(runs, tmp_path / "out")
+    return json.loads((tmp_path / "out" / "compare.json").read_text())
+
+
+def test_equal_time_numbers_have_their_closed_form(tmp_path):
+    """Errors 0.5 exp(-t / 4) and 0.5 exp(-t / 2), times a factor per seed: medians, ratio and time are known."""
+    runs = []
+    times = {"plain": np.arange(1, 9) * 1.0, "rcv": np.arange(1, 17) * 0.5}
+    for method, rate in (("plain", 0.25), ("rcv", 0.5)):
+        for seed, factor in enumerate((0.7, 1.0, 1.2)):
+            errors = factor * 0.5 * np.exp(-rate * times[method])
+            runs.append(write_run(tmp_path / f"{method}{seed}", method, seed, times[method], errors))
+    found = compared(tmp_path, runs)
+    assert found["first"] == "plain"
+    assert found["seconds"] == 8.0
+    assert [metric["name"] for metric in found["metrics"]] == [KEY, "loss"]
+    by_error = found["metrics"][0]
+    for i, t in enumerate((2.0, 4.0, 8.0)):
+        for method, rate in (("plain", 0.25), ("rcv", 0.5)):
+            moment = by_error["methods"][method]["moments"][i]
+            assert moment["seconds"] == t
+            assert moment["error"]["median"] == pytest.approx(0.5 * np.exp(-rate * t), rel=1e-5)
+            assert moment["error"]["low"] == pytest.approx(0.35 * np.exp(-rate * t), rel=1e-5)
+            assert moment["error"]["high"] == pytest.approx(0.6 * np.exp(-rate * t), rel=1e-5)
+            assert moment["ratio"] == pytest.approx(1.0 if method == "plain" else np.exp(-0.25 * t), rel=1e-5)
+    assert by_error["best_of_first"] == pytest.approx(0.5 * np.exp(-2.0), rel=1e-6)
+    reached = by_error["methods"]["rcv"]["reached"]
+    assert reached["seconds"] == 4.0  # exp(-4 / 2) = exp(-8 / 4)
+    assert reached["speedup"] == 2.0
+    assert (reached["fastest"], reached["slowest"], reached["count"]) == (3.5, 4.5, 3)
+    assert by_error["methods"]["plain"]["reached"]["count"] == 2  # the third seed never came to the median
+    assert (tmp_path / "out" / "compare.png").read_bytes().startswith(b"\x89PNG")
+    page = Page(tmp_path / "out" / "compare.html")
+    assert page.dangers() == []
+    assert "2× as fast" in page.words
+    assert "plain seed 1 (8 s), rcv seed 1 (8 s)" in page.words  # the median runs are the ones pictured
+
+
+def test_a_first_method_that_never_improves_gives_no_speedup(tmp_path):
+    runs = [
+        write_run(tmp_path / "plain", "plain", errors=(0.6, 0.7, 0.8, 0.9)),
+        write_run(tmp_path / "rcv", "rcv"),
+    ]
+    found = compared(tmp_path, runs)["metrics"][0]
+    assert found["first_improves"] is False
+    assert found["methods"]["rcv"]["reached"]["speedup"] is None
+    assert "never got below where it began" in Page(tmp_path / "out" / "compare.html").words
+
+
+def test_a_level_never_reached_is_null(tmp_path):
+    runs = [write_run(tmp_path / "rcv", "rcv"), write_run(tmp_path / "plain", "plain", errors=(0.5, 0.45, 0.45, 0.4))]
+    reached = compared(tmp_path, runs)["metrics"][0]["methods"]["plain"]["reached"]
+    assert reached["seconds"] is None
+    assert reached["count"] == 0
+    assert "not reached" in Page(tmp_path / "out" / "compare.html").words
+
+
+def test_several_parameters_come_with_their_mean_relative_error(tmp_path):
+    truth = {"a": np.zeros(4), "b": np.zeros(4)}
+    initial = {"a": np.full(4, 2.0), "b": np.full(4, 0.5)}
+    runs = [write_run(tmp_path / m, m, errors=(0.5, 0.5, 0.5, 0.25), truth=truth, initial=initial) for m in ("x", "y")]
+    metrics = compared(tmp_path, runs)["metrics"]
+    assert [metric["name"] for metric in metrics] == ["relative parameter error", "loss", "a", "b"]
+    last = metrics[0]["methods"]["x"]["moments"][-1]["error"]["median"]
+    assert last == pytest.approx((0.25 / 2.0 + 0.25 / 0.5) / 2)
+
+
+def test_without_truth_the_loss_is_compared(tmp_path):
+    alone = {"initial": {KEY: np.zeros((4, 4, 3))}, "parameters": {KEY: np.ones((4, 4, 3))}, "truth": {}, "views": {}}
+    found = compared(tmp_path, [write_run(tmp_path / m, m, **alone) for m in ("x", "y")])
+    assert [metric["name"] for metric in found["metrics"]] == ["loss"]
+    assert found["methods"][0]["image_error"]["median"] is None
+
+
+def test_runs_are_grouped_by_method_and_settings_but_not_by_seed_or_budget(tmp_path):
+    def run(name: str, method: str, seed: int, settings: dict[str, Any]) -> Path:
+        return write_run(tmp_path / name, method, seed, settings=settings)
+
+    runs = [
+        run("a", "plain", 0, {"spp": 4, "steps": 10, "estimator": "PathGradient(image=Plain(), spp=4)"}),
+        run("b", "plain", 1, {"spp": 4, "steps": 20, "estimator": "PathGradient(image=Plain(), spp=4)"}),
+        run("c", "plain", 0, {"spp": 8, "steps": 10, "estimator": "PathGradient(image=Plain(), spp=8)"}),
+        run("d", "rcv", 0, {"spp": 2, "steps": 10}),
+    ]
+    found = groups.group([read(path) for path in runs])
+    assert [(group.label, len(group.runs)) for group in found] == [
+        ("plain (spp 4)", 2),
+        ("plain (spp 8)", 1),
+        ("rcv", 1),
+    ]
+
+
+def test_what_weakens_a_comparison_is_said(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", "plain", 0),
+        write_run(tmp_path / "b", "plain", 0),
+        write_run(
+            tmp_path / "c",
+            "rcv",
+            0,
+            hardware={"processor": "another"},
+            stopped="interrupted",
+            warnings=["mind the gap"],
+        ),
+    ]
+    notices = " ".join(compared(tmp_path, runs)["notices"])
+    for part in ("share a seed", "different hardware", "interrupted", "mind the gap"):
+        assert part in notices
+    assert compared(tmp_path, [write_run(tmp_path / m, m) for m in ("x", "y")])["notices"] == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"truth": {"other.data": np.zeros((4, 5, 3))}}, "only one of them recovers"),
+        ({"views": {f"view0/{k}": np.ones((3, 4, 3)) for k in ("reference", "result")}}, "view 0 is 4 × 3, not 8 × 6"),
+        ({"views": {}}, "view 0 is missing"),
+        ({"times": (), "errors": (0.1,)[:0], "parameters": {KEY: np.ones((4, 5, 3))}}, "no step was taken"),
+    ],
+)
+def test_runs_of_another_problem_are_refused(tmp_path, change, message):
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **change)]
+    with pytest.raises(InputError, match=message) as raised:
+        report.compare(runs, tmp_path / "out")
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_compare_refuses_nothing_twice_and_a_file_in_its_place(tmp_path):
+    run = write_run(tmp_path / "a")
+    with pytest.raises(InputError, match="at least one"):
+        report.compare([], tmp_path / "out")
+    with pytest.raises(InputError, match="given twice"):
+        report.compare([run, run], tmp_path / "out")
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="cannot be written"):
+        report.compare([run], tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
