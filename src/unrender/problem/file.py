@@ -176,7 +176,7 @@ def _explain(detail: Any) -> tuple[Place, str]:
         names = ", ".join(fields)
         return place, f"no such field{did_you_mean(str(name), fields) or f'; there are {names}'}"
     expected = fields[str(name)].description if name in fields else "a table"
-    if detail["type"] == "missing":
+    if detail["type"] == "missing" and len(detail["loc"]) == len(place):
         return place, f"missing, expected {expected}"
     got = repr(detail["input"])
     return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"

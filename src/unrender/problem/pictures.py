@@ -100,7 +100,7 @@ def _read(path: Path, linearise: bool) -> Picture:
     try:
         bitmap = mi.Bitmap(str(path))
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-            bitmap = _colour_layer(bitmap)
+            return Picture(_colour_channels(bitmap))
         encoded = bool(bitmap.srgb_gamma())
         bits = 8 * np.array(bitmap).itemsize
         single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
@@ -116,13 +116,12 @@ def _read(path: Path, linearise: bool) -> Picture:
     return Picture(values, f"{bits}-bit sRGB, linearised" if encoded and linearise else "")
 
 
-def _colour_layer(bitmap: Any) -> Any:
-    """The layer without a name of an EXR file of many layers, as Mitsuba's own `aov` integrator writes it."""
-    layers = dict(bitmap.split())
-    for name in ("<root>", ""):
-        if name in layers and layers[name].channel_count() in (3, 4):
-            return layers[name]
-    raise InputError(f"has layers {', '.join(sorted(layers))[:200]} but no plain R, G, B channels")
+def _colour_channels(bitmap: Any) -> np.ndarray:
+    """R, G and B of an EXR file of many channels, such as Mitsuba's own `aov` integrator writes: (H, W, 3)."""
+    names = [field.name for field in bitmap.struct_()]
+    if not {"R", "G", "B"} <= set(names):
+        raise InputError(f"has the channels {', '.join(names)[:200]}, but not R, G and B")
+    return np.array(bitmap)[..., [names.index(name) for name in "RGB"]].astype(np.float32)
 
 
 def _from_array(array: np.ndarray, linearise: bool) -> Picture:

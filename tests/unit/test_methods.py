@@ -1,0 +1,110 @@
+"""Methods by name: their options, and the words for wrong ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from unrender.errors import InputError
+from unrender.gradients.path import PathGradient
+from unrender.images import Plain, RecursiveControlVariate
+from unrender.methods import METHODS, method, parse_schedule
+from unrender.optimizers import Adam, schedules
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_starts_with_its_defaults_and_documents_them(name: str):
+    made = method(name)
+    estimator, optimizer = made.start()
+    assert optimizer.requires <= estimator.provides
+    assert made.summary
+    for option, field in made.options.model_fields.items():
+        assert field.description
+        assert not field.is_required()
+        assert made.expected(option)
+
+
+def test_plain_takes_its_options():
+    estimator, optimizer = method("plain").start({"spp": "16", "learning_rate": "0.5", "schedule": "cosine(10, 0.25)"})
+    assert estimator == PathGradient(Plain(), spp=16)
+    assert optimizer == Adam(0.5, schedule=schedules.Cosine(10, 0.25))
+
+
+def test_rcv_takes_its_options():
+    options = {"spp": 3, "adjoint_spp": "1", "space": "primary", "alpha": 0.5, "beta": "0.75", "beta_1": "0.8"}
+    estimator, optimizer = method("rcv").start(options)
+    assert estimator == PathGradient(RecursiveControlVariate("primary", 0.5, 0.75), spp=3, adjoint_spp=1)
+    assert optimizer == Adam(beta_1=0.8)
+
+
+def test_none_is_none():
+    assert method("plain").configure({"adjoint_spp": "none", "schedule": "None"}) == method("plain").configure({})
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("plain", {"sp": 1}, "method plain has no option sp; did you mean spp?"),
+        ("plain", {"space": "path"}, "method plain has no option space; it has learning_rate, "),
+        ("plain", {"spp": "-2"}, "method plain: option spp: expected a whole number above 0, got '-2'"),
+        ("plain", {"spp": "2.5"}, "option spp: expected a whole number above 0, got '2.5'"),
+        ("plain", {"spp": ""}, "option spp: expected a whole number above 0, got ''"),
+        ("plain", {"adjoint_spp": "0"}, "option adjoint_spp: expected a whole number above 0 or none, got '0'"),
+        ("plain", {"learning_rate": "0"}, "option learning_rate: expected a number above 0, got '0'"),
+        ("plain", {"learning_rate": "nan"}, "option learning_rate: expected a number above 0, got 'nan'"),
+        ("plain", {"learning_rate": "inf"}, "option learning_rate: expected a number above 0, got 'inf'"),
+        ("plain", {"learning_rate": "fast"}, "option learning_rate: expected a number above 0, got 'fast'"),
+        ("plain", {"beta_1": "1"}, "option beta_1: expected a number of at least 0 and below 1, got '1'"),
+        ("rcv", {"space": "paths"}, "method rcv: option space: expected path or primary, got 'paths'"),
+        ("plain", {"schedule": "cosin(3)"}, "method plain: schedule: unknown 'cosin'; did you mean cosine?"),
+    ],
+)
+def test_refuses_options(name: str, settings: dict[str, Any], message: str):
+    with pytest.raises(InputError) as caught:
+        method(name).start(settings)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_methods_get_a_suggestion():
+    with pytest.raises(InputError, match=r"unknown method rvc; did you mean rcv\?"):
+        method("rvc")
+    with pytest.raises(InputError, match=r"unknown method zzz; there are plain, rcv"):
+        method("zzz")
+
+
+@pytest.mark.parametrize(
+    ("text", "schedule"),
+    [
+        ("constant", schedules.Constant()),
+        ("constant()", schedules.Constant()),
+        (" Exponential( 100 ) ", schedules.Exponential(100)),
+        ("steps(50)", schedules.Steps(50)),
+        ("steps(50, 0.1)", schedules.Steps(50, 0.1)),
+        ("warmup(20)", schedules.Warmup(20)),
+        ("warmup(20) then cosine(280)", schedules.Warmup(20, schedules.Cosine(280))),
+        ("warmup(2) then warmup(3) then constant(2)", schedules.Warmup(2, schedules.Warmup(3, schedules.Constant(2)))),
+        (None, None),
+    ],
+)
+def test_schedules_are_read(text: str | None, schedule: Any):
+    assert parse_schedule(text) == schedule
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "schedule: unknown ''"),
+        ("((", "schedule: unknown '\\(\\('"),
+        ("cosine", r"expected cosine\(steps, floor\), got 'cosine'"),
+        ("cosine(1, 2, 3)", r"expected cosine\(steps, floor\)"),
+        ("cosine(-3)", "steps must be a whole number of at least 1"),
+        ("cosine(x)", "expected a number, got 'x'"),
+        ("steps(3) then steps(4)", "only warmup"),
+        ("warmup(3) then", "unknown ''"),
+    ],
+)
+def test_schedules_are_refused(text: str, message: str):
+    with pytest.raises(InputError, match=message):
+        parse_schedule(text)

@@ -1,0 +1,275 @@
+"""A problem: what it takes, what it refuses and in which words, and the arithmetic of its loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unrender import losses
+from unrender.errors import InputError
+from unrender.preconditioners import LargeSteps
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.analytic import AnalyticRenderer
+from unrender.rendering.port import ParameterInfo
+
+HEIGHT, WIDTH = 4, 5
+PIXELS = HEIGHT * WIDTH * 3
+
+
+class Renderer(AnalyticRenderer):
+    """With a colour, a texture, a number, and one parameter that has no gradient."""
+
+    def __init__(self, sensors: int = 2):
+        values = {
+            "wall.value": np.array([0.2, 0.4, 0.6]),
+            "floor.data": np.full((2, 2, 3), 0.5),
+            "lamp.scale": np.array(2.0),
+            "lens.eta": np.array(1.5),
+        }
+        matrix = np.random.default_rng(0).random((PIXELS, 3 + 12 + 1 + 1))
+        super().__init__(values, matrix, shape=(HEIGHT, WIDTH), sensors=sensors)
+
+    def parameters(self) -> dict[str, ParameterInfo]:
+        known = dict(super().parameters())
+        known["wall.value"] = ParameterInfo((3,), lowest=0.0, highest=1.0)
+        known["floor.data"] = ParameterInfo((2, 2, 3), lowest=0.0, highest=1.0)
+        known["lens.eta"] = ParameterInfo((), False, False, "it bends rays")
+        return known
+
+
+REFERENCE = np.random.default_rng(1).random((HEIGHT, WIDTH, 3)).astype(np.float32)
+WALL = Parameter("wall.value")
+VIEW = View(REFERENCE)
+
+
+def problem(parameters: Any = (WALL,), views: Any = (VIEW,), **more: Any) -> Problem:
+    return Problem(Renderer(), parameters, views, **more)
+
+
+# ------------------------------------------------------------------ what it makes of its input
+
+
+def test_takes_the_scenes_own_values_and_physical_bounds_by_default():
+    made = problem([WALL, Parameter("lamp.scale")])
+    np.testing.assert_allclose(made.initial()["wall.value"], [0.2, 0.4, 0.6])
+    assert made.bounds == {"wall.value": (0.0, 1.0), "lamp.scale": (None, None)}
+    assert made.learning_rates == {}
+    assert made.preconditioners == {}
+    assert made.truth == {}
+    assert made.notices == []
+
+
+@pytest.mark.parametrize(
+    ("key", "initial", "expected"),
+    [
+        ("wall.value", 0.25, [0.25] * 3),
+        ("wall.value", [0.1, 0.2, 0.3], [0.1, 0.2, 0.3]),
+        ("wall.value", np.float64(0.25), [0.25] * 3),
+        ("floor.data", 0.25, np.full((2, 2, 3), 0.25)),
+        ("floor.data", (0.1, 0.2, 0.3), np.tile([0.1, 0.2, 0.3], (2, 2, 1))),
+        ("floor.data", np.arange(12).reshape(2, 2, 3) / 12, np.arange(12).reshape(2, 2, 3) / 12),
+        ("lamp.scale", 3, 3.0),
+        ("lamp.scale", [3.0], 3.0),
+    ],
+)
+def test_initial_fills_the_parameters_shape(key: str, initial: Any, expected: Any):
+    found = problem([Parameter(key, initial)]).initial()[key]
+    assert np.shape(found) == np.shape(expected)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_initial_is_a_copy_each_time():
+    given = np.full((2, 2, 3), 0.5)
+    made = problem([Parameter("floor.data", given)])
+    given[:] = 0.1
+    made.initial()["floor.data"][:] = 0.9
+    np.testing.assert_allclose(made.initial()["floor.data"], 0.5)
+
+
+def test_initial_is_moved_into_the_bounds_and_says_so():
+    made = problem([Parameter("wall.value", [-1.0, 0.5, 2.0], bounds=(0.1, 0.9))])
+    np.testing.assert_allclose(made.initial()["wall.value"], [0.1, 0.5, 0.9])
+    assert made.notices == ["parameter wall.value: 2 of 3 initial values moved into the bounds [0.1, 0.9]"]
+
+
+@pytest.mark.parametrize(
+    ("bounds", "kept"),
+    [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None))],
+)
+def test_given_bounds_replace_the_physical_ones(bounds: Any, kept: Any):
+    assert problem([Parameter("wall.value", bounds=bounds)]).bounds["wall.value"] == kept
+
+
+def test_keeps_rates_and_preconditioners_by_key():
+    smooth = LargeSteps(5.0)
+    made = problem([Parameter("wall.value", learning_rate=1), Parameter("floor.data", preconditioner=smooth)])
+    assert made.learning_rates == {"wall.value": 1.0}
+    assert made.preconditioners == {"floor.data": smooth}
+
+
+def test_references_are_float32_and_alpha_is_dropped():
+    rgba = np.concatenate([REFERENCE, np.zeros((HEIGHT, WIDTH, 1))], axis=2)
+    grey = REFERENCE[..., 0].astype(np.float64)
+    made = problem(views=[View(rgba), View(grey, sensor=1)])
+    assert [view.reference.dtype for view in made.views] == [np.float32] * 2  # pyright: ignore
+    np.testing.assert_array_equal(made.views[0].reference, REFERENCE)
+    np.testing.assert_array_equal(made.views[1].reference, np.repeat(REFERENCE[..., :1], 3, axis=2))
+
+
+def test_eight_bit_values_are_linearised_and_it_says_so():
+    made = problem(views=[View(np.full((HEIGHT, WIDTH, 3), 188, np.uint8))])
+    np.testing.assert_allclose(np.asarray(made.views[0].reference), 0.5029, atol=1e-4)  # sRGB 188 is half the light
+    assert made.notices == ["view 0: reference 8-bit sRGB, linearised"]
+
+
+def test_eight_bit_masks_are_taken_as_they_are():
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[0] = 51
+    made = problem(views=[View(REFERENCE, mask=mask)])
+    np.testing.assert_allclose(np.asarray(made.views[0].mask), mask / 255)
+    assert made.notices == []
+
+
+def test_one_view_or_parameter_may_be_given_bare():
+    made = problem(WALL, VIEW)
+    assert (len(made.parameters), len(made.views)) == (1, 1)
+
+
+def test_truth_takes_what_initial_takes():
+    made = problem([WALL, Parameter("floor.data")], truth={"floor.data": [0.1, 0.2, 0.3]})
+    assert made.truth["floor.data"].shape == (2, 2, 3)
+    point = {"wall.value": np.zeros(3), "floor.data": made.truth["floor.data"] + np.array([0.0, 0.0, 0.3])}
+    assert made.parameter_error(point) == {"floor.data": pytest.approx(0.3 / np.sqrt(3), rel=1e-5)}
+
+
+# ------------------------------------------------------------------ the loss
+
+
+@pytest.mark.parametrize("loss", [losses.L1(), losses.L2(), losses.RelativeL2(), losses.Huber()])
+def test_loss_derivative_is_the_derivative_of_the_total(loss: losses.Loss):
+    rng = np.random.default_rng(2)
+    mask = rng.random((HEIGHT, WIDTH))
+    made = problem(views=[View(REFERENCE, weight=2.5, mask=mask), View(REFERENCE, sensor=1)], loss=loss)
+    for view in (0, 1):
+        image = REFERENCE + rng.normal(0, 0.3, REFERENCE.shape)
+        slope = made.loss_derivative(view, image)
+        assert slope.shape == image.shape
+        for place in [(0, 0, 0), (3, 4, 2), (1, 2, 1)]:
+            step = np.zeros_like(image)
+            step[place] = 1e-5
+            difference = made.loss_value(view, image + step) - made.loss_value(view, image - step)
+            assert slope[place] == pytest.approx(difference / 2e-5, rel=1e-5, abs=1e-9)
+
+
+def test_loss_is_the_weighted_mean_over_pixels_and_channels():
+    mask = np.zeros((HEIGHT, WIDTH))
+    mask[0, 0] = 0.5
+    made = problem(views=[View(REFERENCE, weight=3.0, mask=mask)])
+    assert made.loss_value(0, REFERENCE.astype(float) + 2.0) == pytest.approx(3.0 * 0.5 * 4.0 / (HEIGHT * WIDTH))
+    assert problem().loss_value(0, REFERENCE.astype(float) + 2.0) == pytest.approx(4.0)
+
+
+# ------------------------------------------------------------------ what it refuses
+
+BAD_PARAMETERS: list[tuple[Parameter, str]] = [
+    (Parameter("wall.valu"), r"parameters\[0\]\.key: the scene has no parameter wall.valu; did you mean wall.value\?"),
+    (Parameter("zzz"), r"the scene has no parameter zzz; it has wall.value, floor.data, lamp.scale"),
+    (Parameter("lens.eta"), r"lens.eta cannot be recovered by gradients: it bends rays"),
+    (Parameter("wall.value", [1.0, 2.0]), r"parameter wall.value: initial: expected .* got an array of shape \(2,\)"),
+    (
+        Parameter("floor.data", np.zeros((3, 2, 3))),
+        r"initial: expected .*\(2, 2, 3\), got an array of shape \(3, 2, 3\)",
+    ),
+    (Parameter("lamp.scale", [1.0, 2.0, 3.0]), r"initial: expected a number, got an array of shape \(3,\)"),
+    (Parameter("wall.value", float("nan")), "initial: must be finite"),
+    (Parameter("wall.value", [0.1, float("inf"), 0.2]), "initial: must be finite"),
+    (Parameter("wall.value", 1e300), "initial: must be finite"),
+    (Parameter("wall.value", "no-such-picture.png"), "initial: no-such-picture.png: no such file"),
+    (Parameter("wall.value", [[0.1], [0.2, 0.3]]), "initial: expected a number, a colour"),
+    (Parameter("wall.value", True), "initial: expected a number, a colour"),
+    (Parameter("wall.value", 1j), "initial: expected a number, a colour"),  # pyright: ignore
+    (Parameter("wall.value", bounds=(1.0, 0.0)), "bounds: low must be less than high, got 1 and 0"),
+    (Parameter("wall.value", bounds=(1.0, 1.0)), "bounds: low must be less than high"),
+    (Parameter("wall.value", bounds=(np.inf, None)), "bounds: low must be less than high"),
+    (Parameter("wall.value", bounds=(0.0, float("nan"))), "bounds: expected two numbers or None, got nan"),
+    (Parameter("wall.value", bounds=(0.0,)), "bounds: expected"),  # pyright: ignore
+    (Parameter("wall.value", bounds="01"), "bounds: expected"),  # pyright: ignore
+    (Parameter("wall.value", learning_rate=0.0), "learning_rate: expected a number above 0, got 0.0"),
+    (Parameter("wall.value", learning_rate=float("nan")), "learning_rate: expected a number above 0, got nan"),
+    (Parameter("wall.value", preconditioner=LargeSteps(1.0)), "wall.value: preconditioner: LargeSteps needs a texture"),
+    (Parameter("floor.data", preconditioner=LargeSteps), "preconditioner: expected one of"),  # pyright: ignore
+]
+
+
+@pytest.mark.parametrize(("parameter", "message"), BAD_PARAMETERS)
+def test_refuses_parameters(parameter: Parameter, message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        problem([parameter])
+    assert "\n" not in str(caught.value)
+
+
+def nan_at(row: int, column: int) -> np.ndarray:
+    picture = REFERENCE.copy()
+    picture[row, column, 1] = np.nan
+    return picture
+
+
+BAD_VIEWS = [
+    (View(REFERENCE, sensor=2), r"view 0: sensor: expected 0 to 1, got 2"),
+    (View(REFERENCE, sensor=-1), r"sensor: expected 0 to 1, got -1"),
+    (View(REFERENCE, sensor=0.0), r"sensor: expected 0 to 1, got 0.0"),  # pyright: ignore
+    (View(REFERENCE, weight=0.0), r"weight: expected a number above 0, got 0.0"),
+    (View(REFERENCE, weight=float("inf")), r"weight: expected a number above 0, got inf"),
+    (View(REFERENCE[:3]), r"view 0: reference: 5x3 pixels \(width x height\), but the film of sensor 0 is 5x4"),
+    (View(np.zeros((HEIGHT, WIDTH, 2))), r"reference: expected an array of shape \(H, W, 3\), got \(4, 5, 2\)"),
+    (View(np.zeros((0, WIDTH, 3))), r"reference: expected an array of shape \(H, W, 3\)"),
+    (View(nan_at(2, 3)), r"reference: 1 pixels are NaN or infinite, the first in row 2, column 3"),
+    (View(np.full((HEIGHT, WIDTH, 3), "a")), r"reference: expected an array of numbers"),
+    (View(REFERENCE.astype(complex)), r"reference: expected an array of real numbers"),
+    (View("nowhere.exr"), r"view 0: reference: nowhere.exr: no such file"),
+    (View(None), r"view 0: reference: expected"),  # pyright: ignore
+    (View(REFERENCE, mask=np.ones((HEIGHT, WIDTH + 1))), r"view 0: mask: 6x4 pixels"),
+    (View(REFERENCE, mask=np.full((HEIGHT, WIDTH), 2.0)), r"mask: expected values from 0 to 1, got 2 to 2"),
+    (View(REFERENCE, mask=np.full((HEIGHT, WIDTH), -0.5)), r"mask: expected values from 0 to 1"),
+    (View(REFERENCE, mask=np.zeros((HEIGHT, WIDTH))), r"mask: it is 0 everywhere"),
+]
+
+
+@pytest.mark.parametrize(("view", "message"), BAD_VIEWS)
+def test_refuses_views(view: View, message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        problem(views=[view])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"parameters": []}, "parameters: expected at least one Parameter, got none"),
+        ({"parameters": ["wall.value"]}, r"parameters\[0\]: expected a Parameter, got str"),
+        ({"parameters": "wall.value"}, "parameters: expected a list of Parameter, got str"),
+        ({"parameters": [WALL, Parameter("floor.data"), WALL]}, r"parameters\[2\]\.key: wall.value is given twice"),
+        ({"views": []}, "views: expected at least one View, got none"),
+        ({"views": [REFERENCE]}, r"views\[0\]: expected a View, got ndarray"),
+        ({"loss": losses.L1}, "loss: expected one of unrender.losses"),
+        ({"loss": "L1"}, "loss: expected one of unrender.losses"),
+        ({"max_depth": 0}, "max_depth: expected a whole number of at least 1, got 0"),
+        ({"max_depth": -1}, "max_depth: expected a whole number of at least 1, got -1"),
+        ({"max_depth": 2.5}, "max_depth: expected a whole number of at least 1, got 2.5"),
+        ({"truth": {"wall.valu": 0.5}}, r"truth\.wall\.valu: not one of the parameters; did you mean wall.value\?"),
+        ({"truth": {"wall.value": [0.5, 0.5]}}, r"truth\.wall\.value: expected"),
+    ],
+)
+def test_refuses(arguments: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        problem(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_refuses_a_scene_that_is_none():
+    with pytest.raises(InputError, match=r"scene: expected an \.xml file, a Mitsuba dictionary or a function, got int"):
+        Problem(3, [WALL], [VIEW])  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,143 @@
+"""Reading pictures: every format as linear values, and one clear line for those that cannot be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from unrender.errors import InputError
+from unrender.problem import pictures, values
+
+COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
+
+
+def bitmap(array: np.ndarray, path: Path) -> Path:
+    mi.Bitmap(array).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("a.exr", 1e-6), ("a.hdr", 1e-2), ("a.pfm", 1e-6)])
+def test_reads_linear_files_as_they_are(tmp_path: Path, name: str, tolerance: float):
+    picture = pictures.read(bitmap(COLOURS, tmp_path / name))
+    assert picture.notice == ""
+    assert picture.values.dtype == np.float32
+    np.testing.assert_allclose(picture.values, COLOURS, atol=tolerance)
+
+
+def test_reads_npy(tmp_path: Path):
+    np.save(tmp_path / "a.npy", COLOURS.astype(np.float64))
+    np.testing.assert_array_equal(pictures.read(tmp_path / "a.npy").values, COLOURS)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_linearises_png(tmp_path: Path, bits: int):
+    levels = np.linspace(0, 2**bits - 1, 6 * 8 * 3).reshape(6, 8, 3).astype(f"uint{bits}")
+    picture = pictures.read(bitmap(levels, tmp_path / "a.png"))
+    assert picture.notice == f"a.png: {bits}-bit sRGB, linearised"
+    encoded = levels / (2**bits - 1)
+    np.testing.assert_allclose(picture.values, pictures.srgb_to_linear(encoded), atol=2e-6)
+    np.testing.assert_allclose(pictures.read(tmp_path / "a.png", linearise=False).values, encoded, atol=1e-6)
+
+
+def test_reads_jpeg_and_upper_case_endings(tmp_path: Path):
+    Image.fromarray(np.full((6, 8, 3), 188, np.uint8)).save(tmp_path / "A.JPG")
+    picture = pictures.read(str(tmp_path / "A.JPG"))
+    assert picture.notice == "A.JPG: 8-bit sRGB, linearised"
+    np.testing.assert_allclose(picture.values, 0.5029, atol=5e-3)
+
+
+def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):
+    rgba = np.concatenate([COLOURS, np.full((6, 8, 1), 0.25, np.float32)], axis=2)
+    np.testing.assert_array_equal(pictures.read(bitmap(rgba, tmp_path / "a.exr")).values, COLOURS)
+    assert pictures.read(bitmap(COLOURS[..., :1], tmp_path / "g.exr")).values.shape == (6, 8, 1)
+
+
+def test_takes_the_colours_of_a_file_of_many_layers(tmp_path: Path):
+    layers = np.concatenate([COLOURS, np.full((6, 8, 1), 9, np.float32)], axis=2)
+    names = ["R", "G", "B", "depth.T"]
+    mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(pictures.read(tmp_path / "a.exr").values, COLOURS)
+
+
+def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):
+    layers = np.zeros((6, 8, 4), np.float32)
+    names = ["a.X", "a.Y", "b.Z", "b.W"]
+    mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match=r"a\.exr: has the channels .*a\.X.*, but not R, G and B"):
+        pictures.read(tmp_path / "a.exr")
+
+
+def test_refuses_what_is_no_picture(tmp_path: Path):
+    for name in ("a.png", "a.jpg", "a.exr", "a.hdr", "a.npy"):
+        (tmp_path / name).write_bytes(b"this is not a picture at all")
+        with pytest.raises(InputError, match=rf"{name}: .*(cannot be read|not a readable)") as caught:
+            pictures.read(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+def test_refuses_a_file_cut_short(tmp_path: Path):
+    whole = bitmap(np.zeros((64, 64, 3), np.uint8), tmp_path / "whole.png").read_bytes()
+    (tmp_path / "half.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"half\.png: cannot be read"):
+        pictures.read(tmp_path / "half.png")
+
+
+def test_never_unpickles(tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match=r"a\.npy: not a readable NumPy array"):
+        pictures.read(tmp_path / "a.npy")
+
+
+def test_refuses_folders_and_unknown_endings(tmp_path: Path):
+    (tmp_path / "a.gif").write_bytes(b"GIF89a")
+    with pytest.raises(InputError, match=r"a\.gif: unknown kind of picture, expected one of \.exr"):
+        pictures.read(tmp_path / "a.gif")
+    with pytest.raises(InputError, match="not a file"):
+        pictures.read(tmp_path)
+
+
+def test_names_the_first_pixel_that_is_not_finite(tmp_path: Path):
+    broken = COLOURS.copy()
+    broken[4, 5] = np.inf
+    with pytest.raises(InputError, match=r"a\.exr: 1 pixels are NaN or infinite, the first in row 4, column 5"):
+        pictures.read(bitmap(broken, tmp_path / "a.exr"))
+
+
+# ------------------------------------------------------------------ pictures as initial values
+
+
+def test_scales_a_picture_to_the_parameter(tmp_path: Path):
+    ramp = np.broadcast_to(np.linspace(0, 1, 32, dtype=np.float32)[:, None, None], (32, 32, 3))
+    filled, notice = values.fill(bitmap(np.array(ramp), tmp_path / "a.exr"), (8, 4, 3))
+    assert notice == "a.exr: scaled from 32x32 to 4x8"
+    assert filled.shape == (8, 4, 3)
+    np.testing.assert_allclose(filled[1:-1, 0, 0], ((np.arange(8) + 0.5) / 8)[1:-1], atol=0.02)
+    assert filled.mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_fits_channels(tmp_path: Path):
+    path = bitmap(COLOURS, tmp_path / "a.exr")
+    grey, notice = values.fill(path, (6, 8, 1))
+    assert notice == "a.exr: reduced to its luminance"
+    np.testing.assert_allclose(grey[..., 0], COLOURS @ [0.212671, 0.71516, 0.072169], rtol=1e-5)
+    four, _ = values.fill(path, (6, 8, 4))
+    np.testing.assert_array_equal(four[..., :3], COLOURS)
+    np.testing.assert_array_equal(four[..., 3], 1)
+    three, _ = values.fill(bitmap(COLOURS[..., :1], tmp_path / "g.exr"), (6, 8, 3))
+    np.testing.assert_array_equal(three, np.repeat(COLOURS[..., :1], 3, axis=2))
+
+
+def test_npy_fills_any_shape(tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.arange(24.0).reshape(2, 3, 4, 1))
+    assert values.fill(tmp_path / "a.npy", (2, 3, 4, 1))[0].shape == (2, 3, 4, 1)
+    with pytest.raises(InputError, match=r"a\.npy: expected .* got an array of shape \(2, 3, 4, 1\)"):
+        values.fill(tmp_path / "a.npy", (2, 3, 5, 1))
+
+
+def test_a_picture_cannot_fill_a_volume(tmp_path: Path):
+    with pytest.raises(InputError, match=r"a picture cannot fill a parameter of shape \(3,\)"):
+        values.fill(bitmap(COLOURS, tmp_path / "a.exr"), (3,))
