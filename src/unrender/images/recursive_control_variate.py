@@ -125,7 +125,8 @@ class RecursiveControlVariate:
             welford.covariance(seen.joint),
             memory.relative_variance * var_previous,
         )
-        relative = arrays.where(var_current > 0, variance / var_current, 1.0)
+        known = var_current > 0
+        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), 1.0)
         estimate = ImageEstimate(images, rendering.paths, {"control_weight": weight, "variance": variance})
         return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender import files
 from unrender.errors import InputError
 from unrender.variant import current
 
@@ -78,8 +79,8 @@ class Result:
             if self.pictures:
                 _write_arrays(folder / "pictures.npz", self.pictures)
             lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in map(_without_nan, self.history))
-            _write(folder / "history.jsonl", lines.encode())
-            _write(folder / "run.json", (json.dumps(self._summary(), indent=2) + "\n").encode())
+            files.write(folder / "history.jsonl", lines.encode())
+            files.write(folder / "run.json", (json.dumps(self._summary(), indent=2) + "\n").encode())
         except OSError as error:
             raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
         return folder
@@ -132,17 +133,13 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _without_nan(record: dict[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in record.items()}
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _without_nan(v) for k, v in value.items()}
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
-    _write(path, buffer.getvalue())
-
-
-def _write(path: Path, data: bytes) -> None:
-    beside = path.with_name(path.name + ".part")
-    beside.write_bytes(data)
-    beside.replace(path)
+    files.write(path, buffer.getvalue())

@@ -1,0 +1,268 @@
+"""Every estimator with every optimizer that fits, on problems whose answers are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import exact_gradient, problem
+from scipy import stats
+
+import unrender as ur
+from unrender.keys import Key
+from unrender.rendering.analytic import AnalyticRenderer
+from unrender.training.bounds import MARGIN
+
+CV = ur.images.RecursiveControlVariate
+ESTIMATORS: dict[str, Callable[[], Any]] = {
+    "plain, crossed halves": lambda: ur.PathGradient(spp=4),
+    "plain, own paths": lambda: ur.PathGradient(spp=1),
+    "plain, other spp": lambda: ur.PathGradient(spp=4, adjoint_spp=1),
+    "control variate, path space": lambda: ur.PathGradient(CV(), spp=2),
+    "control variate, primary space": lambda: ur.PathGradient(CV(space="primary"), spp=2),
+    "control variate, own paths": lambda: ur.PathGradient(CV(), spp=1),
+}
+OPTIMIZERS: dict[str, Callable[[], Any]] = {
+    "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),
+    "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
+    "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
+}
+
+
+@pytest.mark.parametrize(("estimator", "optimizer"), itertools.product(ESTIMATORS, OPTIMIZERS))
+def test_the_truth_is_recovered(estimator: str, optimizer: str) -> None:
+    found = ur.optimize(problem(views=2), ESTIMATORS[estimator](), OPTIMIZERS[optimizer](), steps=600)
+    errors = [record["parameter_error"] for record in found.history if "parameter_error" in record]
+    assert max(errors[-1].values()) < 0.4 * max(errors[0].values())
+    assert found.skipped == 0 and found.steps == 600 and found.stopped == "steps"
+    assert not found.warnings
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_shape_of_an_estimate(name: str) -> None:
+    asked = problem(views=2)
+    found = ur.estimate(asked, ESTIMATORS[name]())
+    assert found.gradient.keys() == asked.initial().keys()
+    assert all(found.gradient[k].shape == v.shape for k, v in asked.initial().items())
+    assert np.isfinite(found.loss) and found.info["samples"] > 0
+    assert found.variance is None and found.hessian is None and found.hvp is None
+
+
+DRIFT = -0.06
+
+
+def gradients(asked: ur.Problem, estimator: Any, count: int) -> np.ndarray:
+    """(count, n): independent estimates at one drifting point, each at the end of a run of its own."""
+    rows = []
+    for seed in range(count):
+        parameters = asked.initial()
+        state = estimator.init(asked, parameters)
+        found = None
+        for step in range(6):
+            found, state = estimator.estimate(asked, parameters, state, Key(seed, step))
+            if step < 5:
+                parameters = {k: v + DRIFT for k, v in parameters.items()}
+        assert found is not None
+        rows.append(np.concatenate([g.ravel() for g in found.gradient.values()]))
+    return np.stack(rows)
+
+
+def worst_z(rows: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
+    """The largest |z| of the mean against the exact value, and its limit at 1e-3 after Šidák."""
+    z = (rows.mean(0) - exact) / (rows.std(0, ddof=1) / np.sqrt(len(rows)))
+    return float(np.abs(z).max()), float(stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("loss", [ur.losses.L2(), ur.losses.RelativeL2()], ids=["L2", "RelativeL2"])
+def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
+    """For the control variate too: here its weight, from five steps, is all but independent of what it weighs."""
+    asked = problem(loss, views=2)
+    at = {k: v + 5 * DRIFT for k, v in asked.initial().items()}
+    exact = np.concatenate([g.ravel() for g in exact_gradient(asked, at).values()])
+    rows = gradients(asked, ESTIMATORS[name](), 400)
+    worst, limit = worst_z(rows, exact)
+    assert worst < limit
+    assert worst_z(rows * 1.1, exact)[0] > limit, "a planted bias of 10 % went unseen"
+
+
+def test_halves_that_are_not_crossed_are_biased(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test above sees what crossing is for."""
+    import unrender.gradients.path as path
+
+    monkeypatch.setattr(path, "reversed", lambda images: images, raising=False)
+    asked = problem(views=1, noise=0.9)
+    at = {k: v + 5 * DRIFT for k, v in asked.initial().items()}
+    exact = np.concatenate([g.ravel() for g in exact_gradient(asked, at).values()])
+    worst, limit = worst_z(gradients(asked, ur.PathGradient(spp=2), 400), exact)
+    assert worst > limit
+
+
+def test_the_control_variate_reduces_the_noise_of_the_image() -> None:
+    asked = problem(noise=0.9)
+    assert isinstance(asked.renderer, AnalyticRenderer)
+
+    def error(image: Any) -> float:
+        squares = []
+        for seed in range(100):
+            parameters = asked.initial()
+            state, found = image.init(asked, parameters), None
+            for step in range(8):
+                parameters = {k: v - 0.02 for k, v in parameters.items()}
+                found, keep = image.estimate(asked, parameters, state, 0, 2, 2, Key(seed, step))
+                state = image.advance(parameters, state, (keep,))
+            assert found is not None
+            squares.append(np.mean((found.mean() - asked.renderer.exact(parameters)) ** 2))
+        return float(np.mean(squares))
+
+    assert error(CV()) < 0.3 * error(ur.images.Plain())
+
+
+def test_equal_seeds_give_equal_runs_and_others_do_not() -> None:
+    def go(seed: int) -> dict[str, np.ndarray]:
+        return ur.optimize(problem(), ESTIMATORS["control variate, path space"](), OPTIMIZERS["Adam"](), steps=20, seed=seed).parameters
+
+    a, b, c = go(0), go(0), go(1)
+    assert all(np.array_equal(a[k], b[k]) for k in a)
+    assert any(not np.array_equal(a[k], c[k]) for k in a)
+
+
+def test_memory_starts_anew_when_a_parameter_changes_its_shape() -> None:
+    asked = problem()
+    estimator = ur.PathGradient(CV(), spp=2)
+    parameters = asked.initial()
+    state = estimator.init(asked, parameters)
+    for step in range(5):
+        _, state = estimator.estimate(asked, parameters, state, Key(0, step))
+    other = dataclasses.replace(state.image, parameters={**parameters, "map": np.zeros((4, 4, 1))})
+    found, after = estimator.estimate(asked, parameters, dataclasses.replace(state, image=other), Key(0, 5))
+    assert "control_weight" not in found.info
+    assert float(np.max(after.image.views[0].current.moment_weight)) == 0.0
+
+
+def test_a_gradient_that_is_not_finite_is_neither_applied_nor_remembered() -> None:
+    asked = problem()
+    estimator = ur.PathGradient(CV(), spp=2)
+    calls = itertools.count()
+
+    @dataclasses.dataclass(frozen=True)
+    class Faulty:
+        provides = estimator.provides
+        init = estimator.init
+
+        def estimate(self, problem: Any, parameters: Any, state: Any, key: Key) -> Any:
+            found, after = estimator.estimate(problem, parameters, state, key)
+            if next(calls) % 4 == 3:
+                bad = {k: g * np.nan for k, g in found.gradient.items()}
+                return dataclasses.replace(found, gradient=bad), None
+            return found, after
+
+    found = ur.optimize(asked, Faulty(), OPTIMIZERS["Adam"](), steps=40)
+    assert found.skipped == 10
+    assert all(np.isfinite(value).all() for value in found.parameters.values())
+
+
+def test_a_run_without_a_finite_gradient_is_given_up() -> None:
+    asked = problem()
+
+    estimator = ur.PathGradient(spp=2)
+
+    @dataclasses.dataclass(frozen=True)
+    class Faulty:
+        provides = estimator.provides
+        init = estimator.init
+
+        def estimate(self, problem: Any, parameters: Any, state: Any, key: Key) -> Any:
+            found, after = estimator.estimate(problem, parameters, state, key)
+            return dataclasses.replace(found, loss=float("nan")), after
+
+    found = ur.optimize(asked, Faulty(), OPTIMIZERS["Adam"](), steps=1000)
+    assert found.stopped == "non-finite" and found.steps < 1000 and found.warnings
+    initial = asked.initial()
+    assert all(np.allclose(found.parameters[k], initial[k]) for k in initial)
+
+
+def test_a_parameter_without_influence_is_warned_of() -> None:
+    matrix = np.random.default_rng(0).random((4 * 4 * 3, 2))
+    matrix[:, 1] = 0
+    renderer = AnalyticRenderer({"seen": np.array([0.5]), "unseen": np.array([0.5])}, matrix)
+    views = [ur.View(renderer.exact({}))]
+    asked = ur.Problem(renderer, [ur.Parameter("seen", 0.2), ur.Parameter("unseen", 0.2)], views)
+    found = ur.optimize(asked, ur.PathGradient(spp=2), OPTIMIZERS["Adam"](), steps=10)
+    assert len(found.warnings) == 1 and "unseen" in found.warnings[0]
+
+
+def test_bounds_hold_and_do_not_stall() -> None:
+    """A parameter driven against its bound by a large step comes back."""
+    asked = problem()
+    pushed = ur.optimize(asked, ur.PathGradient(spp=4), ur.optimizers.SGD(learning_rate=50.0), steps=1).parameters
+    assert all((v >= MARGIN * 0.999).all() and (v <= 1 - MARGIN * 0.999).all() for v in pushed.values())
+    assert any((np.isclose(v, MARGIN) | np.isclose(v, 1 - MARGIN)).any() for v in pushed.values())
+    again = ur.Problem(
+        asked.renderer,
+        [ur.Parameter(k, initial=v, bounds=(0, 1)) for k, v in pushed.items()],
+        asked.views,
+        truth=asked.truth,
+    )
+    found = ur.optimize(again, ur.PathGradient(spp=4), OPTIMIZERS["Adam"](), steps=600)
+    assert max(found.history[-1]["parameter_error"].values()) < 0.1
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    class NeedsHessian(ur.optimizers.SGD):
+        @property
+        def requires(self) -> frozenset[str]:
+            return frozenset({"hessian"})
+
+    with pytest.raises(ur.InputError, match="hessian.*does not provide"):
+        ur.optimize(problem(), ur.PathGradient(), NeedsHessian(learning_rate=1.0), steps=1)
+    with pytest.raises(ur.InputError, match="budget"):
+        ur.optimize(problem(), ur.PathGradient(), OPTIMIZERS["SGD"]())
+    for bad in ({"steps": 0}, {"steps": 1.5}, {"seconds": -1.0}, {"seconds": float("nan")}):
+        with pytest.raises(ur.InputError):
+            ur.optimize(problem(), ur.PathGradient(), OPTIMIZERS["SGD"](), **bad)
+    with pytest.raises(ur.InputError, match='space="primary"'):
+        ur.optimize(problem(carried=False), ur.PathGradient(CV()), OPTIMIZERS["SGD"](), steps=1)
+    for spp in (0, -4, 1.5, True):
+        with pytest.raises(ur.InputError, match="spp"):
+            ur.PathGradient(spp=spp)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ur.InputError, match="space"):
+        CV(space="pixel")  # pyright: ignore[reportArgumentType]
+
+
+def test_callbacks_hear_and_can_stop() -> None:
+    heard: list[str] = []
+
+    class Listener(ur.Callback):
+        def on_start(self, run: Any) -> None:
+            heard.append("start")
+
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            heard.append(f"step {record['step']}")
+            if record["step"] == 2:
+                run.stop()
+
+        def on_end(self, run: Any, result: ur.Result) -> None:
+            heard.append(result.stopped)
+
+    ur.optimize(problem(), ur.PathGradient(), OPTIMIZERS["SGD"](), steps=100, callbacks=[Listener()])
+    assert heard == ["start", "step 0", "step 1", "step 2", "callback"]
+
+
+def test_ctrl_c_returns_what_was_reached() -> None:
+    import os
+    import signal
+
+    class Interrupt(ur.Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            if record["step"] == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    found = ur.optimize(problem(), ur.PathGradient(), OPTIMIZERS["SGD"](), steps=100000, callbacks=[Interrupt()])
+    assert found.stopped == "interrupted" and found.steps <= 5
+    assert signal.getsignal(signal.SIGINT) is before
