@@ -63,7 +63,7 @@ def prepare() -> None:
         # Dr.Jit will say so on standard error as it is imported, before our one line that also says what to do.
         # Whatever goes wrong here is told by the import that follows.
         with _silent_stderr(), contextlib.suppress(Exception):
-            import drjit  # noqa: F401  # pyright: ignore[reportUnusedImport]
+            llvm_version()  # waits for Dr.Jit's initialisation, which goes on in a thread after the import
 
 
 def use(variant: str = "auto") -> str:
