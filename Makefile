@@ -27,8 +27,8 @@ help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
 demo: .venv/ready
-	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo
-	@echo "The result: file://$(CURDIR)/out/demo/compare.html"
+	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo --overwrite
+	@echo "the result, to open in a browser: file://$(CURDIR)/out/demo/compare.html"
 
 test: lint
 	$(PYTEST) -m "not slow"
