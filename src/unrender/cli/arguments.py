@@ -1,0 +1,148 @@
+"""From what was typed to what it means: problems, settings, folders."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from unrender import gallery, variant
+from unrender.errors import InputError
+from unrender.problem.field import did_you_mean
+from unrender.problem.problem import Problem
+
+DEFAULT_STEPS = 300
+
+ProblemName = Annotated[
+    str, typer.Argument(metavar="PROBLEM", help="A problem file (TOML), or a name from the gallery.")
+]
+ProblemSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--problem-set",
+        "-p",
+        metavar="NAME=VALUE",
+        help="An option of a gallery problem, such as resolution=64. Repeatable.",
+    ),
+]
+Variant = Annotated[str, typer.Option(help="Mitsuba's variant: auto, cuda_ad_rgb or llvm_ad_rgb.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")]
+FinalSpp = Annotated[
+    int | None, typer.Option(min=1, help="Samples per pixel of the final pictures. Default: as many as take seconds.")
+]
+
+
+def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:
+    """["spp=4"] as {"spp": "4"}. Raises `InputError` for what is no NAME=VALUE, or a name given twice."""
+    found: dict[str, str] = {}
+    for pair in pairs or ():
+        name, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals or not name:
+            raise InputError(f"{option} {pair}: expected NAME=VALUE")
+        if name in found:
+            raise InputError(f"{option} {pair}: {name} is given twice")
+        found[name] = value
+    return found
+
+
+def literal(text: str) -> Any:
+    """A whole number, a number, true or false where `text` is one, else the text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def use_variant(name: str) -> str:
+    """Choose the variant. A name that does not exist is wrong input; one that cannot run here is not."""
+    known = ("auto", *variant.VARIANTS)
+    if name not in known:
+        raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
+    return variant.use(name)
+
+
+def check_problem(name: str, options: Mapping[str, str]) -> None:
+    """Raise `InputError` where `open_problem` would fail for reasons that can be told without Mitsuba."""
+    if _is_file(name):
+        if Path(name).suffix.lower() == ".xml":
+            raise InputError(
+                f"{name}: a scene alone does not say what is unknown; write a problem file with: "
+                f'scene = "{Path(name).name}", [[parameters]] and [[views]]'
+            )
+        if options:
+            raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
+        if not Path(name).exists():
+            raise InputError(f"{name}: no such file")
+    elif name not in gallery.names():
+        hint = did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
+        raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
+
+
+def open_problem(name: str, options: Mapping[str, str]) -> Problem:
+    """The problem of a TOML file or of the gallery. A variant must be in use. Raises `InputError`."""
+    check_problem(name, options)
+    if _is_file(name):
+        return Problem.from_file(name)
+    return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+
+
+def _is_file(name: str) -> bool:
+    return Path(name).suffix.lower() in (".toml", ".xml") or Path(name).is_file()
+
+
+def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
+    """Steps and seconds; `DEFAULT_STEPS` where neither is given. Raises `InputError` where one makes no sense."""
+    if steps is not None and steps < 1:
+        raise InputError(f"--steps {steps}: expected at least 1")
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise InputError(f"--seconds {seconds:g}: expected a number above 0")
+    return (DEFAULT_STEPS if steps is None and seconds is None else steps), seconds
+
+
+def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
+    """Where results go: an empty folder, made here so that a wrong place is known before hours of work.
+
+    Args:
+        given: what the user asked for, or None for a new folder in out/.
+        default: its name there; a number is added to one that exists.
+        overwrite: whether a folder that holds earlier results may be written to.
+        marks: patterns of the files by which earlier results are known.
+
+    Raises:
+        InputError: a file, a folder with other things in it, earlier results without `overwrite`, or not writable.
+    """
+    if given is None:
+        name = re.sub(r"[^\w.-]+", "-", default).strip(".-") or "run"
+        number = 1
+        given = Path("out", name)
+        while given.exists():
+            number += 1
+            given = Path("out", f"{name}-{number}")
+    try:
+        if given.exists() and not given.is_dir():
+            raise InputError(f"--out {given}: a file, expected a folder")
+        if given.is_dir() and any(given.iterdir()):
+            if not any(True for mark in marks for _ in given.glob(mark)):
+                raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
+            if not overwrite:
+                raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
+        given.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {given}: {error.strerror or error}") from error
+    if not os.access(given, os.W_OK | os.X_OK):
+        raise InputError(f"--out {given}: not writable")
+    return given
+
+
+def remove_if_empty(directory: Path) -> None:
+    """Take back a folder that `folder` made and nothing was written to."""
+    with contextlib.suppress(OSError):
+        directory.rmdir()

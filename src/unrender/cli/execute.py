@@ -1,0 +1,126 @@
+"""One run from start to folder: descend, save, render the final pictures, save again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from unrender.cli.progress import Progress
+from unrender.methods import Method
+from unrender.problem.problem import Problem
+from unrender.problem.render import render
+from unrender.training.loop import optimize
+from unrender.training.result import Result
+
+_PICTURE_PATHS = 1 << 22
+_FEWEST, _MOST = 16, 512
+_FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz", "report.html")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be run.
+
+    Attributes:
+        problem, method: of what, by what.
+        settings: of the method, where they are not the defaults.
+        steps, seconds, seed: see `optimize`.
+        final_spp: of the final pictures; None chooses.
+        command: what was typed, to be kept with the results.
+        problem_settings: of a gallery problem, to be kept with the results.
+    """
+
+    problem: Problem
+    method: Method
+    settings: Mapping[str, Any]
+    steps: int | None
+    seconds: float | None
+    seed: int
+    final_spp: int | None
+    command: str
+    problem_settings: Mapping[str, Any]
+
+
+def execute(plan: Plan, directory: Path, console: Console) -> Result:
+    """Run, and leave a run folder. An interrupted run is saved as far as it came."""
+    problem = plan.problem
+    estimator, optimizer = plan.method.start(plan.settings)
+    with Progress(console) as progress:
+        result = optimize(problem, estimator, optimizer, plan.steps, plan.seconds, plan.seed, [progress])
+    options = plan.method.configure(plan.settings).model_dump()
+    kept = {"options": options, "problem_options": dict(plan.problem_settings)}
+    kept = {name: value for name, value in kept.items() if value}
+    result = replace(result, method=plan.method.name, settings={**kept, **result.settings}, command=plan.command)
+    for name in _FILES:  # of an earlier run, which may have had more of them
+        (directory / name).unlink(missing_ok=True)
+    result.save(directory)  # what took long is safe before what takes seconds more
+    result = replace(result, pictures=pictures(problem, result, plan.final_spp))
+    result.save(directory)
+    return result
+
+
+def pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
+    """Reference, initial and final picture of each view, and the control weight where there is one.
+
+    Args:
+        problem, result: whose.
+        spp: samples per pixel, or None for as many as some four million paths per picture allow.
+    """
+    weights = result.info.get("control_weight", {})
+    found: dict[str, np.ndarray] = {}
+    for index, view in enumerate(problem.views):
+        reference = np.asarray(view.reference, np.float32)
+        samples = spp or min(max(_PICTURE_PATHS // (reference.size // 3), _FEWEST), _MOST)
+        found[f"view{index}/reference"] = reference
+        found[f"view{index}/initial"] = render(problem, result.initial, index, samples, seed=1)
+        found[f"view{index}/result"] = render(problem, result.parameters, index, samples, seed=2)
+        if index in weights:
+            found[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
+    return found
+
+
+def image_errors(result: Result, which: str = "result") -> list[float]:
+    """Root mean square error of each view's picture against its reference."""
+    errors = []
+    for index in range(int(result.problem["views"])):
+        difference = result.pictures[f"view{index}/{which}"] - result.pictures[f"view{index}/reference"]
+        errors.append(float(np.sqrt(np.mean(np.square(difference, dtype=np.float64)))))
+    return errors
+
+
+def introduce(console: Console, problem: Problem, variant: str) -> None:
+    """What is about to be recovered, and what was done to the input."""
+    sizes = {np.asarray(view.reference).shape[1::-1] for view in problem.views}
+    size = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
+    views = f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"
+    keys = ", ".join(parameter.key for parameter in problem.parameters)
+    console.print(f"[bold]{escape(problem.name)}[/]: {escape(keys)} from {views}, on {variant}", soft_wrap=True)
+    for notice in problem.notices:
+        console.print(f"note: {escape(notice)}", soft_wrap=True)
+
+
+def summarise(console: Console, problem: Problem, result: Result) -> None:
+    """What came out."""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s (and {result.warmup_seconds:.1f} s to compile)")
+    if result.skipped:
+        table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
+    before, after = (np.mean(image_errors(result, which)) for which in ("initial", "result"))
+    table.add_row("image error", f"{before:.4g} before, {after:.4g} after (root mean square)")
+    start = problem.parameter_error(result.initial)
+    for key, error in problem.parameter_error(result.parameters).items():
+        table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")
+    console.print(table)
+    for warning in result.warnings:
+        console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
+    if result.stopped == "interrupted":
+        console.print("interrupted: what was reached is saved")

@@ -1,0 +1,100 @@
+"""`unrender gallery`: problems made by code, ready to run."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from PIL import Image
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from unrender import gallery as problems
+from unrender.cli import arguments
+from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
+from unrender.cli.execute import introduce
+from unrender.files import write
+from unrender.problem.problem import Problem
+from unrender.problem.render import render
+from unrender.report import pictures
+
+_SPP = 64
+
+
+def gallery(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Tell more of this one.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="With NAME: render its references, its start and its truth to PNG files here.")
+    ] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+    spp: FinalSpp = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """List the gallery's problems, or tell more of one."""
+    console = Console(highlight=False)
+    if name is None:
+        table = _table()
+        for known in problems.names():
+            table.add_row(known, escape(problems.summary(known)))
+        console.print(table)
+        return
+    console.print(f"[bold]{escape(name)}[/]  {escape(problems.summary(name))}", soft_wrap=True)
+    options = arguments.settings(problem_settings, "--problem-set")
+    table = _table()
+    for option in problems.options(name):
+        default = option.default if isinstance(option.default, (int, float, str)) else type(option.default).__name__
+        table.add_row(f"  {option.name}", str(default), escape(option.about))
+    console.print(table)
+    if out is None and not options:
+        return
+    folder = None if out is None else arguments.folder(out, name, overwrite, "view0-reference.png")
+    try:
+        running = arguments.use_variant(variant)
+        problem = arguments.open_problem(name, options)
+        introduce(console, problem, running)
+        console.print(_parameters(problem))
+        if folder is not None:
+            for path in _draw(problem, folder, spp):
+                console.print(escape(str(path)), soft_wrap=True)
+    finally:
+        if folder is not None:
+            arguments.remove_if_empty(folder)
+
+
+def _table() -> Table:
+    return Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+
+
+def _parameters(problem: Problem) -> Table:
+    table = _table()
+    initial = {key: np.asarray(value) for key, value in problem.initial().items()}
+    for key, error in problem.parameter_error(problem.initial()).items():
+        low, high = (("open" if side is None else f"{side:g}") for side in problem.bounds[key])
+        about = f"shape {initial[key].shape}, bounds {low} to {high}, error of the start {error:.3g}"
+        table.add_row(escape(key), about)
+    return table
+
+
+def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
+    """PNG files of each view's reference, start and truth, all as bright as the reference."""
+    written: list[Path] = []
+    for index, view in enumerate(problem.views):
+        reference = np.asarray(view.reference, np.float32)
+        shots = {"reference": reference, "start": render(problem, None, index, spp or _SPP)}
+        if set(problem.truth) == {parameter.key for parameter in problem.parameters}:
+            shots["truth"] = render(problem, problem.truth, index, spp or _SPP)
+        for what, picture in shots.items():
+            path = folder / f"view{index}-{what}.png"
+            written.append(write(path, _png(picture * pictures.exposure(reference))))
+    return written
+
+
+def _png(linear: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray((pictures.srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()

@@ -1,0 +1,33 @@
+"""`unrender methods`: what there is, and what it can be told."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from unrender.methods import METHODS, Method, method
+
+
+def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None) -> None:
+    """List the methods, their options and defaults."""
+    console = Console(highlight=False)
+    for one in [method(name)] if name else METHODS.values():
+        console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
+        console.print(_options(one))
+        console.print()
+
+
+def _options(one: Method) -> Table:
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, field in one.options.model_fields.items():
+        default = "none" if field.default is None else str(field.default)
+        about = f"{field.description} ({one.expected(name)})"
+        table.add_row(f"  {name}", escape(default), escape(about))
+    return table

@@ -1,0 +1,107 @@
+"""How far a run is: a bar that moves on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+from unrender.training.callbacks import Callback
+
+if TYPE_CHECKING:
+    from unrender.training.loop import Run
+    from unrender.training.result import Result
+
+_BAR_SECONDS = 0.1
+_LINE_SECONDS = 2.0
+_SMOOTHING = 0.1
+
+
+class Progress(Callback):
+    """Shows steps, loss, parameter error (where the truth is known), gradient noise, speed and the time left.
+
+    The loss is smoothed over about ten steps. Use as a context manager, so that the bar is taken down whatever happens.
+
+    Args:
+        console: where to; None for standard output.
+    """
+
+    def __init__(self, console: Console | None = None):
+        self._console = console or Console()
+        self._bar: Bar | None = None
+        self._started = self._shown = 0.0
+        self._loss: float | None = None
+        self._error: dict[str, float] = {}
+        self._skipped = 0
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def on_start(self, run: Run) -> None:
+        """See `Callback.on_start`."""
+        del run
+        self._started = time.perf_counter()
+        if self._console.is_terminal:
+            columns = BarColumn(bar_width=20), TextColumn("{task.description}", markup=False)
+            self._bar = Bar(*columns, console=self._console, transient=True, auto_refresh=False)
+            self._bar.start()
+            self._bar.add_task("", total=1.0)
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        loss = record["loss"]
+        if np.isfinite(loss):
+            self._loss = loss if self._loss is None else self._loss + _SMOOTHING * (loss - self._loss)
+        self._error = record.get("parameter_error") or self._error
+        now = time.perf_counter()
+        last = bool(run.stopped)
+        if self._bar is not None:
+            if last or now - self._shown >= _BAR_SECONDS:
+                self._shown = now
+                self._bar.update(self._bar.task_ids[0], completed=run.progress(), description=self._line(run, record))
+                self._bar.refresh()
+        elif last or now - self._shown >= _LINE_SECONDS:
+            self._shown = now
+            self._console.print(self._line(run, record), markup=False, highlight=False, soft_wrap=True)
+
+    def on_end(self, run: Run, result: Result) -> None:
+        """See `Callback.on_end`."""
+        del run, result
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _line(self, run: Run, record: dict[str, Any]) -> str:
+        parts = [f"step {run.step}" + (f"/{run.steps}" if run.steps else "")]
+        if self._loss is not None:
+            parts.append(f"loss {self._loss:.4g}")
+        if self._error:
+            parts.append("error " + ", ".join(f"{error:.3g}" for error in self._error.values()))
+        if record["gradient_noise"] is not None:
+            parts.append(f"noise {100 * record['gradient_noise']:.0f}%")
+        if run.clock > 0:
+            parts.append(f"{_count(record['samples'] / run.clock)} samples/s")
+        if run.skipped:
+            parts.append(f"{run.skipped} skipped")
+        done = run.progress()
+        if done > 0 and not run.stopped:
+            left = (time.perf_counter() - self._started) * (1 - done) / done
+            parts.append(f"{int(left) // 60}:{int(left) % 60:02d} left")
+        return "  ".join(parts)
+
+
+def _count(number: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g}{letter}"
+    return f"{number:.3g}"

@@ -1,0 +1,88 @@
+"""`unrender run`: recover one problem's parameters by one method."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from unrender import report
+from unrender.cli import arguments
+from unrender.cli.arguments import FinalSpp, Overwrite, ProblemName, ProblemSettings, Variant
+from unrender.cli.execute import Plan, execute, introduce, summarise
+from unrender.errors import InputError
+from unrender.methods import method
+
+INTERRUPTED = 130
+
+
+def run(
+    context: typer.Context,
+    problem: ProblemName,
+    method_name: Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")] = "rcv",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+    final_spp: FinalSpp = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Recover a problem's parameters, and write a run folder with a page that shows the result.
+
+    Ctrl-C stops after the present step and keeps what was reached.
+    """
+    console = Console(highlight=False)
+    chosen = method(method_name)
+    given = arguments.settings(settings, "--set")
+    steps, seconds = _budget_settings(given, steps, seconds)
+    chosen.start(given)
+    options = arguments.settings(problem_settings, "--problem-set")
+    arguments.check_problem(problem, options)
+    name = Path(problem).stem if problem.endswith(".toml") else problem
+    folder = arguments.folder(out, f"{name}-{chosen.name}", overwrite, "run.json")
+    try:
+        running = arguments.use_variant(variant)
+        opened = arguments.open_problem(problem, options)
+        introduce(console, opened, running)
+        command = shlex.join(context.find_root().obj or ["unrender"])
+        plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options)
+        result = execute(plan, folder, console)
+    finally:
+        arguments.remove_if_empty(folder)
+    summarise(console, opened, result)
+    if result.steps:
+        console.print(f"page: {escape(str(report.page(folder)))}", soft_wrap=True)
+    if result.stopped == "interrupted":
+        raise typer.Exit(INTERRUPTED)
+
+
+def _budget_settings(
+    given: dict[str, str], steps: int | None, seconds: float | None
+) -> tuple[int | None, float | None]:
+    """The budget, which may also stand among the settings (--set steps=300): it is taken from there."""
+    for name, option in (("steps", steps), ("seconds", seconds)):
+        if name in given and option is not None:
+            raise InputError(f"--set {name}={given[name]}: --{name} is given, too")
+    if "steps" in given:
+        text = given.pop("steps")
+        try:
+            steps = int(text)
+        except ValueError as error:
+            raise InputError(f"--set steps={text}: expected a whole number") from error
+    if "seconds" in given:
+        text = given.pop("seconds")
+        try:
+            seconds = float(text)
+        except ValueError as error:
+            raise InputError(f"--set seconds={text}: expected a number") from error
+    return arguments.budget(steps, seconds)

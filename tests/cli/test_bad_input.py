@@ -1,0 +1,133 @@
+"""Bad input: status 2, one line on standard error, nothing left behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unrender.cli import arguments
+from unrender.errors import VariantError
+
+# Arguments, and what the line says. None of them reaches a renderer.
+MISTAKES = [
+    (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
+    (["run"], "Missing argument 'PROBLEM'"),
+    (["run", "problem.toml", "--stpes", "3"], "No such option: --stpes"),
+    (["run", "problem.toml", "--steps", "many"], "Invalid value for '--steps'"),
+    (["run", "problem.toml", "--steps", "0"], "--steps 0: expected at least 1"),
+    (["run", "problem.toml", "--steps", "-5"], "--steps -5: expected at least 1"),
+    (["run", "problem.toml", "--seconds", "-1"], "--seconds -1: expected a number above 0"),
+    (["run", "problem.toml", "--seconds", "nan"], "--seconds nan: expected a number above 0"),
+    (["run", "problem.toml", "--seconds", "inf"], "--seconds inf: expected a number above 0"),
+    (["run", "problem.toml", "--seed", "-1"], "Invalid value for '--seed'"),
+    (["run", "problem.toml", "--final-spp", "0"], "Invalid value for '--final-spp'"),
+    (["run", "problem.toml", "--method", "rvc"], "unknown method rvc; did you mean rcv?"),
+    (["run", "problem.toml", "--set", "spp"], "--set spp: expected NAME=VALUE"),
+    (["run", "problem.toml", "--set", "=3"], "--set =3: expected NAME=VALUE"),
+    (["run", "problem.toml", "--set", "spp=2", "--set", "spp=4"], "--set spp=4: spp is given twice"),
+    (["run", "problem.toml", "--set", "spp=-2"], "option spp: expected a whole number above 0, got '-2'"),
+    (["run", "problem.toml", "--set", "sp=2"], "method rcv has no option sp; did you mean spp?"),
+    (["run", "problem.toml", "--set", "schedule=cosin(9)"], "schedule: unknown 'cosin'; did you mean cosine?"),
+    (["run", "problem.toml", "--set", "steps=x"], "--set steps=x: expected a whole number"),
+    (["run", "problem.toml", "--set", "seconds=x"], "--set seconds=x: expected a number"),
+    (["run", "problem.toml", "--set", "steps=3", "--steps", "3"], "--set steps=3: --steps is given, too"),
+    (["run", "problem.toml", "--variant", "cuda_ad_rbg"], "did you mean cuda_ad_rgb?"),
+    (["run", "problem.toml", "--problem-set", "resolution=8"], "--problem-set resolution: only gallery problems"),
+    (["run", "missing.toml"], "missing.toml: no such file"),
+    (["run", "wall.xml"], "wall.xml: a scene alone does not say what is unknown"),
+    (["run", "indirect-rom"], "neither a TOML file nor in the gallery; did you mean indirect-room?"),
+    (["run", "indirect-room", "-p", "resolutoin=8"], "no option resolutoin; did you mean resolution?"),
+    (["run", "indirect-room", "-p", "resolution=-8"], "resolution"),
+    (["run", "indirect-room", "-p", "resolution=big"], "resolution"),
+    (["run", "problem.toml", "--out", "problem.toml"], "--out problem.toml: a file, expected a folder"),
+    (["run", "problem.toml", "--out", "problem.toml/run"], "--out problem.toml/run: Not a directory"),
+    (["run", "problem.toml", "--out", "."], "--out .: the folder is not empty and holds no earlier results"),
+    (["run", "problem.toml", "--out", ".", "--overwrite"], "--out .: the folder is not empty"),
+    (["methods", "plian"], "unknown method plian; did you mean plain?"),
+    (["gallery", "indirect-rooms"], "did you mean indirect-room?"),
+    (["report", "nowhere"], "nowhere"),
+    (["report", "."], "run.json"),
+    (["compare"], "Missing argument"),
+    (["compare", "problem.toml", "--methods", "plain,rvc"], "unknown method rvc; did you mean rcv?"),
+    (["compare", "problem.toml", "--methods", ","], "--methods: expected at least one name"),
+    (["compare", "problem.toml", "--methods", "rcv,rcv"], "--methods: rcv is given twice"),
+    (["compare", "problem.toml", "--seconds", "0"], "--seconds 0: expected a number above 0"),
+    (["compare", "problem.toml", "--seeds", "0"], "Invalid value for '--seeds'"),
+    (["compare", "problem.toml", "--set", "rvc.spp=2"], "rvc is not one of the methods plain, rcv"),
+    (["compare", "problem.toml", "--set", "space=path"], "method plain has no option space"),
+    (["compare", "problem.toml", "--set", "rcv.spp=0"], "method rcv: option spp: expected a whole number above 0"),
+    (["compare", ".", "nowhere"], "nowhere: no such run folder"),
+    (["compare", "."], "run.json"),
+    (["compare", ".", "--seconds", "3"], "run folders are compared as they are"),
+]
+
+
+def check(answer, message: str, status: int = 2) -> None:
+    assert answer.status == status
+    assert message in answer.error
+    assert answer.error.startswith("unrender: ")
+    assert answer.error.count("\n") == 1
+    assert "Traceback" not in answer.out + answer.error
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES)
+def test_mistakes_are_one_line(unrender, problem: Path, words: list[str], message: str):
+    before = sorted(problem.parent.rglob("*"))
+    check(unrender(*words), message)
+    assert [path for path in sorted(problem.parent.rglob("*")) if path.name != "out"] == before
+
+
+# How to spoil the files of a problem, and what the line says.
+def _nan(folder: Path) -> None:
+    photo = np.full((4, 6, 3), 0.5, np.float32)
+    photo[1, 2] = np.nan
+    mi.Bitmap(photo).write(str(folder / "photo.exr"))
+
+
+def _wrong_size(folder: Path) -> None:
+    mi.Bitmap(np.zeros((6, 4, 3), np.float32)).write(str(folder / "photo.exr"))
+
+
+def _edit(name: str, old: str, new: str):
+    def spoil(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new))
+
+    return spoil
+
+
+SPOILT = [
+    (_nan, "problem.toml:8: views[0].reference: photo.exr: 1 pixels are NaN or infinite, the first in row 1, column 2"),
+    (_wrong_size, "problem.toml:8: views[0].reference: 4x6 pixels (width x height), but the film of sensor 0 is 6x4"),
+    (lambda folder: (folder / "photo.exr").write_bytes(b"v/1\x01"), "photo.exr: cannot be read as a picture"),
+    (lambda folder: (folder / "photo.exr").unlink(), "problem.toml:8: views[0].reference: photo.exr: no such file"),
+    (lambda folder: (folder / "wall.xml").unlink(), "problem.toml:1: scene: wall.xml: no such file"),
+    (_edit("wall.xml", "</film>", ""), "problem.toml:1: scene: wall.xml: Mitsuba could not load it"),
+    (_edit("wall.xml", "diffuse", "difuse"), "problem.toml:1: scene: wall.xml: Mitsuba could not load it"),
+    (_edit("problem.toml", "reflectance", "reflectence"), "did you mean wall.bsdf.reflectance.value?"),
+    (
+        _edit("problem.toml", "truth =", "bounds = [1.0, 0.0]\ntruth ="),
+        "problem.toml:6: parameters[0].bounds: low must",
+    ),
+    (_edit("problem.toml", '"L2"', '"L2'), "problem.toml:2: not valid TOML"),
+    (_edit("problem.toml", "wall.bsdf.reflectance.value", "wall.to_world"), "cannot be recovered by gradients"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILT)
+def test_spoilt_files_are_one_line(unrender, problem: Path, mitsuba_variant: str, spoil, message: str):
+    spoil(problem.parent)
+    check(unrender("run", "problem.toml", "--out", "result", "--variant", mitsuba_variant), message)
+    assert not (problem.parent / "result").exists()
+
+
+def test_a_machine_that_cannot_is_status_3(unrender, problem: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(name: str) -> str:
+        raise VariantError("no LLVM library was found; install: this")
+
+    monkeypatch.setattr(arguments.variant, "use", fail)
+    check(unrender("run", "problem.toml"), "no LLVM library was found; install: this", status=3)

@@ -1,0 +1,69 @@
+"""What the command tells of itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from unrender import gallery
+from unrender.methods import METHODS
+
+COMMANDS = ("run", "compare", "report", "gallery", "methods", "doctor")
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
+def test_help_names_every_command(unrender, arguments):
+    answer = unrender(*arguments)
+    assert answer.status == 0
+    assert all(command in answer.out for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(unrender, command):
+    answer = unrender(command, "--help")
+    assert answer.status == 0
+    assert "Usage: unrender " + command in answer.out
+
+
+def test_version(unrender):
+    answer = unrender("--version")
+    assert answer.status == 0
+    assert answer.out.strip()
+
+
+def test_methods_lists_every_option_of_every_method(unrender):
+    answer = unrender("methods")
+    assert answer.status == 0
+    for method in METHODS.values():
+        alone = unrender("methods", method.name)
+        assert alone.out in answer.out
+        assert method.summary in alone.out
+        for name, field in method.options.model_fields.items():
+            assert name in alone.out
+            assert field.description
+            assert field.description in alone.out
+
+
+def test_gallery_lists_every_problem(unrender):
+    answer = unrender("gallery")
+    assert answer.status == 0
+    assert [line.split()[0] for line in answer.out.splitlines()] == gallery.names()
+
+
+def test_gallery_tells_the_options_of_one(unrender):
+    name = gallery.names()[0]
+    answer = unrender("gallery", name)
+    assert answer.status == 0
+    assert gallery.summary(name) in answer.out
+    assert all(option.name in answer.out for option in gallery.options(name))
+
+
+def test_gallery_draws_one(unrender, mitsuba_variant, tmp_path):
+    name = gallery.names()[0]
+    answer = unrender(
+        "gallery", name, "--out", "drawn", "-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=4",
+        "--spp", 4, "--variant", mitsuba_variant,
+    )  # fmt: skip
+    assert answer.status == 0
+    drawn = sorted(path.name for path in (tmp_path / "drawn").iterdir())
+    assert drawn == ["view0-reference.png", "view0-start.png", "view0-truth.png"]
+    assert "8x8" in answer.out

@@ -1,0 +1,179 @@
+"""`unrender run`, `report` and `compare`: what they leave, and how they end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as package
+from unrender.cli import execute
+
+KEY = "wall.bsdf.reflectance.value"
+FILES = ["history.jsonl", "initial.npz", "parameters.npz", "pictures.npz", "report.html", "run.json", "truth.npz"]
+QUICK = ["--final-spp", "4"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, mitsuba_variant: str):
+    words = ["run", "problem.toml", "--steps", 90, "--set", "learning_rate=0.02", "--out", "result", "--seed", 3]
+    answer = unrender(*words, "--variant", mitsuba_variant, *QUICK)
+    assert answer.status == 0, answer.error
+    folder = problem.parent / "result"
+    assert names(folder) == FILES
+    record = json.loads((folder / "run.json").read_text())
+    assert (record["name"], record["method"], record["seed"], record["stopped"]) == ("problem", "rcv", 3, "steps")
+    assert record["command"].startswith("unrender run problem.toml --steps 90 --set learning_rate=0.02")
+    assert record["settings"]["options"]["learning_rate"] == 0.02
+    with np.load(folder / "parameters.npz") as found:
+        np.testing.assert_allclose(found[KEY], [0.6, 0.5, 0.4], atol=0.02)
+    with np.load(folder / "pictures.npz") as found:
+        assert sorted(found) == [f"view0/{name}" for name in ("control_weight", "initial", "reference", "result")]
+        np.testing.assert_allclose(found["view0/initial"].mean((0, 1)), 0.2, atol=0.02)
+        np.testing.assert_allclose(found["view0/result"].mean((0, 1)), [0.6, 0.5, 0.4], atol=0.05)
+        np.testing.assert_allclose(found["view0/reference"][0, 0], [0.6, 0.5, 0.4], rtol=1e-6)
+    assert f"page: {Path('result', 'report.html')}" in answer.out
+    assert "step 90/90" in answer.out
+    assert f"{KEY} error 0.3109 before, 0.0" in " ".join(answer.out.split())
+
+
+def test_run_names_a_new_folder_each_time(unrender, problem: Path, mitsuba_variant: str):
+    for _ in range(2):
+        words = ["run", "problem.toml", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant, *QUICK]
+        assert unrender(*words).status == 0
+    assert names(problem.parent / "out") == ["problem-plain", "problem-plain-2"]
+
+
+def test_run_says_what_was_done_to_the_input(unrender, problem: Path, mitsuba_variant: str):
+    mi.Bitmap(np.full((4, 6, 3), 188, np.uint8)).write(str(problem.parent / "photo.png"))
+    problem.write_text(problem.read_text().replace("photo.exr", "photo.png"))
+    answer = unrender("run", "problem.toml", "--steps", 1, "--variant", mitsuba_variant, *QUICK)
+    assert answer.status == 0
+    assert "note: view 0: reference photo.png: 8-bit sRGB, linearised" in answer.out
+
+
+def test_run_replaces_earlier_results_only_when_told(unrender, problem: Path, mitsuba_variant: str):
+    words = ["run", "problem.toml", "--steps", 1, "--out", "result", "--variant", mitsuba_variant, *QUICK]
+    assert unrender(*words).status == 0
+    (problem.parent / "result" / "notes.txt").write_text("mine")
+    refused = unrender(*words)
+    assert refused.status == 2
+    assert refused.error == "unrender: --out result: holds earlier results; give --overwrite to replace them\n"
+    problem.write_text(problem.read_text().replace("truth", "# truth"))
+    assert unrender(*words, "--overwrite").status == 0
+    assert names(problem.parent / "result") == [name for name in sorted([*FILES, "notes.txt"]) if name != "truth.npz"]
+
+
+def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_variant: str, monkeypatch):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(execute, "optimize", fail)
+    answer = unrender("run", "problem.toml", "--out", "result", "--variant", mitsuba_variant)
+    assert (answer.status, answer.error) == (130, "unrender: interrupted\n")
+    assert not (problem.parent / "result").exists()
+
+
+def test_run_warns_of_a_parameter_without_influence(unrender, problem: Path, mitsuba_variant: str):
+    hidden = '<shape type="sphere" id="hidden"><transform name="to_world"><translate z="50"/></transform>'
+    hidden += '<bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape></scene>'
+    scene = problem.parent / "wall.xml"
+    scene.write_text(scene.read_text().replace("</scene>", hidden))
+    problem.write_text(problem.read_text() + '[[parameters]]\nkey = "hidden.bsdf.reflectance.value"\n')
+    answer = unrender("run", "problem.toml", "--steps", 8, "--variant", mitsuba_variant, *QUICK)
+    assert answer.status == 0
+    assert "warning parameter hidden.bsdf.reflectance.value: its gradient is zero" in answer.out
+
+
+def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mitsuba_variant: str):
+    words = ["compare", "problem.toml", "--methods", "plain,rcv", "--seconds", 0.2, "--seeds", 2, "--out", "both"]
+    words += ["--set", "rcv.spp=4", "--set", "learning_rate=0.02", "--variant", mitsuba_variant, *QUICK]
+    answer = unrender(*words)
+    assert answer.status == 0, answer.error
+    folder = problem.parent / "both"
+    runs = ["plain-seed0", "plain-seed1", "rcv-seed0", "rcv-seed1"]
+    assert names(folder) == ["compare.html", "compare.json", "compare.png", *runs]
+    for run in runs:
+        record = json.loads((folder / run / "run.json").read_text())
+        assert f"{record['method']}-seed{record['seed']}" == run
+        assert record["stopped"] == "seconds"
+        assert record["settings"]["options"]["learning_rate"] == 0.02
+        assert record["settings"]["options"]["spp"] == (4 if record["method"] == "rcv" else 8)
+    rows = [line.split() for line in answer.out.splitlines()]
+    assert [row[:2] for row in rows if row and row[0] in ("plain", "rcv")] == [["plain", "2"], ["rcv", "2"]]
+    assert f"page: {Path('both', 'compare.html')}" in answer.out
+
+    again = unrender("compare", Path("both", "plain-seed0"), Path("both", "rcv-seed1"))
+    assert again.status == 0
+    assert names(problem.parent / "out" / "compare") == ["compare.html", "compare.json", "compare.png"]
+    (folder / "plain-seed0" / "report.html").unlink(missing_ok=True)
+    assert unrender("report", Path("both", "plain-seed0")).out.strip() == str(
+        Path("both", "plain-seed0", "report.html")
+    )
+    assert unrender(*words).error.startswith("unrender: --out both: holds earlier results")
+
+
+def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
+    source = Path(package.__file__).parents[1]
+    command = [sys.executable, "-m", "unrender.cli.main", "run", "problem.toml", "--seconds", "600", "--out", "result"]
+    process = subprocess.Popen(
+        [*command, "--variant", mitsuba_variant, *QUICK],
+        cwd=problem.parent,
+        env={**os.environ, "PYTHONPATH": str(source)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if line.startswith("step "):
+                process.send_signal(signal.SIGINT)
+                break
+        out, error = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 130, error
+    assert error == "unrender: interrupted\n"
+    assert "interrupted: what was reached is saved" in out
+    folder = problem.parent / "result"
+    assert names(folder) == FILES
+    record = json.loads((folder / "run.json").read_text())
+    assert record["stopped"] == "interrupted"
+    assert record["steps"] == len((folder / "history.jsonl").read_text().splitlines()) >= 1
+
+
+def test_a_reader_that_leaves_gets_no_traceback():
+    source = Path(package.__file__).parents[1]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "unrender.cli.main", "methods"],
+        env={**os.environ, "PYTHONPATH": str(source)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 1
+
+
+@pytest.mark.parametrize("spp", [None, 4])
+def test_final_pictures_are_of_the_result(problem: Path, spp):
+    made = package.Problem.from_file(problem)
+    result = package.optimize(made, package.PathGradient(spp=2), package.optimizers.Adam(0.3), steps=1)
+    shown = execute.pictures(made, result, spp)
+    assert sorted(shown) == ["view0/initial", "view0/reference", "view0/result"]
+    np.testing.assert_allclose(shown["view0/initial"].mean((0, 1)), result.initial[KEY], atol=0.02)
+    np.testing.assert_allclose(shown["view0/result"].mean((0, 1)), result.parameters[KEY], atol=0.05)
