@@ -4,27 +4,51 @@
 
     problem = ur.gallery.problem("indirect-room")
     estimator = ur.PathGradient(image=ur.images.RecursiveControlVariate(), spp=2)
-    result = ur.optimize(problem, estimator, ur.optimizers.Adam(learning_rate=5e-3), steps=300)
+    result = ur.optimize(problem, estimator, ur.optimizers.Adam(learning_rate=1e-2), steps=300)
     result.save("out")
+
+Names are loaded when first used, so that `import unrender` is quick and works where Mitsuba does not (yet).
 """
 
+from contextlib import suppress
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from unrender import variant as _variant
+from unrender.errors import InputError, UnrenderError, VariantError
+from unrender.variant import use
 
-_variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
+if TYPE_CHECKING:
+    from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, statistics
+    from unrender.gradients.estimate import Estimate
+    from unrender.gradients.path import PathGradient
+    from unrender.keys import Key
+    from unrender.problem.parameter import Parameter
+    from unrender.problem.problem import Problem
+    from unrender.problem.render import render, render_pair
+    from unrender.problem.view import View
+    from unrender.training.callbacks import Callback
+    from unrender.training.loop import estimate, optimize
+    from unrender.training.result import Result
 
-from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, statistics  # noqa: E402
-from unrender.errors import InputError, UnrenderError, VariantError  # noqa: E402
-from unrender.gradients.estimate import Estimate  # noqa: E402
-from unrender.gradients.path import PathGradient  # noqa: E402
-from unrender.keys import Key  # noqa: E402
-from unrender.problem.parameter import Parameter  # noqa: E402
-from unrender.problem.problem import Problem  # noqa: E402
-from unrender.problem.view import View  # noqa: E402
-from unrender.problem.render import render, render_pair  # noqa: E402
-from unrender.training.callbacks import Callback  # noqa: E402
-from unrender.training.loop import estimate, optimize  # noqa: E402
-from unrender.training.result import Result  # noqa: E402
-from unrender.variant import use  # noqa: E402
+_MODULES = ("gallery", "images", "losses", "optimizers", "pixels", "preconditioners", "report", "statistics")
+_HOMES = {
+    "Callback": "training.callbacks",
+    "Estimate": "gradients.estimate",
+    "Key": "keys",
+    "Parameter": "problem.parameter",
+    "PathGradient": "gradients.path",
+    "Problem": "problem.problem",
+    "Result": "training.result",
+    "View": "problem.view",
+    "estimate": "training.loop",
+    "optimize": "training.loop",
+    "render": "problem.render",
+    "render_pair": "problem.render",
+}
+
+with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
+    _variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
 
 __all__ = [
     "Callback",
@@ -52,3 +76,18 @@ __all__ = [
     "statistics",
     "use",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES or name in _HOMES:
+        _variant.prepare()
+        if name in _MODULES:
+            return import_module(f"unrender.{name}")
+        value = getattr(import_module(f"unrender.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'unrender' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

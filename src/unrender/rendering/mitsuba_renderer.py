@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -169,7 +170,7 @@ class MitsubaRenderer:
         count = self._count(shot)
         key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None)
         if key not in self._frozen:
-            self._frozen[key] = dr.freeze(self._trace(what, shot.sensor, shot.spp, count))
+            self._frozen[key] = _uncollected(dr.freeze(self._trace(what, shot.sensor, shot.spp, count)))
         return self._frozen[key]
 
     def _trace(self, what: str, sensor: int, spp: int, count: int) -> Callable[..., Any]:
@@ -218,6 +219,21 @@ class MitsubaRenderer:
                 changed = True
         if changed:
             self.pair.previous_parameters.update()
+
+
+def _uncollected(frozen: Callable[..., Any]) -> Callable[..., Any]:
+    """`frozen` with Python's garbage collector held off: arrays that die in the middle of a recording abort the process."""
+
+    def call(*arguments: Any) -> Any:
+        enabled = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*arguments)
+        finally:
+            if enabled:
+                gc.enable()
+
+    return call
 
 
 class PrbKernel:

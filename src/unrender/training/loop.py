@@ -88,8 +88,8 @@ def optimize(
         optimizer: what becomes of them.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up and callbacks. One of the two must be given.
-        seed: of every random number of the run. Equal arguments give equal results, bit for bit on LLVM for textures of up to
-            about 256 x 256 (above, float atomics sum in any order).
+        seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
+            threads add to a gradient in the order they finish, and results agree to rounding.
         callbacks: listeners.
         run_directory: where to save the result, or None.
 

@@ -1,0 +1,7 @@
+"""`python -m unrender`."""
+
+import sys
+
+from unrender.cli.entry import main
+
+sys.exit(main())
