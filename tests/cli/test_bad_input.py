@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender.cli import arguments
+from unrender import variant
 from unrender.errors import VariantError
 
 # Arguments, and what the line says. None of them reaches a renderer.
@@ -77,7 +77,7 @@ def check(answer, message: str, status: int = 2) -> None:
 def test_mistakes_are_one_line(unrender, problem: Path, words: list[str], message: str):
     before = sorted(problem.parent.rglob("*"))
     check(unrender(*words), message)
-    assert [path for path in sorted(problem.parent.rglob("*")) if path.name != "out"] == before
+    assert sorted(problem.parent.rglob("*")) == before
 
 
 # How to spoil the files of a problem, and what the line says.
@@ -125,9 +125,17 @@ def test_spoilt_files_are_one_line(unrender, problem: Path, mitsuba_variant: str
     assert not (problem.parent / "result").exists()
 
 
+def test_a_machine_without_libraries_is_status_3(unrender, monkeypatch: pytest.MonkeyPatch):
+    def fail() -> None:
+        raise VariantError("libatomic.so.1 not found, which Dr.Jit needs; install: this")
+
+    monkeypatch.setattr(variant, "prepare", fail)
+    check(unrender("methods"), "libatomic.so.1 not found, which Dr.Jit needs; install: this", status=3)
+
+
 def test_a_machine_that_cannot_is_status_3(unrender, problem: Path, monkeypatch: pytest.MonkeyPatch):
     def fail(name: str) -> str:
         raise VariantError("no LLVM library was found; install: this")
 
-    monkeypatch.setattr(arguments.variant, "use", fail)
+    monkeypatch.setattr(variant, "use", fail)
     check(unrender("run", "problem.toml"), "no LLVM library was found; install: this", status=3)

@@ -177,6 +177,7 @@ def test_loss_is_the_weighted_mean_over_pixels_and_channels():
 
 BAD_PARAMETERS: list[tuple[Parameter, str]] = [
     (Parameter("wall.valu"), r"parameters\[0\]\.key: the scene has no parameter wall.valu; did you mean wall.value\?"),
+    (Parameter("paint.data"), r"the scene has no parameter paint.data; did you mean floor.data\?"),
     (Parameter("zzz"), r"the scene has no parameter zzz; it has wall.value, floor.data, lamp.scale"),
     (Parameter("lens.eta"), r"lens.eta cannot be recovered by gradients: it bends rays"),
     (Parameter("wall.value", [1.0, 2.0]), r"parameter wall.value: initial: expected .* got an array of shape \(2,\)"),

@@ -146,3 +146,5 @@ def remove_if_empty(directory: Path) -> None:
     """Take back a folder that `folder` made and nothing was written to."""
     with contextlib.suppress(OSError):
         directory.rmdir()
+        if directory.parent == Path("out"):
+            directory.parent.rmdir()

@@ -1,4 +1,4 @@
-"""The `unrender` command: its parts, and how it ends.
+"""The `unrender` command: how it starts and how it ends.
 
 Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 130 where it was interrupted.
 Whatever is wrong is one line on standard error.
@@ -9,58 +9,28 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
 import typer
 
-from unrender.cli.compare import compare
+from unrender import variant
 from unrender.cli.doctor import doctor
-from unrender.cli.gallery import gallery
-from unrender.cli.methods import methods
-from unrender.cli.report import report
-from unrender.cli.run import run
 from unrender.errors import UnrenderError, VariantError
-from unrender.training.result import versions
 
 INPUT, ENVIRONMENT, INTERRUPTED = 2, 3, 130
 
 # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
 _UsageError: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
 
-app = typer.Typer(
-    help="Recover what a scene is made of (textures, materials, light) from images of it.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command()(run)
-app.command()(compare)
-app.command()(report)
-app.command()(gallery)
-app.command()(methods)
-
-
-@app.command("doctor")
-def _doctor() -> None:
-    """Tell what this machine has, try a gradient, say what to install."""
-    raise typer.Exit(doctor())
-
-
-@app.callback(invoke_without_command=True)
-def _unrender(
-    context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
-) -> None:
-    if version:
-        typer.echo(versions()["unrender"])
-    elif context.invoked_subcommand is None:
-        typer.echo(context.get_help())
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
+            return doctor()
+        variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
+        from unrender.cli.app import app
+
         status = app(given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
         sys.stdout.flush()
         if status == INTERRUPTED:  # what Typer makes of Ctrl-C, and what a run returns that kept its results

@@ -301,6 +301,8 @@ def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> Non
 
 def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     able = [name for name, info in known.items() if info.differentiable]
-    if near := did_you_mean(key, able) or did_you_mean(key, known):
+    # Mitsuba may call an owner by its shape where people think of its material: the rest of the key tells as much.
+    alike = [name for name in able if name.endswith("." + key.partition(".")[2])] if "." in key else []
+    if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, able) or did_you_mean(key, known):
         return near
     return f"; it has {', '.join(able[:6])}{' and others' if len(able) > 6 else ''}" if able else ""
