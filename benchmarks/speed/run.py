@@ -1,0 +1,184 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""What a pair, a step and the loop cost, as ratios within one run.
+
+    python benchmarks/speed/run.py [--resolution 128] [--spp 16]
+
+On `indirect-room`: the pair against a plain primal render of the same kernel and of Mitsuba's `prb`; a step with crossed halves and a
+step with the control variate against the stock loop (`mi.render`, `dr.backward`, `mi.ad.Adam`) at equal spp; the variance of
+the gradients of those three at one point; the share of a step spent outside kernels, and whether any kernel is new after warm-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import matplotlib.pyplot as plt
+import mitsuba as mi
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common import median_time, mitsuba_renderer, read, stock_loop, write
+
+import unrender as ur
+from unrender.keys import Key
+from unrender.rendering.port import Shot
+from unrender.training.bounds import project
+
+HERE = Path(__file__).resolve().parent
+
+
+def stepper(problem: ur.Problem, estimator: Any) -> Any:
+    """A function that takes one whole step."""
+    optimizer = ur.optimizers.Adam(learning_rate=1e-3)
+    parameters = problem.initial()
+    box = {"p": parameters, "s": estimator.init(problem, parameters), "m": optimizer.init(parameters)}
+
+    def step(number: int) -> None:
+        found, box["s"] = estimator.estimate(problem, box["p"], box["s"], Key(0, number))
+        steps, box["m"] = optimizer.update(found, box["m"], box["p"])
+        box["p"] = {k: project(x + steps[k], *problem.bounds[k]) for k, x in box["p"].items()}
+        dr.eval(box["p"], box["m"])
+
+    return step
+
+
+def stock_time(problem: ur.Problem, spp: int, steps: int = 20) -> float:
+    """Median milliseconds of a step of the stock loop."""
+    clock = [h["seconds"] for h in stock_loop(problem, spp, 1e-3, steps=steps, every=1)]
+    return 1e3 * float(np.median(np.diff(clock)))
+
+
+def primal_costs(problem: ur.Problem, spp: int) -> dict[str, Any]:
+    """A pair against plain renders, in milliseconds."""
+    renderer = mitsuba_renderer(problem)
+    renderer.select([p.key for p in problem.parameters], "path")
+    now = problem.initial()
+    before = {k: x * 0.99 for k, x in now.items()}
+    dr.eval(before)
+    prb = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
+    scene = renderer.pair.current
+    plain = median_time(lambda n: dr.eval(renderer.image(now, Shot(0, spp, n, 2)).images))
+
+    def pair(n: int) -> None:
+        found = renderer.image_pair(now, before, Shot(0, spp, n, 2), "path")
+        dr.eval(found.images, found.previous)
+
+    both = median_time(pair)
+    with dr.suspend_grad():
+        stock = median_time(lambda n: dr.eval(prb.render(scene, sensor=0, spp=spp, seed=n)))
+    return {
+        "plain": plain,
+        "pair": both,
+        "mitsuba_prb": stock,
+        "pair/plain": both[0] / plain[0],
+        "pair/prb": both[0] / stock[0],
+    }
+
+
+def outside_kernels(problem: ur.Problem, estimator: Any, steps: int = 10) -> dict[str, Any]:
+    """The share of wall clock that no kernel accounts for, and how many kernels were new, over some steps after warm-up."""
+    step = stepper(problem, estimator)
+    for number in range(5):
+        step(number)
+    dr.sync_thread()
+    inside, wall, new, launched = 0.0, 0.0, 0, 0
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for number in range(5, 5 + steps):
+            dr.kernel_history_clear()
+            began = time.perf_counter()
+            step(number)
+            dr.sync_thread()
+            wall += 1e3 * (time.perf_counter() - began)
+            history = dr.kernel_history()
+            inside += sum(k["execution_time"] for k in history)
+            jit = [k for k in history if k["type"] == dr.KernelType.JIT]
+            launched += len(jit)
+            new += sum(not k["cache_hit"] or k["cache_disk"] for k in jit)
+    return {
+        "wall_ms": wall / steps,
+        "kernels_ms": inside / steps,
+        "outside": 1 - inside / wall,
+        "launched": launched / steps,
+        "new": new,
+    }
+
+
+def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[str, float]:
+    """Variance of the gradient at the initial parameters, summed over elements: stock and crossed halves."""
+    renderer = mitsuba_renderer(problem)
+    now = problem.initial()
+    estimator = ur.PathGradient(spp=spp)
+    state = estimator.init(problem, now)
+    halves, stock = [], []
+    for number in range(count):
+        found, _ = estimator.estimate(problem, now, state, Key(7, number))
+        halves.append(np.concatenate([np.ravel(np.array(g)) for g in found.gradient.values()]))
+        key = Key(8, number)
+        image = renderer.image(now, Shot(0, spp, key.fold(0).uint32())).images[0]
+        paths = renderer.image(now, Shot(0, spp, key.fold(1).uint32())).paths
+        gradient = renderer.adjoint(now, paths, (problem.loss_derivative(0, image),))
+        stock.append(np.concatenate([np.ravel(np.array(g)) for g in gradient.values()]))
+    a, b = (float(np.var(np.stack(x).astype(np.float64), axis=0, ddof=1).sum()) for x in (halves, stock))
+    return {"crossed": a, "independent": b, "ratio": a / b}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--resolution", type=int, default=128)
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--plot-only", action="store_true")
+    asked = parser.parse_args()
+    if not asked.plot_only:
+        print(ur.use())
+        linear = ur.gallery.problem("indirect-room", resolution=asked.resolution, loss="L2")
+        plain, rcv = ur.PathGradient(spp=asked.spp), ur.PathGradient(ur.images.RecursiveControlVariate(), spp=asked.spp)
+        primal = primal_costs(linear, asked.spp)
+        print(primal)
+        steps = {
+            "stock": stock_time(linear, asked.spp),
+            "crossed": median_time(stepper(linear, plain)),
+            "rcv": median_time(stepper(linear, rcv)),
+        }
+        ratios = {"crossed/stock": steps["crossed"][0] / steps["stock"], "rcv/stock": steps["rcv"][0] / steps["stock"]}
+        print(steps, ratios)
+        small = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+        defaults = {name: ur.gallery.problem(name) for name in ur.gallery.names()}
+        figures = {
+            "resolution": asked.resolution,
+            "spp": asked.spp,
+            "primal_ms": primal,
+            "step_ms": steps,
+            "step_ratios": ratios,
+            "gradient_variance": gradient_variance(linear, asked.spp),
+            "outside_kernels": {name: outside_kernels(problem, small) for name, problem in defaults.items()},
+        }
+        print(figures["gradient_variance"], figures["outside_kernels"])
+        write(HERE, figures)
+    plot(read(HERE))
+
+
+def plot(results: dict[str, Any]) -> None:
+    """Two bar charts: primal and step."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    primal = {k: results["primal_ms"][k][0] for k in ("mitsuba_prb", "plain", "pair")}
+    steps = {
+        "stock loop": results["step_ms"]["stock"],
+        "crossed halves": results["step_ms"]["crossed"][0],
+        "control variate": results["step_ms"]["rcv"][0],
+    }
+    for axis, bars, title in zip(axes, (primal, steps), ("primal render", "whole step"), strict=True):
+        axis.bar(list(bars), list(bars.values()), color=["#888888", "#d1782a", "#1f6fb4"])
+        axis.set(title=f"{title}, {results['resolution']}², {results['spp']} spp", ylabel="milliseconds")
+    figure.savefig(HERE / "figure.png", dpi=110)
+    print(f"wrote {HERE / 'figure.png'}")
+
+
+if __name__ == "__main__":
+    main()
