@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """The adjoint against finite differences of the pair's previous image on the very same paths, for BSDFs of every kind.
 
 On one set of paths the previous image is a smooth function of the previous state, and path replay is its exact derivative:
@@ -76,20 +79,25 @@ def test_repeating_repeats_the_image_to_the_bit_and_the_gradient_to_rounding() -
     shots = [renderer.image(current, Shot(0, 4, 9)) for _ in range(3)]
     images = [np.array(shot.images[0]) for shot in shots]
     gradients = [np.array(renderer.adjoint(current, shot.paths, weight)[key]) for shot in shots]
-    for image, gradient in zip(images[1:], gradients[1:]):
+    for image, gradient in zip(images[1:], gradients[1:], strict=True):
         assert np.array_equal(images[0], image)
         np.testing.assert_allclose(gradient, gradients[0], rtol=1e-4, atol=1e-5 * np.abs(gradients[0]).max())
 
 
 def test_gradients_agree_with_mitsuba_prb() -> None:
     """Our path replay and Mitsuba's `prb` estimate the same derivative of the mean image with respect to a colour."""
-    renderer = MitsubaRenderer(scene({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.4, 0.3]}}), DEPTH)
+    renderer = MitsubaRenderer(
+        scene({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.4, 0.3]}}), DEPTH
+    )
     key = next(k for k in renderer.parameters() if k.startswith("ball") and k.endswith("reflectance.value"))
     renderer.select([key], None)
     current = renderer.values([key])
     weight = renderer.array(np.full((SIZE, SIZE, 3), 1 / SIZE**2))
     ours = np.stack(
-        [np.array(renderer.adjoint(current, renderer.image(current, Shot(0, 64, s)).paths, (weight,))[key]) for s in range(12)]
+        [
+            np.array(renderer.adjoint(current, renderer.image(current, Shot(0, 64, s)).paths, (weight,))[key])
+            for s in range(12)
+        ]
     )
     import drjit as dr
 

@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """Both images of the pair against separate renders, and our kernel against Mitsuba's `path`, for BSDFs of every kind."""
 
 from __future__ import annotations
@@ -40,7 +43,9 @@ def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
     renderer.select(["floor.bsdf.reflectance.data"], None)
     ours = renderer.image(renderer.values(["floor.bsdf.reflectance.data"]), Shot(0, RUNS * SPP, 1, RUNS))
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
-    theirs = [np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)]
+    theirs = [
+        np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)
+    ]
     verdict, figures = agree(runs(ours.images), np.stack(theirs).astype(np.float64))
     assert verdict, figures
 

@@ -30,7 +30,11 @@ def scene(bsdf: dict[str, Any], environment: bool = True) -> dict[str, Any]:
             "to_world": to().look_at([0, -4, 2.2], [0, 0, 0.55], [0, 0, 1]),
             "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
         },
-        "floor": {"type": "rectangle", "to_world": to().scale(3), "bsdf": {"type": "diffuse", "reflectance": texture(1)}},
+        "floor": {
+            "type": "rectangle",
+            "to_world": to().scale(3),
+            "bsdf": {"type": "diffuse", "reflectance": texture(1)},
+        },
         "ball": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "thing": bsdf},
         "lamp": {
             "type": "rectangle",
@@ -44,7 +48,11 @@ def scene(bsdf: dict[str, Any], environment: bool = True) -> dict[str, Any]:
 
 
 def bumps() -> dict[str, Any]:
-    return {"type": "bitmap", "bitmap": mi.Bitmap(np.random.default_rng(3).random((8, 8, 1)).astype(np.float32)), "raw": True}
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.random.default_rng(3).random((8, 8, 1)).astype(np.float32)),
+        "raw": True,
+    }
 
 
 def normals() -> dict[str, Any]:
@@ -54,7 +62,10 @@ def normals() -> dict[str, Any]:
 
 
 def rough(alpha: float = 0.3) -> dict[str, Any]:
-    return {"type": "roughconductor", "alpha": {"type": "bitmap", **{k: v for k, v in texture(7, 1, 0.1, 0.5).items() if k != "type"}}}
+    return {
+        "type": "roughconductor",
+        "alpha": {"type": "bitmap", **{k: v for k, v in texture(7, 1, 0.1, 0.5).items() if k != "type"}},
+    }
 
 
 # name -> (material, {ending of a key: factor of its change})
@@ -69,7 +80,10 @@ MATERIALS: dict[str, tuple[Any, dict[str, float]]] = {
         {"diffuse_reflectance.data": 0.9},
     ),
     "rough conductor": (rough, {"alpha.data": 1.2}),
-    "conductor": (lambda: {"type": "conductor", "specular_reflectance": texture(2)}, {"specular_reflectance.data": 0.9}),
+    "conductor": (
+        lambda: {"type": "conductor", "specular_reflectance": texture(2)},
+        {"specular_reflectance.data": 0.9},
+    ),
     "glass": (
         lambda: {"type": "dielectric", "specular_transmittance": {"type": "rgb", "value": [0.9, 0.8, 0.7]}},
         {"specular_transmittance.value": 0.9},
@@ -78,7 +92,10 @@ MATERIALS: dict[str, tuple[Any, dict[str, float]]] = {
         lambda: {"type": "thindielectric", "specular_transmittance": {"type": "rgb", "value": [0.9, 0.8, 0.7]}},
         {"specular_transmittance.value": 0.9},
     ),
-    "rough glass": (lambda: {"type": "roughdielectric", "alpha": 0.3, "specular_transmittance": texture(2)}, {"specular_transmittance.data": 0.9}),
+    "rough glass": (
+        lambda: {"type": "roughdielectric", "alpha": 0.3, "specular_transmittance": texture(2)},
+        {"specular_transmittance.data": 0.9},
+    ),
     "principled": (
         lambda: {
             "type": "principled",
@@ -100,18 +117,27 @@ MATERIALS: dict[str, tuple[Any, dict[str, float]]] = {
         {"nested_bsdf.reflectance.data": 0.9},
     ),
     "mask": (
-        lambda: {"type": "mask", "opacity": texture(9, 1, 0.3, 0.8), "b": {"type": "twosided", "b": {"type": "diffuse", "reflectance": texture(2)}}},
+        lambda: {
+            "type": "mask",
+            "opacity": texture(9, 1, 0.3, 0.8),
+            "b": {"type": "twosided", "b": {"type": "diffuse", "reflectance": texture(2)}},
+        },
         {"opacity.data": 0.9, "nested_bsdf.brdf_0.reflectance.data": 0.9},
     ),
     "blend": (
-        lambda: {"type": "blendbsdf", "weight": texture(9, 1), "a": {"type": "diffuse", "reflectance": texture(2)}, "b": rough()},
+        lambda: {
+            "type": "blendbsdf",
+            "weight": texture(9, 1),
+            "a": {"type": "diffuse", "reflectance": texture(2)},
+            "b": rough(),
+        },
         {"weight.data": 0.9, "alpha.data": 1.2},
     ),
     "blend with a mirror, unchanged": (
         lambda: {"type": "blendbsdf", "weight": 0.5, "a": {"type": "conductor"}, "b": {"type": "diffuse"}},
         {"floor.bsdf.reflectance.data": 0.9},
     ),
-}  # fmt: skip
+}
 LIGHTS = {"lamp.emitter.radiance.value": 0.9, "sky.data": 1.1}
 
 
@@ -126,4 +152,4 @@ def two_states(renderer: MitsubaRenderer, changes: dict[str, float]) -> tuple[di
     keys = [key for end in changes for key in renderer.parameters() if key.endswith(end)]
     assert len(keys) == len(changes), f"{changes} -> {keys}"
     current = renderer.values(keys)
-    return current, {key: current[key] * factor for key, factor in zip(keys, changes.values())}
+    return current, {key: current[key] * factor for key, factor in zip(keys, changes.values(), strict=True)}

@@ -105,4 +105,3 @@ class PathGradient:
         loss = sum(arrays.number(value) for value in losses)
         info = {"samples": samples, "images": pictures, **told}
         return Estimate(loss, gradient, info=info), next_state
-

@@ -115,7 +115,9 @@ class RecursiveControlVariate:
         weight = statistics.control_weight(
             welford.covariance(used.joint), var_previous, memory.relative_variance * var_previous
         )
-        images = tuple(advance(memory.image, f, h, weight) for f, h in zip(rendering.images, rendering.previous))
+        images = tuple(
+            advance(memory.image, f, h, weight) for f, h in zip(rendering.images, rendering.previous, strict=True)
+        )
         seen = used if self.update_before_use else self._observe(memory, F, H)
         var_current, var_previous = welford.covariance(seen.current), welford.covariance(seen.previous)
         variance = statistics.control_variate_variance(

@@ -107,7 +107,7 @@ class AnalyticRenderer:
         """See `Renderer.adjoint`."""
         rows = self._rows(paths.pixels)
         flat = np.zeros(self.matrix.shape[1])
-        for group, weight in zip(self._grouped(paths), weights):
+        for group, weight in zip(self._grouped(paths), weights, strict=True):
             factor = 1 + self.noise * (2 * group[..., 0] - 1).mean(axis=-1)
             flat += (weight.reshape(-1) * factor.reshape(-1)) @ self.matrix[rows] / paths.groups
         gradient, start = {}, 0
@@ -141,5 +141,7 @@ class AnalyticRenderer:
         images = []
         for group in self._grouped(paths):
             u = (2 * group - 1).mean(axis=2).reshape(-1, 2)
-            images.append((self.offset[rows] + linear * (1 + self.noise * u[:, 0]) + self.grain * u[:, 1]).reshape(shape))
+            images.append(
+                (self.offset[rows] + linear * (1 + self.noise * u[:, 0]) + self.grain * u[:, 1]).reshape(shape)
+            )
         return tuple(images)

@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """From pixels to camera rays, from path radiance back to pixels: one box filter, independent samples.
 
 The film's own reconstruction filter is not used. Per-pixel statistics need pixels whose samples are their own, so every
@@ -34,7 +37,9 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
         index = dr.gather(mi.UInt32, pixels, index)
     y = index // width
     position = mi.Point2f(index - y * width, y) + sampler.next_2d()
-    time = sensor.shutter_open() + (sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0)
+    time = sensor.shutter_open() + (
+        sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0
+    )
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray_differential(
         mi.Float(time), 0.5, mi.Point2f(position.x / width, position.y / height), aperture

@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """Mitsuba's answer to the renderer port."""
 
 from __future__ import annotations
@@ -84,7 +87,9 @@ class MitsubaRenderer:
         for key in keys:
             if key not in self._info:
                 near = difflib.get_close_matches(key, self._info, n=1)
-                raise InputError(f"parameter {key}: the scene has none of that name" + (f"; did you mean {near[0]}?" if near else ""))
+                raise InputError(
+                    f"parameter {key}: the scene has none of that name" + (f"; did you mean {near[0]}?" if near else "")
+                )
             info = self._info[key]
             if not info.differentiable:
                 raise InputError(f"parameter {key}: it cannot be recovered by gradients, since {info.reason}")
@@ -131,7 +136,9 @@ class MitsubaRenderer:
         self._set_previous(previous)
         if space == "primary":
             radiance = self._function(shot, "image")(self.pair.current, None, None, *self._arguments(shot))
-            radiance_previous = self._function(shot, "previous image")(self.pair.previous, None, None, *self._arguments(shot))
+            radiance_previous = self._function(shot, "previous image")(
+                self.pair.previous, None, None, *self._arguments(shot)
+            )
         else:
             tables = dict(self.pair.tables(), delta=self._delta_table)
             frozen = self._function(shot, "pair")
@@ -147,7 +154,9 @@ class MitsubaRenderer:
         for leaf in self._leaves.values():
             dr.clear_grad(leaf)
         frozen = self._function(shot, "adjoint")
-        frozen(self.pair.current, None, {"delta": self._delta_table}, *self._arguments(shot), paths.radiance, list(weights))
+        frozen(
+            self.pair.current, None, {"delta": self._delta_table}, *self._arguments(shot), paths.radiance, list(weights)
+        )
         gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
         dr.eval(gradient)
         return gradient
@@ -178,7 +187,9 @@ class MitsubaRenderer:
 
         def trace(scene, previous, tables, seed, pixels, radiance=None, weights=None):
             # `previous` is read through pointers only: as an argument it becomes an input of the frozen kernel.
-            sampler = self._sampler.clone()  # a seeded one would die, and free memory, while the next kernel is recorded
+            sampler = (
+                self._sampler.clone()
+            )  # a seeded one would die, and free memory, while the next kernel is recorded
             with dr.suspend_grad():
                 ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
                 if what == "adjoint":

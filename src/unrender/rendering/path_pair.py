@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """The surface path tracer: next-event estimation, multiple importance sampling, roulette, for one state or two, and its adjoint.
 
 Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. A subscript ₚ
@@ -170,7 +173,7 @@ class PathPair:
 
         return L, Lₚ
 
-    def _delta_value(self, kind, bsdf, si, bs, sample_1, sample_2, active):  # noqa: PLR0913
+    def _delta_value(self, kind, bsdf, si, bs, sample_1, sample_2, active):
         """The value of the perfectly specular lobe that was sampled, which no BSDF evaluation returns.
 
         A conductor's, dielectric's or plastic's is had by sampling that lobe alone, with probability one; a mask's null lobe from

@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
 """One scene description, loaded twice: the *current* and the *previous* state, and the tables that lead from one to the other.
 
 Paths are traced in the current scene only. At a hit, the BSDF, emitter or shape of the previous state is found by a gather
@@ -138,7 +141,7 @@ class ScenePair:
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
-        return {key: self._info(key) for key in self.current_parameters.keys()}
+        return {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)
@@ -186,9 +189,9 @@ def carriage(parameters: Any, key: str) -> Carriage:
     if any(isinstance(n, mi.Sensor) for n in chain):
         return Carriage(True, None, "it moves the sensor")
     if any(isinstance(n, mi.Shape) for n in chain):
-        if leaf.startswith(("vertex_color", "face_color")) or leaf.startswith(("vertex_", "face_")) and leaf not in (
+        if leaf.startswith(("vertex_color", "face_color")) or (leaf.startswith(("vertex_", "face_")) and leaf not in (
             "vertex_positions", "vertex_normals", "vertex_texcoords"
-        ):  # fmt: skip
+        )):  # fmt: skip
             return Carriage(False, None, "")  # a mesh attribute, read through the shape pointer
         return Carriage(True, None, "it moves a shape")
     return Carriage(True, None, "it is neither a material's nor an emitter's")
@@ -216,7 +219,11 @@ def _physical_range(parameters: Any, key: str) -> tuple[float | None, float | No
     while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
     if isinstance(node, mi.Emitter):
-        return (0.0, None) if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data") else (None, None)
+        return (
+            (0.0, None)
+            if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data")
+            else (None, None)
+        )
     if not isinstance(node, mi.BSDF):
         return None, None
     if role in ("alpha", "alpha_u", "alpha_v", "roughness"):

@@ -106,7 +106,7 @@ def optimize(
     run = Run(problem, estimator, optimizer, seed, steps, seconds, parameters)
     history: list[dict[str, Any]] = []
     noise = GradientNoise()
-    silent = {key: True for key in parameters}
+    silent = dict.fromkeys(parameters, True)
     samples, in_a_row, next_error = 0, 0, 0.0
 
     warmup = _warm_up(run, state, memory)
@@ -230,7 +230,9 @@ def _warm_up(run: Run, state: Any, memory: Any) -> float:
     return time.perf_counter() - started
 
 
-def _apply(problem: Problem, estimate: Estimate, memory: Any, optimizer: Optimizer, parameters: Tree) -> tuple[Tree, Any]:
+def _apply(
+    problem: Problem, estimate: Estimate, memory: Any, optimizer: Optimizer, parameters: Tree
+) -> tuple[Tree, Any]:
     """Precondition, update, bound. The optimizer sees S g, the parameters S (step): descent in u where x = S u."""
     maps = problem.preconditioners
     gradient = {k: maps[k].apply(g) if k in maps else g for k, g in estimate.gradient.items()}
@@ -246,7 +248,9 @@ def _watch_influence(run: Run, estimate: Estimate, silent: dict[str, bool]) -> N
     for key, gradient in estimate.gradient.items():
         silent[key] = silent[key] and arrays.number(arrays.total(gradient * gradient)) == 0.0
         if silent[key] and run.step == _INFLUENCE_STEPS:
-            run.warnings.append(f"parameter {key}: its gradient is zero so far; it does not seem to influence the images")
+            run.warnings.append(
+                f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"
+            )
 
 
 def _budget(run: Run, non_finite_in_a_row: int) -> None:
