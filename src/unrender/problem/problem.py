@@ -235,9 +235,12 @@ class Problem:
         if key not in self._initial:
             raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, self._initial)}")
         try:
-            return values.fill(value, self._initial[key].shape)[0]
+            array, notice = values.fill(value, self._initial[key].shape)
         except InputError as error:
             raise FieldError(("truth", key), str(error)) from error
+        if notice:
+            self.notices.append(f"parameter {key}: truth {notice}")
+        return array
 
 
 def _open(scene: Any, max_depth: int) -> Renderer:
