@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import gc
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,9 @@ from unrender.rendering.path_pair import DELTA_MASK, DELTA_SIMPLE, PathPair
 from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
 from unrender.rendering.scene_pair import SceneDescription, ScenePair, from_tensor, to_tensor
 from unrender.trees import Tree
+
+
+_log = logging.getLogger("unrender")
 
 
 @dataclass(frozen=True)
@@ -125,8 +129,7 @@ class MitsubaRenderer:
     def image(self, parameters: Tree, shot: Shot) -> Rendering:
         """Render. Unbiased; box filter."""
         self._set_current(parameters)
-        frozen = self._function(shot, "image")
-        radiance = frozen(self.pair.current, None, None, *self._arguments(shot))
+        radiance = self._run("image", shot)
         dr.eval(radiance)
         return Rendering(self._develop(radiance, shot), None, Paths(shot, radiance))
 
@@ -135,14 +138,11 @@ class MitsubaRenderer:
         self._set_current(current)
         self._set_previous(previous)
         if space == "primary":
-            radiance = self._function(shot, "image")(self.pair.current, None, None, *self._arguments(shot))
-            radiance_previous = self._function(shot, "previous image")(
-                self.pair.previous, None, None, *self._arguments(shot)
-            )
+            radiance = self._run("image", shot)
+            radiance_previous = self._run("previous image", shot)
         else:
             tables = dict(self.pair.tables(), delta=self._delta_table)
-            frozen = self._function(shot, "pair")
-            radiance, radiance_previous = frozen(self.pair.current, self.pair.previous, tables, *self._arguments(shot))
+            radiance, radiance_previous = self._run("pair", shot, tables)
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, shot), self._develop(radiance_previous, shot)
         return Rendering(*images, Paths(shot, radiance))
@@ -151,18 +151,10 @@ class MitsubaRenderer:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `Renderer.adjoint`."""
         self._set_current(parameters)
         shot = paths.shot
-        for leaf in self._leaves.values():
-            dr.clear_grad(leaf)
-        frozen = self._function(shot, "adjoint")
-        frozen(
-            self.pair.current, None, {"delta": self._delta_table}, *self._arguments(shot), paths.radiance, list(weights)
-        )
+        self._run("adjoint", shot, {"delta": self._delta_table}, paths.radiance, list(weights))
         gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
         dr.eval(gradient)
         return gradient
-
-    def _arguments(self, shot: Shot) -> tuple[Any, Any]:
-        return mi.UInt32(shot.seed), shot.pixels
 
     def _count(self, shot: Shot) -> int:
         if shot.pixels is not None:
@@ -174,22 +166,39 @@ class MitsubaRenderer:
         shape = (self._count(shot), 3) if shot.pixels is not None else (*self.resolutions()[shot.sensor], 3)
         return camera.develop(radiance, shot.spp, shot.groups, shape)
 
-    def _function(self, shot: Shot, what: str) -> Callable[..., Any]:
-        """The frozen kernel for shots of this form: traced once, replayed at each step."""
+    def _run(self, what: str, shot: Shot, tables: Any = None, *more: Any) -> Any:
+        """Call the frozen kernel for shots of this form: traced once, replayed at each step."""
         count = self._count(shot)
         key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None)
         if key not in self._frozen:
             self._frozen[key] = _uncollected(dr.freeze(self._trace(what, shot.sensor, shot.spp, count)))
-        return self._frozen[key]
+        scene = self.pair.previous if what == "previous image" else self.pair.current
+        arguments = (scene, [self.pair.current, *self.pair.others()], tables, mi.UInt32(shot.seed), shot.pixels, *more)
+        try:
+            self._clear_gradients()
+            return self._frozen[key](*arguments)
+        except RuntimeError as error:
+            if "frozen function" not in str(error):
+                raise
+            # Mitsuba objects outside these scenes, even unused ones, can keep Dr.Jit from recording.
+            _log.warning(
+                "this process holds other Mitsuba objects, which keep kernels from being frozen: steps are slower"
+            )
+            self._frozen[key] = self._trace(what, shot.sensor, shot.spp, count)
+            self._clear_gradients()
+            return self._frozen[key](*arguments)
+
+    def _clear_gradients(self) -> None:
+        for leaf in self._leaves.values():
+            dr.clear_grad(leaf)
 
     def _trace(self, what: str, sensor: int, spp: int, count: int) -> Callable[..., Any]:
         kernel = self._geometric_kernel() if self._geometric else self._kernel
 
-        def trace(scene, previous, tables, seed, pixels, radiance=None, weights=None):
-            # `previous` is read through pointers only: as an argument it becomes an input of the frozen kernel.
-            sampler = (
-                self._sampler.clone()
-            )  # a seeded one would die, and free memory, while the next kernel is recorded
+        def trace(scene, living, tables, seed, pixels, radiance=None, weights=None):
+            del living  # read through pointers, if at all
+            # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
+            sampler = self._sampler.clone()
             with dr.suspend_grad():
                 ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
                 if what == "adjoint":

@@ -9,6 +9,7 @@ from pointer id to pointer id. No adapter plugin is needed, and every BSDF that 
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +83,10 @@ class Carriage:
     reason: str
 
 
+_living: weakref.WeakSet[ScenePair] = weakref.WeakSet()
+"""Frozen kernels must be handed every scene whose objects they might call through a pointer."""
+
+
 class ScenePair:
     """Two loads of one description.
 
@@ -100,6 +105,7 @@ class ScenePair:
         self._previous: Any = None
         self._previous_parameters: Any = None
         self._tables: dict[str, Any] | None = None
+        _living.add(self)
 
     @property
     def previous(self) -> Any:
@@ -108,6 +114,12 @@ class ScenePair:
             self._previous = load(self.description)
             self._previous_parameters = mi.traverse(self._previous)
         return self._previous
+
+    def others(self) -> list[Any]:
+        """Every scene but the current one that any pair of this process holds, the own previous one among them."""
+        return [
+            scene for pair in _living for scene in (pair.current, pair._previous) if scene not in (None, self.current)
+        ]
 
     @property
     def previous_parameters(self) -> Any:

@@ -1,0 +1,181 @@
+"""The main job on scenes that the project did not make, through the command line as a user types it.
+
+    python benchmarks/real_input/run.py ASSETS [--seconds 60] [--resolution 128]
+
+ASSETS holds `tutorials/` (mitsuba-tutorials' scenes) and `spot/`, `textures/` (Keenan Crane's model, mitsuba-data's pictures).
+`cbox`: the tutorials' cbox.xml with its mirror and glass spheres, its back wall papered with the flower photograph. `spot`: Spot with
+her own texture under museum.exr, seen from four sides. The references are rendered by Mitsuba's `path`; the textures start grey.
+Writes, per scene, scene.xml, references, problem.toml and run folders under benchmarks/real_input/out/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import mitsuba as mi
+import numpy as np
+from skimage.transform import resize
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common import write
+
+import unrender as ur
+
+HERE = Path(__file__).resolve().parent
+TEXTURE = 128
+
+
+def picture(path: Path) -> np.ndarray:
+    """A photograph as linear float32 (TEXTURE, TEXTURE, 3)."""
+    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    small = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
+    return np.clip(small, 0.02, 0.95).astype(np.float32)
+
+
+def cbox(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
+    """The Cornell box, its back wall with texture coordinates and a photograph."""
+    mi.Bitmap(picture(assets / "tutorials/textures/flower_photo.jpeg")).write(str(folder / "truth.exr"))
+    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    wall = (assets / "tutorials/meshes/cbox_back.obj").read_text()
+    wall = wall.replace("f 1 2 3 4", "vt 1 0\nvt 1 1\nvt 0 1\nvt 0 0\nf 1/1 2/2 3/3 4/4")
+    (folder / "back.obj").write_text(wall)
+    paper = (
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="truth.exr"/>'
+        '<boolean name="raw" value="true"/></texture></bsdf>'
+    )
+    back = f'<shape type="obj" id="back"><string name="filename" value="back.obj"/>{paper}</shape>'
+    text = re.sub(r'<shape type="obj" id="back">.*?</shape>', back, text, flags=re.DOTALL)
+    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
+    (folder / "scene.xml").write_text(text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>'))
+    return "back.bsdf.reflectance.data", 1
+
+
+def spot(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
+    """Spot under an environment map, four cameras around her."""
+    mi.Bitmap(picture(assets / "spot/spot_texture.png")).write(str(folder / "truth.exr"))
+    cameras = "".join(
+        f'<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
+        f'<lookat origin="{3 * np.sin(a):.4f}, 0.7, {3 * np.cos(a):.4f}" target="0, 0.1, 0" up="0, 1, 0"/></transform>'
+        f'<film type="hdrfilm"><integer name="width" value="{resolution}"/><integer name="height" value="{resolution}"/>'
+        f'<rfilter type="box"/></film></sensor>'
+        for a in np.radians([30, 120, 210, 300])
+    )
+    (folder / "scene.xml").write_text(
+        f'<scene version="3.0.0">{cameras}<emitter type="envmap"><string name="filename" '
+        f'value="{assets / "textures/museum.exr"}"/></emitter><shape type="obj" id="spot"><string name="filename" '
+        f'value="{assets / "spot/spot.obj"}"/><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        f'<string name="filename" value="truth.exr"/><boolean name="raw" value="true"/></texture></bsdf></shape></scene>'
+    )
+    return "spot.bsdf.reflectance.data", 4
+
+
+def prepare(make: Any, assets: Path, folder: Path, resolution: int) -> None:
+    """Write the scene, its references and the problem file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    key, views = make(assets, folder, resolution)
+    scene = mi.load_file(str(folder / "scene.xml"))
+    path = mi.load_dict({"type": "path", "max_depth": 6})
+    lines = [
+        'scene = "scene.xml"',
+        'loss = "L1"',
+        "max_depth = 6",
+        "",
+        "[[parameters]]",
+        f'key = "{key}"',
+        "initial = 0.5",
+    ]
+    lines += ['truth = "truth.exr"']
+    for view in range(views):
+        image = sum(np.array(mi.render(scene, sensor=view, integrator=path, spp=256, seed=n)) for n in range(8)) / 8
+        mi.Bitmap(image.astype(np.float32)).write(str(folder / f"view{view}.exr"))
+        lines += ["", "[[views]]", f'reference = "view{view}.exr"', f"sensor = {view}"]
+    (folder / "problem.toml").write_text("\n".join(lines) + "\n")
+
+
+def recover(folder: Path, method: str, seconds: float, settings: list[str]) -> dict[str, Any]:
+    """Run the command line and read what it left."""
+    out = folder / method
+    command = ["unrender", "run", str(folder / "problem.toml"), "--method", method, "--seconds", str(seconds)]
+    command += [word for setting in settings for word in ("--set", setting)] + ["--out", str(out), "--overwrite"]
+    print(" ".join(command), flush=True)
+    subprocess.run([sys.executable, "-m", *command], check=True)
+    run = json.loads((out / "run.json").read_text())
+    errors = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
+    errors = [next(iter(e["parameter_error"].values())) for e in errors if e.get("parameter_error")]
+    with np.load(out / "pictures.npz") as pictures:
+        image = [
+            float(np.sqrt(np.mean((pictures[f"view0/{what}"] - pictures["view0/reference"]) ** 2)))
+            for what in ("initial", "result")
+        ]
+    with (
+        np.load(out / "parameters.npz") as found,
+        np.load(out / "truth.npz") as truth,
+        np.load(out / "initial.npz") as start,
+    ):
+        key = next(iter(found))
+        seen = np.abs(found[key] - start[key]).max(axis=-1) > 1e-3  # texels that any view tells of
+        rmse = [float(np.sqrt(np.mean((x[key] - truth[key])[seen] ** 2))) for x in (start, found)]
+    return {
+        "command": " ".join(["unrender", *command[1:]]).replace(str(HERE), "benchmarks/real_input"),
+        "steps": run["steps"],
+        "seconds": run["seconds"],
+        "texture_rmse": [errors[0], errors[-1]],
+        "texture_rmse_where_seen": rmse,
+        "share_seen": float(seen.mean()),
+        "image_rmse_view0": image,
+    }
+
+
+def plot() -> None:
+    """Per scene: reference, start and result of its first view, true and recovered texture."""
+    figure, axes = plt.subplots(2, 5, figsize=(13, 5.4), layout="constrained")
+    for row, name in zip(axes, ("cbox", "spot"), strict=True):
+        out = HERE / "out" / name / "rcv"
+        with np.load(out / "pictures.npz") as p, np.load(out / "parameters.npz") as q, np.load(out / "truth.npz") as t:
+            shown = [
+                p["view0/reference"],
+                p["view0/initial"],
+                p["view0/result"],
+                next(iter(t.values())),
+                next(iter(q.values())),
+            ]
+        scale = np.percentile(shown[0], 97)
+        titles = ("reference", "start", "recovered (rcv)", "true texture", "recovered texture")
+        for number, (axis, image, title) in enumerate(zip(row, shown, titles, strict=True)):
+            axis.imshow(np.clip(image / (scale if number < 3 else 1), 0, 1) ** (1 / 2.2))
+            axis.set(title=f"{name}: {title}", xticks=[], yticks=[])
+    figure.savefig(HERE / "figure.png", dpi=80)
+    print(f"wrote {HERE / 'figure.png'}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("assets", type=Path)
+    parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--resolution", type=int, default=128)
+    parser.add_argument("--plot-only", action="store_true")
+    asked = parser.parse_args()
+    if not asked.plot_only:
+        ur.use()
+        figures: dict[str, Any] = {"resolution": asked.resolution, "scenes": {}}
+        for name, make in (("cbox", cbox), ("spot", spot)):
+            folder = HERE / "out" / name
+            prepare(make, asked.assets.resolve(), folder, asked.resolution)
+            figures["scenes"][name] = {
+                "plain": recover(folder, "plain", asked.seconds, ["spp=8", "learning_rate=0.01"]),
+                "rcv": recover(folder, "rcv", asked.seconds, ["spp=2", "learning_rate=0.01"]),
+            }
+            print(figures["scenes"][name])
+        write(HERE, figures)
+    plot()
+
+
+if __name__ == "__main__":
+    main()
