@@ -8,6 +8,9 @@ bias, relative to the mean of the image, is measured twice: as the mean over run
 parameters, and, far more sharply, less the same recursion on the same samples with weights fixed beforehand (those of
 other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp of one step times
 Var[plain] / Var[control variate].
+
+At few samples a part of the bias is not of the order: while a pixel has seen equal samples only (often 0), its variance
+is 0, so is its weight, and those samples are forgotten once another comes. `--spp 32` shows the order alone.
 """
 
 from __future__ import annotations
