@@ -15,12 +15,10 @@ from rich.table import Table
 from unrender.cli.progress import Progress
 from unrender.methods import Method
 from unrender.problem.problem import Problem
-from unrender.problem.render import render
 from unrender.training.loop import optimize
+from unrender.training.pictures import pictures
 from unrender.training.result import Result
 
-_PICTURE_PATHS = 1 << 22
-_FEWEST, _MOST = 16, 512
 _FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz", "report.html")
 
 
@@ -64,26 +62,6 @@ def execute(plan: Plan, directory: Path, console: Console) -> Result:
     result = replace(result, pictures=pictures(problem, result, plan.final_spp))
     result.save(directory)
     return result
-
-
-def pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
-    """Reference, initial and final picture of each view, and the control weight where there is one.
-
-    Args:
-        problem, result: whose.
-        spp: samples per pixel, or None for as many as some four million paths per picture allow.
-    """
-    weights = result.info.get("control_weight", {})
-    found: dict[str, np.ndarray] = {}
-    for index, view in enumerate(problem.views):
-        reference = np.asarray(view.reference, np.float32)
-        samples = spp or min(max(_PICTURE_PATHS // (reference.size // 3), _FEWEST), _MOST)
-        found[f"view{index}/reference"] = reference
-        found[f"view{index}/initial"] = render(problem, result.initial, index, samples, seed=1)
-        found[f"view{index}/result"] = render(problem, result.parameters, index, samples, seed=2)
-        if index in weights:
-            found[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
-    return found
 
 
 def image_errors(result: Result, which: str = "result") -> list[float]:

@@ -18,11 +18,10 @@ import numpy as np
 
 from unrender.errors import InputError
 from unrender.rendering import camera
-from unrender.rendering.path_pair import DELTA_MASK, DELTA_SIMPLE, PathPair
+from unrender.rendering.path_pair import DELTA_EQUAL, PathPair
 from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
-from unrender.rendering.scene_pair import SceneDescription, ScenePair, from_tensor, to_tensor
+from unrender.rendering.scene_pair import Carriage, SceneDescription, ScenePair, from_tensor, to_tensor
 from unrender.trees import Tree
-
 
 _log = logging.getLogger("unrender")
 
@@ -109,19 +108,19 @@ class MitsubaRenderer:
             self._native = {key: self.pair.current_parameters[key] for key in keys}
             rides = [self.pair.carriage(key) for key in keys]
             self._geometric = any(ride.geometric for ride in rides)
-            changing = [r.bsdf for r in rides if r.bsdf is not None and mi.has_flag(r.bsdf.flags(), mi.BSDFFlags.Delta)]
+            changing = [ride for ride in rides if ride.delta != DELTA_EQUAL]
             self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
             self._delta_table = self._delta_kinds(changing)
             self._leaves, self._loaded, self._loaded_previous = {}, {}, {}
             self._frozen.clear()
 
-    def _delta_kinds(self, changing: list[Any]) -> Any:
+    def _delta_kinds(self, changing: list[Carriage]) -> Any:
         pointers = self.pair.current.shapes_dr().bsdf()
         table = np.zeros(int(dr.reinterpret_array(mi.UInt32, pointers).numpy().max(initial=0)) + 1, np.uint32)
-        for bsdf in changing:
-            number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)).numpy()[0])
+        for ride in changing:
+            number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(ride.bsdf)).numpy()[0])
             if number < len(table):
-                table[number] = DELTA_MASK if bsdf.class_name() == "MaskBSDF" else DELTA_SIMPLE
+                table[number] = ride.delta
         return mi.UInt32(table)
 
     # ------------------------------------------------------------------ rendering

@@ -9,6 +9,7 @@ from pointer id to pointer id. No adapter plugin is needed, and every BSDF that 
 
 from __future__ import annotations
 
+import re
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.errors import InputError
+from unrender.rendering.path_pair import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.port import ParameterInfo
 from unrender.variant import ensure
 
@@ -31,6 +33,7 @@ meshes are made twice)."""
 # depend on the parameter.
 _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
 _WRAPPERS = {"TwoSidedBRDF"}
+_BENDERS = {"BumpMap", "NormalMap"}
 
 
 def load(description: SceneDescription) -> Any:
@@ -76,11 +79,15 @@ class Carriage:
         geometric: moves shapes, sensors or emitters, so that paths themselves change.
         bsdf: the outermost BSDF it belongs to, or None.
         reason: why one path cannot serve two values of it, "" if it can.
+        blind: whether path replay cannot tell its derivative either, for the same reason.
+        delta: how the BSDF's perfectly specular lobes follow it, one of `path_pair.DELTA_...`.
     """
 
     geometric: bool
     bsdf: Any
     reason: str
+    blind: bool = False
+    delta: int = DELTA_EQUAL
 
 
 _living: weakref.WeakSet[ScenePair] = weakref.WeakSet()
@@ -162,11 +169,20 @@ class ScenePair:
             shape = native_shape(value)
         except TypeError:
             return ParameterInfo((), False, False, f"its type {type(value).__name__} has no derivatives")
+        if re.match(r"object_\d{9,}\.", key):
+            return ParameterInfo(
+                shape, False, False, "its object has no id in the XML, so its name changes; give it one"
+            )
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
-            return ParameterInfo(shape, False, False, "Mitsuba marks it as not differentiable")
+            why = "Mitsuba marks it as not differentiable"
+            if key.endswith(".data") and dr.is_tensor_v(value):
+                why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
+            return ParameterInfo(shape, False, False, why)
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers")
         ride = self.carriage(key)
+        if ride.blind:
+            return ParameterInfo(shape, False, False, ride.reason)
         low, high = _physical_range(self.current_parameters, key)
         return ParameterInfo(shape, True, not ride.reason, ride.reason, low, high)
 
@@ -191,13 +207,13 @@ def carriage(parameters: Any, key: str) -> Carriage:
         node = parameters.hierarchy[node][0]
     bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
     if bsdfs:
-        return Carriage(False, bsdfs[-1], _delta_reason(bsdfs, chain))
+        return _bsdf_carriage(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
             return Carriage(True, None, "it moves an emitter")
         return Carriage(False, None, "")
     if any(isinstance(n, mi.Medium) for n in chain):
-        return Carriage(False, None, "it belongs to a medium")
+        return Carriage(False, None, "it belongs to a medium, and media are not rendered yet", blind=True)
     if any(isinstance(n, mi.Sensor) for n in chain):
         return Carriage(True, None, "it moves the sensor")
     if any(isinstance(n, mi.Shape) for n in chain):
@@ -209,18 +225,30 @@ def carriage(parameters: Any, key: str) -> Carriage:
     return Carriage(True, None, "it is neither a material's nor an emitter's")
 
 
-def _delta_reason(bsdfs: list[Any], chain: list[Any]) -> str:
-    """Why the delta lobes of this nest of BSDFs (innermost first) cannot follow a change of the parameter."""
+def _bsdf_carriage(bsdfs: list[Any], chain: list[Any]) -> Carriage:
+    """How a parameter inside this nest of BSDFs (innermost first) reaches the picture: what its delta lobes make of it."""
     outer = bsdfs[-1]
-    if not mi.has_flag(outer.flags(), mi.BSDFFlags.Delta):
-        return ""
+    if not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta):
+        return Carriage(False, outer, "")  # whatever mirrors stand beside it do not change
     names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
-    if names == ["MaskBSDF"] or (names[-1] == "MaskBSDF" and not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta)):
-        return ""
-    if len(names) == 1 and names[0] in _SIMPLE_DELTA:
-        bends = not any(isinstance(c, mi.Texture) for c in chain)  # the index of refraction is no texture
-        return "it bends the direction of a perfectly specular lobe" if bends else ""
-    return "its BSDF mixes perfectly specular lobes whose share one path cannot follow"
+    if names == ["MaskBSDF"] and not _masks_delta(outer):
+        return Carriage(False, outer, "", delta=DELTA_MASK)
+    inner = names[0]
+    if inner in _SIMPLE_DELTA and all(name in _BENDERS for name in names[1:]):
+        if not any(isinstance(c, mi.Texture) for c in chain):  # the index of refraction is no texture
+            return Carriage(False, outer, "it bends the direction of a perfectly specular lobe", blind=True)
+        turned = "it lies under a bump or normal map that turns a specular lobe" if names[1:] else ""
+        return Carriage(False, outer, turned, delta=DELTA_SIMPLE)
+    if inner in _BENDERS:
+        return Carriage(False, outer, "it bends the direction of a perfectly specular lobe", blind=True)
+    return Carriage(False, outer, "its BSDF mixes perfectly specular lobes with others", blind=True)
+
+
+def _masks_delta(bsdf: Any) -> bool:
+    """Whether what lies under a mask (the outermost BSDF) has perfectly specular lobes of its own."""
+    return any(
+        mi.has_flag(bsdf.flags(), kind) for kind in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
+    )
 
 
 def _physical_range(parameters: Any, key: str) -> tuple[float | None, float | None]:

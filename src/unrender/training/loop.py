@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from unrender.problem.render import as_tree
 from unrender.training.bounds import project
 from unrender.training.callbacks import Callback
 from unrender.training.noise import GradientNoise
+from unrender.training.pictures import pictures
 from unrender.training.result import Result
 from unrender.trees import Tree
 
@@ -91,7 +92,7 @@ def optimize(
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
             threads add to a gradient in the order they finish, and results agree to rounding.
         callbacks: listeners.
-        run_directory: where to save the result, or None.
+        run_directory: where to save the result, with final pictures of every view for the report; None for nowhere.
 
     Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. A step whose loss or
     gradient is not finite is not applied, nor remembered by the estimator; it is counted in `Result.skipped`.
@@ -163,6 +164,8 @@ def optimize(
         truth=problem.truth,
     )
     if run_directory is not None:
+        result.save(run_directory)  # what took long is safe before what takes seconds more
+        result = replace(result, pictures=pictures(problem, result))
         result.save(run_directory)
     for callback in callbacks:
         callback.on_end(run, result)

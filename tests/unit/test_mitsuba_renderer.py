@@ -1,0 +1,182 @@
+"""What Mitsuba's renderer accepts, refuses and keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from kernels import recorded
+
+import unrender as ur
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+from unrender.rendering.scene_pair import from_tensor, to_tensor
+
+
+def box(**more: Any) -> dict[str, Any]:
+    """Mitsuba's Cornell box, small, its back wall with a texture."""
+    found = mi.cornell_box()
+    found["sensor"]["film"].update(width=16, height=16)
+    values = np.random.default_rng(0).uniform(0.2, 0.8, (8, 8, 3)).astype(np.float32)
+    found["back"]["bsdf"] = {
+        "type": "diffuse",
+        "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True},
+    }
+    return {**found, **more}
+
+
+WALL = "back.bsdf.reflectance.data"
+
+
+def problem(scene: Any, key: str = WALL, views: int = 1, **options: Any) -> ur.Problem:
+    return ur.Problem(scene, [ur.Parameter(key, **options)], [ur.View(np.full((16, 16, 3), 0.3))] * views, max_depth=3)
+
+
+def test_values_survive_the_way_to_a_tensor_and_back() -> None:
+    for value in (
+        mi.Float(0.3),
+        mi.Color3f(0.1, 0.2, 0.3),
+        mi.TensorXf(np.arange(6.0, dtype=np.float32), (1, 2, 3)),
+        mi.Float([1, 2]),
+    ):
+        again = from_tensor(to_tensor(value), value)
+        assert type(again) is type(value)
+        assert np.array_equal(np.array(again), np.array(value))
+
+
+@pytest.mark.parametrize(
+    ("more", "key", "message"),
+    [
+        ({}, "small-box.vertex_positions", 'moves a shape, which space="path" cannot carry.*space="primary"'),
+        ({}, "light.to_world", "no derivatives"),
+        ({}, "small-box.faces", "not differentiable"),
+        ({}, "back.bsdf.reflectanse.data", "did you mean back.bsdf.reflectance.data"),
+        (
+            {"ball": {"type": "sphere", "b": {"type": "blendbsdf", "a": {"type": "conductor"}, "b": {"type": "diffuse"}}}},
+            "ball.bsdf.weight.value",
+            "mixes perfectly specular lobes",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_pair_cannot_carry_is_refused_in_one_line(more: dict[str, Any], key: str, message: str) -> None:
+    renderer = MitsubaRenderer(box(**more))
+    with pytest.raises(ur.InputError, match=message) as caught:
+        renderer.select([key], "path")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_shape_without_a_name_is_refused_with_the_cure(tmp_path: Path) -> None:
+    """Mitsuba names it by its address, which differs between two loads."""
+    file = tmp_path / "scene.xml"
+    file.write_text('<scene version="3.0.0"><sensor type="perspective"/><shape type="sphere"/></scene>')
+    renderer = MitsubaRenderer(file)
+    key = next(k for k in renderer.parameters() if k.endswith("reflectance.value"))
+    with pytest.raises(ur.InputError, match="no id in the XML"):
+        renderer.select([key], None)
+
+
+def test_a_ready_made_object_cannot_be_in_two_states() -> None:
+    mesh = mi.load_dict({"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}})
+    key = "cube.bsdf.reflectance.value"
+    shared = problem(box(cube=mesh), key)
+    estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+    with pytest.raises(ur.InputError, match="function that returns the dictionary"):
+        ur.optimize(shared, estimator, ur.optimizers.Adam(), steps=1)
+
+    def scene() -> dict[str, Any]:
+        return box(cube={"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}})
+
+    assert ur.optimize(problem(scene, key), estimator, ur.optimizers.Adam(), steps=2).steps == 2
+
+
+@pytest.mark.parametrize("image", [ur.images.Plain(), ur.images.RecursiveControlVariate()], ids=["plain", "rcv"])
+def test_no_kernel_is_compiled_after_warm_up(image: Any) -> None:
+    asked = problem(box(), initial=0.5)
+    launched: list[int] = []
+    new: list[int] = []
+
+    class Count(ur.Callback):
+        """Looks at the kernels between one step's end and the next's."""
+
+        def on_start(self, run: Any) -> None:
+            self.recording = recorded()
+            self.found = self.recording.__enter__()
+
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            self.recording.__exit__(None, None, None)
+            launched.append(len(self.found))
+            new.append(sum(self.found))
+            self.recording = recorded()
+            self.found = self.recording.__enter__()
+
+        def on_end(self, run: Any, result: ur.Result) -> None:
+            self.recording.__exit__(None, None, None)
+
+    ur.optimize(asked, ur.PathGradient(image, spp=2), ur.optimizers.Adam(), steps=16, callbacks=[Count()])
+    assert min(launched) > 0
+    assert sum(new[6:]) == 0, new
+
+
+def test_a_kernel_that_is_compiled_each_step_is_noticed() -> None:
+    """The test above can fail: a Python number that changes makes a new kernel."""
+    x = dr.opaque(mi.Float, 1.0, 64)
+    counts = []
+    for step in range(3):
+        with recorded() as found:
+            dr.eval(x * (0.123456 + step / 7))
+        counts.append(sum(found))
+    assert counts[1:] == [1, 1]
+
+
+def test_moving_geometry_runs_in_primary_space() -> None:
+    key = "small-box.vertex_positions"
+    renderer = MitsubaRenderer(box(), 3)
+    renderer.select([key], "primary")
+    current = renderer.values([key])
+    previous = {key: current[key] + 0.02}
+    pair = renderer.image_pair(current, previous, Shot(0, 64, 1), "primary")
+    alone = renderer.image(previous, Shot(0, 64, 1))
+    assert pair.previous is not None
+    assert np.array_equal(np.array(pair.previous[0]), np.array(alone.images[0]))
+    assert not np.array_equal(np.array(pair.previous[0]), np.array(pair.images[0]))
+    gradient = renderer.adjoint(
+        current, renderer.image(current, Shot(0, 64, 1)).paths, (renderer.array(np.ones((16, 16, 3))),)
+    )
+    assert np.isfinite(np.array(gradient[key])).all()
+    assert np.abs(np.array(gradient[key])).max() > 0
+
+
+def test_chosen_pixels_are_the_pixels_of_the_film() -> None:
+    renderer = MitsubaRenderer(box(), 3)
+    renderer.select([WALL], None)
+    now = renderer.values([WALL])
+    whole = np.array(renderer.image(now, Shot(0, 4096, 1)).images[0]).reshape(-1, 3)
+    chosen = np.array([3, 100, 17, 255])
+    some = np.array(renderer.image(now, Shot(0, 4096, 2, pixels=mi.UInt32(chosen))).images[0])
+    assert some.shape == (4, 3)
+    np.testing.assert_allclose(some, whole[chosen], rtol=0.15, atol=0.01)
+
+
+def test_several_views_and_problems_in_one_process() -> None:
+    one, two = problem(box(), views=2, initial=0.5), problem(box(), initial=0.5)
+    estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+    first = ur.optimize(one, estimator, ur.optimizers.Adam(), steps=4)
+    second = ur.optimize(two, estimator, ur.optimizers.Adam(), steps=4)
+    again = ur.optimize(two, estimator, ur.optimizers.Adam(), steps=4)
+    assert set(first.info["control_weight"]) == {0, 1}
+    np.testing.assert_allclose(second.parameters[WALL], again.parameters[WALL], rtol=1e-4, atol=1e-5)
+
+
+def test_both_images_of_render_pair() -> None:
+    asked = problem(box(), initial=0.5)
+    now = {WALL: np.full((8, 8, 3), 0.5, np.float32)}
+    before = {WALL: np.full((8, 8, 3), 0.3, np.float32)}
+    a, b = ur.render_pair(asked, now, before, 16, 0)
+    assert a.shape == b.shape == (16, 16, 3)
+    assert a.mean() > b.mean()
+    same = ur.render_pair(asked, now, now, 16, 0)
+    assert np.array_equal(*same)
