@@ -1,0 +1,99 @@
+"""What a gallery problem may be asked for: the typed fields of its recipe, and their checks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from unrender import checks
+from unrender.errors import InputError
+from unrender.losses import Loss
+from unrender.problem.components import LOSSES, make
+from unrender.problem.field import did_you_mean
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a gallery problem.
+
+    Attributes:
+        name: the keyword.
+        kind: `int`, or `Loss`, which may be given by its name.
+        default: its value where none is given.
+        about: one line for people.
+    """
+
+    name: str
+    kind: type
+    default: Any
+    about: str
+
+
+def whole(default: int, about: str, at_least: int = 1, at_most: int | None = None) -> Any:
+    """A dataclass field: a whole number in [at_least, at_most]."""
+
+    def check(owner: str, name: str, value: Any) -> int:
+        number = checks.whole(owner, name, value, at_least)
+        if at_most is not None and number > at_most:
+            raise InputError(f"{owner}: {name} must be at most {at_most}, got {number}")
+        return number
+
+    return field(default=default, metadata={"kind": int, "about": about, "check": check})
+
+
+def resolution(default: int) -> Any:
+    """The field `resolution`."""
+    return whole(default, "pixels along a side of each view", at_least=4)
+
+
+def texture_resolution(default: int) -> Any:
+    """The field `texture_resolution`."""
+    return whole(default, "texels along a side of each unknown map", at_least=2)
+
+
+def reference_spp(default: int) -> Any:
+    """The field `reference_spp`."""
+    return whole(default, "samples per pixel of the reference pictures")
+
+
+def max_depth(default: int, at_least: int) -> Any:
+    """The field `max_depth`."""
+    return whole(default, "longest light path in segments", at_least=at_least)
+
+
+def _check_loss(owner: str, name: str, value: Any) -> Loss:
+    if isinstance(value, tuple(LOSSES.values())):
+        return value
+    if not isinstance(value, (str, Mapping)):
+        raise InputError(f"{owner}: {name} must be one of unrender.losses or its name, got {value!r}")
+    try:
+        return make(LOSSES, value)
+    except InputError as error:
+        raise InputError(f"{owner}: {name}: {error}") from error
+
+
+LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2 or Huber", "check": _check_loss}
+"""The metadata of the field `loss`."""
+
+
+def of(recipe: type) -> list[Option]:
+    """The options that a recipe has, in its order."""
+    return [Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(recipe)]
+
+
+def fill(name: str, recipe: type, given: Mapping[str, Any]) -> Any:
+    """The recipe with these options, the others at their defaults.
+
+    Raises `InputError` for one that is unknown (with the nearest known one) or out of its range.
+    """
+    fields = {f.name: f for f in dataclasses.fields(recipe)}
+    owner = f"gallery problem {name}"
+    taken = {}
+    for key, value in given.items():
+        if key not in fields:
+            hint = did_you_mean(key, fields) or f"; it has {', '.join(fields)}"
+            raise InputError(f"{owner}: no option {key}{hint}")
+        taken[key] = fields[key].metadata["check"](owner, key, value)
+    return recipe(**taken)

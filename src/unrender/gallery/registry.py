@@ -1,0 +1,65 @@
+"""The gallery's problems by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from unrender.errors import InputError
+from unrender.gallery import fields
+from unrender.gallery.fields import Option
+from unrender.gallery.glossy_room import GlossyRoom
+from unrender.gallery.indirect_room import IndirectRoom
+from unrender.gallery.lamp import Lamp
+from unrender.gallery.recipe import cook
+from unrender.gallery.sunlit_vase import SunlitVase
+from unrender.problem.field import did_you_mean
+from unrender.problem.problem import Problem
+
+_RECIPES: dict[str, type] = {
+    "indirect-room": IndirectRoom,
+    "glossy-room": GlossyRoom,
+    "sunlit-vase": SunlitVase,
+    "lamp": Lamp,
+}
+
+
+def names() -> list[str]:
+    """The problems there are; the first is the one to begin with."""
+    return list(_RECIPES)
+
+
+def summary(name: str) -> str:
+    """One line: what is to be recovered, and from what. Raises `InputError` for an unknown name."""
+    return (_recipe(name).__doc__ or "").split("\n")[0]
+
+
+def options(name: str) -> list[Option]:
+    """What `problem(name, ...)` may be asked for. Raises `InputError` for an unknown name."""
+    return fields.of(_recipe(name))
+
+
+def problem(name: str, **options: Any) -> Problem:
+    """A problem made by code, with its truth known: its scene, its references (rendered now), where the descent starts.
+
+        problem("indirect-room", resolution=64, texture_resolution=64)
+
+    Args:
+        name: one of `names()`.
+        options: see `options(name)`. All have resolution (pixels along a side), texture_resolution, reference_spp,
+            max_depth and loss; the defaults take seconds on two CPU cores, a GPU wants larger ones.
+
+    Returns:
+        the problem. Its references hold noise of their own, which `reference_spp` lowers.
+
+    Raises:
+        InputError: the name or an option is unknown, or an option is out of its range.
+        VariantError: Mitsuba cannot run on this machine.
+    """
+    return cook(name, fields.fill(name, _recipe(name), options))
+
+
+def _recipe(name: str) -> type:
+    if not isinstance(name, str) or name not in _RECIPES:
+        hint = did_you_mean(str(name), _RECIPES) or f"; it has {', '.join(_RECIPES)}"
+        raise InputError(f"gallery: no problem {name}{hint}")
+    return _RECIPES[name]

@@ -1,0 +1,66 @@
+"""Pictures as textures: photographs that every installation of scikit-image carries, and patterns from formulas.
+
+Textures are float32, linear, and stored as they are (`raw`): Mitsuba does not differentiate 8-bit bitmaps.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import skimage.data
+from skimage.transform import resize
+
+Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
+"""Those that lie inside scikit-image's wheel, so that nothing is downloaded."""
+
+DARKEST, BRIGHTEST = 0.04, 0.9
+"""Reflectances of real paints: none is black, none reflects all."""
+
+
+def to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def photograph(name: Photograph, resolution: int) -> np.ndarray:
+    """The middle square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
+    picture = np.asarray(getattr(skimage.data, name)())
+    if picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    height, width = picture.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    linear = to_linear(picture[top : top + side, left : left + side, :3] / 255.0)
+    small = np.asarray(resize(linear, (resolution, resolution), anti_aliasing=resolution < side))
+    return np.clip(DARKEST + (BRIGHTEST - DARKEST) * small, DARKEST, BRIGHTEST).astype(np.float32)
+
+
+def grid(resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (u, v) of texel centres: two arrays (resolution, resolution) in (0, 1), u along columns."""
+    centres = (np.arange(resolution) + 0.5) / resolution
+    u, v = np.meshgrid(centres, centres)
+    return u, v
+
+
+def ramp(x: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> np.ndarray:
+    """A smooth step of `x` from 0 at `low` to 1 at `high`."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3 - 2 * t)
+
+
+def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dict[str, Any]:
+    """A trainable texture of values (H, W, C) or (H, W): the Mitsuba dictionary.
+
+    Args:
+        values: the first row lies at the top (v = 1), or at v = 0 with `repeat`.
+        repeat: how often the texture fits into u and v from 0 to 1; every other copy is mirrored, so that no seam
+            shows.
+    """
+    pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], dtype=np.float32)
+    if repeat is None:
+        wrap, to_uv = "clamp", mi.ScalarTransform4f().translate([0, 1, 0]) @ mi.ScalarTransform4f().scale([1, -1, 1])
+    else:
+        wrap, to_uv = "mirror", mi.ScalarTransform4f().scale([*repeat, 1])
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": wrap, "to_uv": to_uv}
