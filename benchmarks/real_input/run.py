@@ -1,3 +1,6 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
 """The main job on scenes that the project did not make, through the command line as a user types it.
 
     python benchmarks/real_input/run.py ASSETS [--seconds 60] [--resolution 128]

@@ -56,7 +56,7 @@ def test_values_survive_the_way_to_a_tensor_and_back() -> None:
         ({}, "small-box.faces", "not differentiable"),
         ({}, "back.bsdf.reflectanse.data", "did you mean back.bsdf.reflectance.data"),
         (
-            {"ball": {"type": "sphere", "b": {"type": "blendbsdf", "a": {"type": "conductor"}, "b": {"type": "diffuse"}}}},
+            {"ball": {"type": "sphere", "b": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "conductor"}, "b": {"type": "diffuse"}}}},
             "ball.bsdf.weight.value",
             "mixes perfectly specular lobes",
         ),

@@ -56,7 +56,7 @@ def compare(name: str, loss: str, seconds: float, seeds: int, options: dict[str,
     found: dict[str, Any] = {"problem": name, "loss": loss, "seconds": seconds, "options": options, "methods": {}}
     for method, counts in SPP.items():
         tried: list[dict[str, Any]] = []
-        grid: list[tuple[int, float]] = list(itertools.product(counts, RATES))
+        grid = [(spp, rate) for spp in counts for rate in RATES]
         if method == "stock":  # same estimate at the same spp but for the crossing: tune it around plain's choice
             chosen = found["methods"]["plain"]
             grid = [(chosen["spp"], rate) for rate in RATES] + [(s, chosen["rate"]) for s in counts if s != chosen["spp"]]

@@ -70,6 +70,10 @@ class RecursiveControlVariate:
     Var[⟨F_n⟩_CV] is kept relative to Var[⟨F_n⟩_n], which the recurrence (10) leaves as it is. Kept absolute, it would
     freeze the first, worst estimate of the variance: a pixel whose first samples happen to agree would get variance 0, weight
     1, and its first value for ever.
+
+    Where no variance was seen yet, at the first steps or in a pixel that has only been black, the two states count as fully correlated:
+    the weight is 1 / (1 + r) for the relative variance r, which becomes r / (1 + r), so that images are averaged. A weight of 0 would
+    drop the black samples as soon as a bright one comes, and leave the pixel too bright.
     """
 
     space: Space = "path"
@@ -111,9 +115,11 @@ class RecursiveControlVariate:
         memory = state.views[view]
         F, H = _mean(rendering.images), _mean(rendering.previous)
         used = self._observe(memory, F, H) if self.update_before_use else memory
-        var_previous = welford.covariance(used.previous)
-        weight = statistics.control_weight(
-            welford.covariance(used.joint), var_previous, memory.relative_variance * var_previous
+        var_previous, past = welford.covariance(used.previous), memory.relative_variance
+        weight = arrays.where(
+            var_previous > 0,
+            statistics.control_weight(welford.covariance(used.joint), var_previous, past * var_previous),
+            1.0 / (1.0 + past),
         )
         images = tuple(
             advance(memory.image, f, h, weight) for f, h in zip(rendering.images, rendering.previous, strict=True)
@@ -125,10 +131,10 @@ class RecursiveControlVariate:
             var_current,
             var_previous,
             welford.covariance(seen.joint),
-            memory.relative_variance * var_previous,
+            past * var_previous,
         )
         known = var_current > 0
-        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), 1.0)
+        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
         estimate = ImageEstimate(images, rendering.paths, {"control_weight": weight, "variance": variance})
         return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
 
