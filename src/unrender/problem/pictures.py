@@ -70,7 +70,7 @@ def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
     from skimage import transform
 
     scaled = transform.resize(values, (height, width, values.shape[2]), order=1, anti_aliasing=True, mode="edge")
-    return scaled.astype(np.float32)
+    return np.asarray(scaled, np.float32)
 
 
 def srgb_to_linear(values: np.ndarray) -> np.ndarray:
