@@ -80,6 +80,11 @@ def mean(x: Array) -> Array:
     return dr.mean(x, axis=None) if is_drjit(x) else np.mean(x)
 
 
+def mean_first(x: Array) -> Array:
+    """The mean over the first axis, (n, ...) -> (...), left lazy on Dr.Jit."""
+    return dr.mean(x, axis=0) if is_drjit(x) else np.mean(x, axis=0)
+
+
 def total(x: Array) -> Array:
     """The sum over all elements, left lazy on Dr.Jit."""
     return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)

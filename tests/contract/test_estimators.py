@@ -13,13 +13,15 @@ from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
+from unrender.images.base import ImageEstimate
 from unrender.keys import Key
 from unrender.rendering.analytic import AnalyticRenderer
 from unrender.training.bounds import MARGIN
 
 CV = ur.images.RecursiveControlVariate
 ESTIMATORS: dict[str, Callable[[], Any]] = {
-    "plain, crossed halves": lambda: ur.PathGradient(spp=4),
+    "plain, crossed halves": lambda: ur.PathGradient(spp=2),
+    "plain, crossed groups": lambda: ur.PathGradient(spp=6),
     "plain, own paths": lambda: ur.PathGradient(spp=1),
     "plain, other spp": lambda: ur.PathGradient(spp=4, adjoint_spp=1),
     "control variate, path space": lambda: ur.PathGradient(CV(), spp=2),
@@ -95,11 +97,9 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
     assert worst_z(rows * 1.1, exact)[0] > limit, "a planted bias of 10 % went unseen"
 
 
-def test_halves_that_are_not_crossed_are_biased(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_groups_that_are_not_crossed_are_biased(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above sees what crossing is for."""
-    import unrender.gradients.path as path
-
-    monkeypatch.setattr(path, "reversed", lambda images: images, raising=False)
+    monkeypatch.setattr(ImageEstimate, "others", lambda self: self.images)
     asked = problem(views=1, noise=0.9)
     at = {k: v + 5 * DRIFT for k, v in asked.initial().items()}
     exact = np.concatenate([g.ravel() for g in exact_gradient(asked, at).values()])
@@ -243,6 +243,12 @@ def test_what_does_not_fit_is_refused() -> None:
             ur.PathGradient(spp=spp)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ur.InputError, match="space"):
         CV(space="pixel")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("spp", "groups"), [(1, 1), (2, 2), (3, 3), (6, 6), (17, 1), (24, 12), (64, 16)])
+def test_samples_form_as_many_groups_as_can_be_crossed(spp: int, groups: int) -> None:
+    assert ur.PathGradient(spp=spp).groups == groups
+    assert ur.PathGradient(spp=spp, adjoint_spp=2).groups == 1
 
 
 def test_callbacks_hear_and_can_stop() -> None:

@@ -47,7 +47,7 @@ def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths(name: str) -> N
     shot = Shot(0, 64, 7)
     weight = np.random.default_rng(2).uniform(0.5, 1.5, (SIZE, SIZE, 3))
     paths = renderer.image(current, shot).paths
-    gradient = renderer.adjoint(current, paths, (renderer.array(weight),))
+    gradient = renderer.adjoint(current, paths, renderer.array(weight[None]))
     for key in current:
         expected = derivative_on_the_same_paths(renderer, current, key, shot, weight)
         found = float((np.array(gradient[key]).astype(np.float64) * np.array(current[key])).sum())
@@ -61,10 +61,12 @@ def test_halves_are_weighted_each_by_its_own() -> None:
     key = "floor.bsdf.reflectance.data"
     renderer.select([key], None)
     current = renderer.values([key])
-    one, none = renderer.array(np.ones((SIZE, SIZE, 3))), renderer.array(np.zeros((SIZE, SIZE, 3)))
+    one, none = np.ones((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))
     paths = renderer.image(current, Shot(0, 8, 3, 2)).paths
-    halves = [np.array(renderer.adjoint(current, paths, w)[key]) for w in ((one, none), (none, one))]
-    both = np.array(renderer.adjoint(current, paths, (one, one))[key])
+    halves = [
+        np.array(renderer.adjoint(current, paths, renderer.array(np.stack(w)))[key]) for w in ((one, none), (none, one))
+    ]
+    both = np.array(renderer.adjoint(current, paths, renderer.array(np.stack((one, one))))[key])
     assert not np.allclose(halves[0], halves[1], rtol=1e-3)
     np.testing.assert_allclose(halves[0] + halves[1], both, rtol=1e-3, atol=1e-3 * np.abs(both).max())
 
@@ -75,7 +77,7 @@ def test_repeating_repeats_the_image_to_the_bit_and_the_gradient_to_rounding() -
     key = "floor.bsdf.reflectance.data"
     renderer.select([key], None)
     current = renderer.values([key])
-    weight = (renderer.array(np.ones((SIZE, SIZE, 3))),)
+    weight = renderer.array(np.ones((1, SIZE, SIZE, 3)))
     shots = [renderer.image(current, Shot(0, 4, 9)) for _ in range(3)]
     images = [np.array(shot.images[0]) for shot in shots]
     gradients = [np.array(renderer.adjoint(current, shot.paths, weight)[key]) for shot in shots]
@@ -92,10 +94,10 @@ def test_gradients_agree_with_mitsuba_prb() -> None:
     key = next(k for k in renderer.parameters() if k.startswith("ball") and k.endswith("reflectance.value"))
     renderer.select([key], None)
     current = renderer.values([key])
-    weight = renderer.array(np.full((SIZE, SIZE, 3), 1 / SIZE**2))
+    weight = renderer.array(np.full((1, SIZE, SIZE, 3), 1 / SIZE**2))
     ours = np.stack(
         [
-            np.array(renderer.adjoint(current, renderer.image(current, Shot(0, 64, s)).paths, (weight,))[key])
+            np.array(renderer.adjoint(current, renderer.image(current, Shot(0, 64, s)).paths, weight)[key])
             for s in range(12)
         ]
     )

@@ -144,7 +144,7 @@ def test_moving_geometry_runs_in_primary_space() -> None:
     assert np.array_equal(np.array(pair.previous[0]), np.array(alone.images[0]))
     assert not np.array_equal(np.array(pair.previous[0]), np.array(pair.images[0]))
     gradient = renderer.adjoint(
-        current, renderer.image(current, Shot(0, 64, 1)).paths, (renderer.array(np.ones((16, 16, 3))),)
+        current, renderer.image(current, Shot(0, 64, 1)).paths, renderer.array(np.ones((1, 16, 16, 3)))
     )
     assert np.isfinite(np.array(gradient[key])).all()
     assert np.abs(np.array(gradient[key])).max() > 0

@@ -15,6 +15,7 @@ import numpy as np
 
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
 _LIGHTS = [
@@ -45,7 +46,7 @@ class GlossyRoom:
     def scene(self) -> dict[str, Any]:
         """The room: x in [-2.2, 2.2], y in [0, 3], z in [-1.5, 4.5]; the cameras at z = 4, looking along -z."""
         wall = parts.diffuse(0.2)
-        places = np.linspace(-0.8, 0.8, self.views) if self.views > 1 else [0.0]
+        places = np.linspace(-1.5, 1.5, self.views) if self.views > 1 else [0.0]
         return {
             "type": "scene",
             **{
@@ -71,9 +72,9 @@ class GlossyRoom:
         """The four maps, each from one value."""
         return (
             Parameter("tile.bsdf.base_color.data", initial=0.5),
-            Parameter("tile.bsdf.roughness.data", initial=0.4),
+            Parameter("tile.bsdf.roughness.data", initial=0.4, preconditioner=LargeSteps(2.0)),
             Parameter("ball.bsdf.metallic.data", initial=0.5),
-            Parameter("ball.bsdf.roughness.data", initial=0.4),
+            Parameter("ball.bsdf.roughness.data", initial=0.4, preconditioner=LargeSteps(2.0)),
         )
 
 
@@ -117,6 +118,6 @@ def _ball_material(resolution: int) -> dict[str, Any]:
     return {
         "type": "principled",
         "base_color": parts.colour(0.85, 0.55, 0.2),
-        "metallic": textures.bitmap(0.25 + 0.7 * dots, repeat),
+        "metallic": textures.bitmap(0.45 + 0.5 * dots, repeat),
         "roughness": textures.bitmap(0.2 + 0.4 * stripes, repeat),
     }

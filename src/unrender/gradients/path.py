@@ -16,6 +16,8 @@ from unrender.problem.problem import Problem
 from unrender.rendering.port import Shot
 from unrender.trees import Tree
 
+_MOST_GROUPS = 16
+
 
 @dataclass(frozen=True)
 class PathGradientState:
@@ -28,9 +30,10 @@ class PathGradientState:
 class PathGradient:
     """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).
 
-    Independence comes from crossed halves: each pixel's samples form two halves A and B; A's adjoint is weighted by
-    the loss derivative at B's image and the reverse. Two traces serve what the usual loop traces three times. With a control
-    variate the halves' images share the memory, which is independent of both.
+    Independence comes from crossing: each pixel's samples form groups (halves at 2 spp), and the adjoint of each group is
+    weighted by the loss derivative at the image of all the others. Two traces serve what the usual loop traces three times. With a
+    control variate the groups' images share the memory, which is independent of them all. For noise that dominates, G groups have
+    G / (G - 1) times the variance of an adjoint on paths of its own, so there are as many as samples, up to 16.
 
     Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image; otherwise biased by the noise of
     the image that the loss sees, which a control variate reduces step by step.
@@ -39,8 +42,8 @@ class PathGradient:
         image: what the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
         pixels: which pixels a step looks at.
         spp: samples per pixel and view of the image, >= 1.
-        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1; None for crossed halves when `spp` is even, and
-            `spp` paths of its own when it is odd.
+        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for crossed groups, and for `spp` paths of
+            its own where `spp` cannot be cut into groups: 1, and primes above 16.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -61,9 +64,11 @@ class PathGradient:
         return frozenset({GRADIENT})
 
     @property
-    def crossed(self) -> bool:
-        """Whether the halves are crossed, rather than paths traced for the adjoint alone."""
-        return self.adjoint_spp is None and self.spp % 2 == 0
+    def groups(self) -> int:
+        """How many groups are crossed; 1 where the adjoint has paths of its own."""
+        if self.adjoint_spp is not None:
+            return 1
+        return max(n for n in range(1, _MOST_GROUPS + 1) if self.spp % n == 0)
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
@@ -75,7 +80,7 @@ class PathGradient:
     ) -> tuple[Estimate, PathGradientState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, and what the
         image estimator tells, per view."""
-        groups = 2 if self.crossed else 1
+        groups = self.groups
         gradient: Tree | None = None
         losses, kept, pictures, samples = [], [], {}, 0
         told: dict[str, dict[int, Any]] = {}
@@ -88,12 +93,11 @@ class PathGradient:
             picture = image.mean()
             losses.append(problem.loss_value(view, picture))
             paths, traced = image.paths, 0
-            if not self.crossed:
+            if groups == 1:
                 traced = self.adjoint_spp or self.spp
                 shot = Shot(problem.views[view].sensor, traced, key_view.fold(1).uint32())
                 paths = problem.renderer.image(parameters, shot).paths
-            weights = tuple(problem.loss_derivative(view, i) for i in reversed(image.images))
-            part = problem.renderer.adjoint(parameters, paths, weights)
+            part = problem.renderer.adjoint(parameters, paths, problem.loss_derivative(view, image.others()))
             gradient = part if gradient is None else trees.add(gradient, part)
             samples += (self.spp + traced) * int(picture.shape[0]) * int(picture.shape[1])
             pictures[view] = picture

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from unrender import arrays
 from unrender.arrays import Array
 from unrender.keys import Key
 from unrender.problem.problem import Problem
@@ -18,21 +19,23 @@ class ImageEstimate:
     """The image of one view at one step.
 
     Attributes:
-        images: (H, W, 3) per group of samples; the estimate made without the other groups' samples.
+        images: (groups, H, W, 3), one estimate per group of samples, made without the other groups' samples.
         paths: the renderer's own, to replay these samples.
         info: for people, e.g. {"control_weight": array}.
     """
 
-    images: tuple[Array, ...]
+    images: Array
     paths: Any
     info: Mapping[str, Any] = field(default_factory=dict)
 
     def mean(self) -> Array:
-        """The image of all samples together."""
-        result = self.images[0]
-        for image in self.images[1:]:
-            result = result + image
-        return result / len(self.images)
+        """The image of all samples together, (H, W, 3)."""
+        return arrays.mean_first(self.images)
+
+    def others(self) -> Array:
+        """For each group, the image of all other groups' samples, (groups, H, W, 3); of its own where it is alone."""
+        groups = self.images.shape[0]
+        return self.images if groups == 1 else (self.mean() * groups - self.images) / (groups - 1)
 
 
 class ImageEstimator(Protocol):

@@ -113,7 +113,7 @@ class RecursiveControlVariate:
             estimate = ImageEstimate(rendering.images, rendering.paths)
             return estimate, self._start(estimate.mean())
         memory = state.views[view]
-        F, H = _mean(rendering.images), _mean(rendering.previous)
+        F, H = arrays.mean_first(rendering.images), arrays.mean_first(rendering.previous)
         used = self._observe(memory, F, H) if self.update_before_use else memory
         var_previous, past = welford.covariance(used.previous), memory.relative_variance
         weight = arrays.where(
@@ -121,9 +121,7 @@ class RecursiveControlVariate:
             statistics.control_weight(welford.covariance(used.joint), var_previous, past * var_previous),
             1.0 / (1.0 + past),
         )
-        images = tuple(
-            advance(memory.image, f, h, weight) for f, h in zip(rendering.images, rendering.previous, strict=True)
-        )
+        images = advance(memory.image, rendering.images, rendering.previous, weight)
         seen = used if self.update_before_use else self._observe(memory, F, H)
         var_current, var_previous = welford.covariance(seen.current), welford.covariance(seen.previous)
         variance = statistics.control_variate_variance(
@@ -157,10 +155,3 @@ class RecursiveControlVariate:
             previous=welford.update(memory.previous, H, H, self.alpha, self.beta),
             joint=welford.update(memory.joint, F, H, self.alpha, self.beta),
         )
-
-
-def _mean(images: tuple[Array, ...]) -> Array:
-    result = images[0]
-    for image in images[1:]:
-        result = result + image
-    return result / len(images)

@@ -103,7 +103,7 @@ class AnalyticRenderer:
         paths = self._paths(shot)
         return Rendering(self._images(current, paths), self._images(previous, paths), paths)
 
-    def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: tuple[np.ndarray, ...]) -> Tree:
+    def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
         """See `Renderer.adjoint`."""
         rows = self._rows(paths.pixels)
         flat = np.zeros(self.matrix.shape[1])
@@ -134,7 +134,7 @@ class AnalyticRenderer:
     def _grouped(self, paths: AnalyticPaths) -> list[np.ndarray]:
         return np.split(paths.numbers, paths.groups, axis=2)
 
-    def _images(self, parameters: Tree, paths: AnalyticPaths) -> tuple[np.ndarray, ...]:
+    def _images(self, parameters: Tree, paths: AnalyticPaths) -> np.ndarray:
         rows = self._rows(paths.pixels)
         linear = (self.matrix @ self._flat(parameters))[rows]
         shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
@@ -144,4 +144,4 @@ class AnalyticRenderer:
             images.append(
                 (self.offset[rows] + linear * (1 + self.noise * u[:, 0]) + self.grain * u[:, 1]).reshape(shape)
             )
-        return tuple(images)
+        return np.stack(images)

@@ -48,7 +48,7 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
     return ray, weight
 
 
-def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
+def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any:
     """The mean of each pixel's samples, per group.
 
     Args:
@@ -58,35 +58,32 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> tup
         shape: of one image, (H, W, 3) or (N, 3).
 
     Returns:
-        one `mi.TensorXf` per group. Sums in a fixed order: equal seeds give equal bits.
+        `mi.TensorXf` (groups, *shape). Sums in a fixed order: equal seeds give equal bits.
     """
     size = spp // groups
     sums = [dr.block_sum(radiance[c], size) if size > 1 else radiance[c] for c in range(3)]
-    pixels = dr.width(sums[0]) // groups
-    images = []
-    for group in range(groups):
-        index = dr.arange(mi.UInt32, pixels) * groups + group
-        channels = mi.Color3f(*(dr.gather(mi.Float, sums[c], index) for c in range(3)))
-        images.append(mi.TensorXf(dr.ravel(channels) / size, shape))
-    return tuple(images)
+    count = dr.width(sums[0])
+    pixels = count // groups
+    index = dr.arange(mi.UInt32, count)
+    group = index // pixels
+    index = (index - group * pixels) * groups + group
+    channels = mi.Color3f(*(dr.gather(mi.Float, sums[c], index) for c in range(3)))
+    return mi.TensorXf(dr.ravel(channels) / size, (groups, *shape))
 
 
-def expose(weights: tuple[Any, ...], spp: int, count: int) -> Any:
+def expose(weights: Any, spp: int, count: int) -> Any:
     """The adjoint of `develop` averaged over the groups: each lane's share of its pixel's and group's weight.
 
     Args:
-        weights: one `mi.TensorXf` per group, (H, W, 3) or (N, 3).
+        weights: `mi.TensorXf` (groups, H, W, 3) or (groups, N, 3).
         spp: samples per pixel, in all groups.
         count: how many pixels.
 
     Returns:
-        `mi.Spectrum` per lane: weights[group][pixel] / spp.
+        `mi.Spectrum` per lane: weights[group, pixel] / spp.
     """
     lane = dr.arange(mi.UInt32, count * spp)
     pixel = lane // spp
-    group = (lane - pixel * spp) // (spp // len(weights))
-    result = mi.Spectrum(0)
-    for number, weight in enumerate(weights):
-        channels = [dr.gather(mi.Float, weight.array, pixel * 3 + c, group == number) for c in range(3)]
-        result += mi.Spectrum(*channels)
-    return result / spp
+    group = (lane - pixel * spp) // (spp // weights.shape[0])
+    index = (group * count + pixel) * 3
+    return mi.Spectrum(*(dr.gather(mi.Float, weights.array, index + c) for c in range(3))) / spp

@@ -146,11 +146,11 @@ class MitsubaRenderer:
         images = self._develop(radiance, shot), self._develop(radiance_previous, shot)
         return Rendering(*images, Paths(shot, radiance))
 
-    def adjoint(self, parameters: Tree, paths: Paths, weights: tuple[Any, ...]) -> Tree:
+    def adjoint(self, parameters: Tree, paths: Paths, weights: Any) -> Tree:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `Renderer.adjoint`."""
         self._set_current(parameters)
         shot = paths.shot
-        self._run("adjoint", shot, {"delta": self._delta_table}, paths.radiance, list(weights))
+        self._run("adjoint", shot, {"delta": self._delta_table}, paths.radiance, weights)
         gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
         dr.eval(gradient)
         return gradient
@@ -161,7 +161,7 @@ class MitsubaRenderer:
         height, width = self.resolutions()[shot.sensor]
         return height * width
 
-    def _develop(self, radiance: Any, shot: Shot) -> tuple[Any, ...]:
+    def _develop(self, radiance: Any, shot: Shot) -> Any:
         shape = (self._count(shot), 3) if shot.pixels is not None else (*self.resolutions()[shot.sensor], 3)
         return camera.develop(radiance, shot.spp, shot.groups, shape)
 
@@ -201,7 +201,7 @@ class MitsubaRenderer:
             with dr.suspend_grad():
                 ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
                 if what == "adjoint":
-                    δL = camera.expose(tuple(weights), spp, count) * ray_weight
+                    δL = camera.expose(weights, spp, count) * ray_weight
                     kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, δL, radiance)
                     return None
                 L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, sampler, ray, pair=what == "pair")

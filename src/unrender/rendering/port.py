@@ -48,7 +48,7 @@ class Shot:
         sensor: index of the sensor.
         spp: samples per pixel, in all groups together; a multiple of `groups`.
         seed: an integer in [0, 2**32), from `Key.uint32()`.
-        groups: how many independent images the samples are split into (2 for crossed halves).
+        groups: how many independent images the samples are split into.
         pixels: flat pixel indices (row-major), or None for the whole film.
     """
 
@@ -64,13 +64,13 @@ class Rendering:
     """The answer to a `Shot`.
 
     Attributes:
-        images: per group, the mean of its samples: (H, W, 3), or (N, 3) for N chosen pixels.
+        images: the mean of each group's samples: (groups, H, W, 3), or (groups, N, 3) for N chosen pixels.
         previous: likewise for the previous parameters on the same samples; None unless a pair was asked for.
         paths: the renderer's own; hand it to `adjoint` to walk the same paths again.
     """
 
-    images: tuple[Array, ...]
-    previous: tuple[Array, ...] | None
+    images: Array
+    previous: Array | None
     paths: Any
 
 
@@ -109,8 +109,9 @@ class Renderer(Protocol):
         (`"primary"`). Both images are unbiased."""
         ...
 
-    def adjoint(self, parameters: Tree, paths: Any, weights: tuple[Array, ...]) -> Tree:
-        """The gradient of the mean over groups g of sum(weights[g] * images[g]), on the paths of a rendering.
+    def adjoint(self, parameters: Tree, paths: Any, weights: Array) -> Tree:
+        """The gradient of the mean over groups g of sum(weights[g] * images[g]), on the paths of a rendering; `weights` has the
+        shape of its images.
 
         Unbiased where `weights[g]` is independent of group g.
         """
