@@ -7,7 +7,7 @@
 
 On `indirect-room`: the pair against a plain primal render of the same kernel and of Mitsuba's `prb`; a step with crossed halves and a
 step with the control variate against the stock loop (`mi.render`, `dr.backward`, `mi.ad.Adam`) at equal spp; the variance of
-the gradients of those three at one point; the share of a step spent outside kernels, and whether any kernel is new after warm-up.
+the gradients, crossed against own paths; the share of a step spent outside kernels, and whether any kernel is new after warm-up.
 """
 
 from __future__ import annotations
@@ -114,23 +114,30 @@ def outside_kernels(problem: ur.Problem, estimator: Any, steps: int = 10) -> dic
     }
 
 
-def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[str, float]:
-    """Variance of the gradient at the initial parameters, summed over elements: stock and crossed halves."""
+def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[str, Any]:
+    """Variance of the gradient summed over elements, crossed groups against an adjoint on paths of its own at equal spp.
+
+    At the start, where the loss derivative is large, and a twentieth of the way from the truth to it. On its own paths an
+    image and an adjoint are correlated; their product's variance gains or loses by that, as the loss derivative is positive or not.
+    """
     renderer = mitsuba_renderer(problem)
-    now = problem.initial()
-    estimator = ur.PathGradient(spp=spp)
-    state = estimator.init(problem, now)
-    halves, stock = [], []
-    for number in range(count):
-        found, _ = estimator.estimate(problem, now, state, Key(7, number))
-        halves.append(np.concatenate([np.ravel(np.array(g)) for g in found.gradient.values()]))
-        key = Key(8, number)
-        image = renderer.image(now, Shot(0, spp, key.fold(0).uint32())).images
-        paths = renderer.image(now, Shot(0, spp, key.fold(1).uint32())).paths
-        gradient = renderer.adjoint(now, paths, problem.loss_derivative(0, image))
-        stock.append(np.concatenate([np.ravel(np.array(g)) for g in gradient.values()]))
-    a, b = (float(np.var(np.stack(x).astype(np.float64), axis=0, ddof=1).sum()) for x in (halves, stock))
-    return {"crossed": a, "independent": b, "ratio": a / b}
+    start = problem.initial()
+    truth = {key: renderer.array(np.asarray(problem.truth[key], np.float32)) for key in start}
+    near = {key: truth[key] + (start[key] - truth[key]) * 0.05 for key in start}
+    dr.eval(near)
+    crossed = ur.PathGradient(spp=spp)
+    own = ur.PathGradient(spp=spp, adjoint_spp=spp)
+    found: dict[str, Any] = {}
+    for place, point in (("start", start), ("near the truth", near)):
+        variances = []
+        for estimator in (crossed, own):
+            state, rows = estimator.init(problem, point), []
+            for number in range(count):
+                gradient = estimator.estimate(problem, point, state, Key(7, number))[0].gradient
+                rows.append(np.concatenate([np.ravel(np.array(g)) for g in gradient.values()]))
+            variances.append(float(np.var(np.stack(rows).astype(np.float64), axis=0, ddof=1).sum()))
+        found[place] = {"crossed": variances[0], "own paths": variances[1], "ratio": variances[0] / variances[1]}
+    return found
 
 
 def main() -> None:
@@ -160,10 +167,14 @@ def main() -> None:
             "primal_ms": primal,
             "step_ms": steps,
             "step_ratios": ratios,
-            "gradient_variance": gradient_variance(linear, asked.spp),
+            "gradient_variance": {
+                name: gradient_variance(ur.gallery.problem(name, resolution=asked.resolution // 2, loss="L2"), asked.spp)
+                for name in ur.gallery.names()
+            },
             "outside_kernels": {name: outside_kernels(problem, small) for name, problem in defaults.items()},
         }
-        print(figures["gradient_variance"], figures["outside_kernels"])
+        for name in defaults:
+            print(name, figures["gradient_variance"][name], figures["outside_kernels"][name])
         write(HERE, figures)
     plot(read(HERE))
 

@@ -62,7 +62,7 @@ class AdamOptions(Options):
 class PathOptions(AdamOptions):
     """What every method has that follows path gradients."""
 
-    spp: PositiveInt = Field(8, description="samples per pixel; where even, the adjoint shares their paths")
+    spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
     adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
@@ -73,7 +73,7 @@ class PathOptions(AdamOptions):
 class RecursiveControlVariateOptions(PathOptions):
     """Options of `rcv`."""
 
-    spp: PositiveInt = Field(2, description="samples per pixel; where even, the adjoint shares their paths")
+    spp: PositiveInt = Field(2, description="samples per pixel; from 2 on, the adjoint shares their paths")
     space: Literal["path", "primary"] = Field(
         "path", description="what two steps share: paths (materials, emitters), or random numbers (any parameter)"
     )
@@ -144,7 +144,7 @@ def _rcv(options: RecursiveControlVariateOptions) -> tuple[Estimator, Optimizer]
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("plain", "a fresh rendering each step, crossed halves, Adam", PathOptions, _plain),
+        Method("plain", "a fresh rendering each step, crossed groups of samples, Adam", PathOptions, _plain),
         Method(
             "rcv",
             "recursive control variates: the image keeps what earlier steps rendered (Nicolet et al. 2023), Adam",

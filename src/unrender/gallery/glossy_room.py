@@ -118,6 +118,6 @@ def _ball_material(resolution: int) -> dict[str, Any]:
     return {
         "type": "principled",
         "base_color": parts.colour(0.85, 0.55, 0.2),
-        "metallic": textures.bitmap(0.45 + 0.5 * dots, repeat),
+        "metallic": textures.bitmap(0.25 + 0.7 * dots, repeat),
         "roughness": textures.bitmap(0.2 + 0.4 * stripes, repeat),
     }
