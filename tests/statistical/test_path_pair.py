@@ -66,6 +66,24 @@ def test_a_planted_bias_of_one_percent_is_seen() -> None:
         assert not verdict, f"a bias of 1 % went unseen: {figures}"
 
 
+def test_mesh_attributes_are_read_from_the_shape_of_their_state() -> None:
+    def description() -> dict[str, Any]:
+        attribute = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+        mesh = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.6]), "bsdf": attribute})
+        count = mesh.vertex_count() * 3
+        mesh.add_attribute("vertex_color", 3, np.random.default_rng(1).uniform(0.1, 0.9, count).astype(np.float32))
+        return {**scene({"type": "diffuse"}), "ball": mesh}
+
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, previous = two_states(renderer, {"vertex_color": 0.8, **LIGHTS})
+    renderer.select(list(current), "path")
+    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    assert pair.previous is not None
+    alone = renderer.image(previous, Shot(0, RUNS * SPP, 3, RUNS))
+    verdict, figures = agree(runs(pair.previous), runs(alone.images))
+    assert verdict, figures
+
+
 def test_light_that_is_black_now_but_was_not_before_is_not_lost() -> None:
     """Termination and visibility must look at both states."""
     renderer = MitsubaRenderer(scene({"type": "diffuse", "reflectance": texture(2)}, environment=False), DEPTH)

@@ -1,0 +1,175 @@
+"""Writes docs/results.md from the results.json of every benchmark: the figures there are these, and no others.
+
+    python benchmarks/summary.py
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+OUT = HERE.parent / "docs" / "results.md"
+
+
+def load(folder: str) -> dict[str, Any] | None:
+    """The results of a benchmark, None where it was not run."""
+    file = HERE / folder / "results.json"
+    return json.loads(file.read_text()) if file.is_file() else None
+
+
+def table(head: list[str], rows: list[list[Any]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+
+
+def command(found: dict[str, Any]) -> str:
+    """How these figures were made, and on what."""
+    words = " ".join(w.split("/work/main/")[-1] for w in found["command"].split())
+    hardware = found["hardware"]
+    return f"`{words}`, {hardware['cores']} cores of {hardware['processor']}, Mitsuba {found['versions']['mitsuba']}."
+
+
+def speed(found: dict[str, Any]) -> str:
+    """Costs as ratios."""
+    primal, steps, ratios = found["primal_ms"], found["step_ms"], found["step_ratios"]
+    variance = [
+        [name, *(f"{entry[place]['ratio']:.2f}" for place in ("start", "near the truth"))]
+        for name, entry in found["gradient_variance"].items()
+    ]
+    outside = [
+        [name, f"{e['wall_ms']:.1f}", f"{e['kernels_ms']:.1f}", f"{e['outside']:.1%}", e["new"]]
+        for name, e in found["outside_kernels"].items()
+    ]
+    return "\n\n".join(
+        [
+            f"`indirect-room`, {found['resolution']}², {found['spp']} spp, milliseconds (median of 15).",
+            table(
+                ["primal", "ms", "ratio"],
+                [
+                    ["plain, this kernel", f"{primal['plain'][0]:.1f}", "1"],
+                    ["Mitsuba's prb, primal", f"{primal['mitsuba_prb'][0]:.1f}", f"{primal['pair/plain'] / primal['pair/prb']:.2f}"],
+                    ["**pair**", f"{primal['pair'][0]:.1f}", f"**{primal['pair/plain']:.2f}** ({primal['pair/prb']:.2f} of prb)"],
+                ],
+            ),
+            table(
+                ["whole step", "ms", "of the stock loop"],
+                [
+                    ["stock loop", f"{steps['stock']:.1f}", "1"],
+                    ["plain, crossed groups", f"{steps['crossed'][0]:.1f}", f"**{ratios['crossed/stock']:.2f}**"],
+                    ["control variate", f"{steps['rcv'][0]:.1f}", f"**{ratios['rcv/stock']:.2f}**"],
+                ],
+            ),
+            "Variance of the gradient, crossed groups over an adjoint on paths of its own, equal spp, L2 (equal is 1):",
+            table(["problem", "at the start", "near the truth"], variance),
+            "Time outside kernels at the gallery's default sizes, control variate at 2 spp, and kernels new after warm-up:",
+            table(["problem", "wall ms a step", "kernel ms", "outside", "new kernels"], outside),
+        ]
+    )
+
+
+def reconstruction(found: dict[str, Any]) -> str:
+    """Equal-time reconstruction."""
+    rows = []
+    for entry in found["entries"]:
+        summary = entry["summary"]
+        for method in ("stock", "plain", "rcv"):
+            chosen, row = entry["methods"][method], summary[method]
+            middle, low, high = row["final"]
+            other = ""
+            if method != "rcv":
+                reached = [t for t in row["rcv_reaches_its_best_after"] if t is not None]
+                share = f"{len(reached)} of {len(entry['methods']['rcv']['runs'])}"
+                when = f"{sorted(reached)[len(reached) // 2]:.1f} s ({share})" if reached else "never"
+                other = f"{1 / row['ratio']:.2f}× | {row['it_reaches_its_best_after']:.1f} s | {when}"
+            else:
+                other = "1 | | "
+            rows.append(
+                [
+                    entry["problem"],
+                    entry["loss"],
+                    f"{entry['seconds']:g} s",
+                    f"{method} ({chosen['spp']} spp, {chosen['rate']:g})",
+                    f"{middle:.3f} ({low:.3f} to {high:.3f})",
+                    f"{row['best']:.3f}",
+                    *other.split(" | "),
+                ]
+            )
+    head = ["problem", "loss", "budget", "method (spp, rate)", "final error", "best on the way"]
+    head += ["× rcv's final", "its best at", "rcv gets there at"]
+    return table(head, rows)
+
+
+def real_input(found: dict[str, Any]) -> str:
+    """The main job on foreign scenes."""
+    rows = []
+    for name, methods in found["scenes"].items():
+        for method, f in methods.items():
+            a, b = f["texture_rmse_where_seen"]
+            c, d = f["image_rmse_view0"]
+            errors = [f"{a:.3f} → {b:.3f}", f"{f['share_seen']:.0%}", f"{c:.4f} → {d:.4f}"]
+            rows.append([name, method, f["steps"], f"{f['seconds']:.0f}", *errors])
+    head = ["scene", "method", "steps", "seconds", "texture RMSE where seen", "texels seen", "image RMSE, first view"]
+    commands = "\n".join(f["command"] for methods in found["scenes"].values() for f in methods.values())
+    return table(head, rows) + "\n\nThe commands, as the script types them:\n\n```sh\n" + commands + "\n```"
+
+
+def weights(found: dict[str, Any]) -> str:
+    """Fig. 3."""
+    rows = [
+        [rule, f"{f['weight'][-1]:.3f}", f"{f['variance'][-1]:.4f}", f"{f['bias']:+.2%} ± {f['bias_error']:.2%}"]
+        for rule, f in found["rules"].items()
+    ]
+    sizes = f"{found['resolution']}², {found['spp']} spp, {found['steps']} steps, {found['runs']} runs"
+    return f"{sizes}; at the last step, variance relative to one render's.\n\n" + table(["rule", "weight", "variance", "bias"], rows)
+
+
+def lines(found: dict[str, Any], keys: tuple[str, ...]) -> str:
+    """The parts of a result that speak for themselves, as JSON."""
+    return "\n\n".join(f"```json\n{json.dumps(found[key], indent=None)}\n```" for key in keys)
+
+
+SECTIONS: list[tuple[str, str, Any, str]] = [
+    (
+        "Cost of a pair, a step, the loop",
+        "speed",
+        speed,
+        "",
+    ),
+    (
+        "Equal-time reconstruction (paper Fig. 9)",
+        "rcv/fig9_reconstruction",
+        reconstruction,
+        "Error: each parameter's RMSE over its RMSE at the start, averaged over parameters; 1 is no progress. Final: median over 5 seeds "
+        "(least to most). Every method was tuned on a seed of its own, over spp and learning rate, for the whole budget (grids in the "
+        "script; `stock` around plain's best). `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` and `rcv` are this "
+        "library's.",
+    ),
+    ("The main job on scenes made by others", "real_input", real_input, ""),
+    ("Steady state of the weights (paper Fig. 3)", "rcv/fig3_weights", weights, ""),
+]
+
+
+def main() -> None:
+    parts = [
+        "# Results",
+        "Written by `python benchmarks/summary.py` from the `results.json` beside each benchmark's script; losses as plainly as wins. "
+        "Ratios are of one run on one machine; times are not comparable between sections.",
+    ]
+    for title, folder, render, note in SECTIONS:
+        found = load(folder)
+        if found is None:
+            continue
+        parts += [f"## {title}", command(found)]
+        parts += [note] if note else []
+        parts += [render(found)]
+        if (HERE / folder / "figure.png").is_file():
+            parts.append(f"![{title}](../benchmarks/{folder}/figure.png)")
+    OUT.write_text("\n\n".join(parts) + "\n")
+    print(f"wrote {OUT}")
+
+
+if __name__ == "__main__":
+    main()
