@@ -43,7 +43,7 @@ def test_spot_under_the_museum(assets: Path) -> None:
     texture = mi.Bitmap(str(assets / "spot/spot_texture.png")).convert(
         mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False
     )
-    texture = texture.resample([32, 32])
+    texture = texture.resample(mi.ScalarVector2u(32, 32))
 
     def scene() -> dict[str, object]:
         return {
