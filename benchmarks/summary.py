@@ -1,6 +1,6 @@
 """Writes docs/results.md from the results.json of every benchmark: the figures there are these, and no others.
 
-    python benchmarks/summary.py
+python benchmarks/summary.py
 """
 
 from __future__ import annotations
@@ -50,8 +50,16 @@ def speed(found: dict[str, Any]) -> str:
                 ["primal", "ms", "ratio"],
                 [
                     ["plain, this kernel", f"{primal['plain'][0]:.1f}", "1"],
-                    ["Mitsuba's prb, primal", f"{primal['mitsuba_prb'][0]:.1f}", f"{primal['pair/plain'] / primal['pair/prb']:.2f}"],
-                    ["**pair**", f"{primal['pair'][0]:.1f}", f"**{primal['pair/plain']:.2f}** ({primal['pair/prb']:.2f} of prb)"],
+                    [
+                        "Mitsuba's prb, primal",
+                        f"{primal['mitsuba_prb'][0]:.1f}",
+                        f"{primal['pair/plain'] / primal['pair/prb']:.2f}",
+                    ],
+                    [
+                        "**pair**",
+                        f"{primal['pair'][0]:.1f}",
+                        f"**{primal['pair/plain']:.2f}** ({primal['pair/prb']:.2f} of prb)",
+                    ],
                 ],
             ),
             table(
@@ -123,7 +131,9 @@ def weights(found: dict[str, Any]) -> str:
         for rule, f in found["rules"].items()
     ]
     sizes = f"{found['resolution']}², {found['spp']} spp, {found['steps']} steps, {found['runs']} runs"
-    return f"{sizes}; at the last step, variance relative to one render's.\n\n" + table(["rule", "weight", "variance", "bias"], rows)
+    return f"{sizes}; at the last step, variance relative to one render's.\n\n" + table(
+        ["rule", "weight", "variance", "bias"], rows
+    )
 
 
 def lines(found: dict[str, Any], keys: tuple[str, ...]) -> str:

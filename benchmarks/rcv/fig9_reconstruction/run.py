@@ -23,6 +23,8 @@ from common import read, stock_loop, total_error, write
 
 import unrender as ur
 
+Grid = dict[str, list[tuple[int, float]]]
+
 HERE = Path(__file__).resolve().parent
 RATES = (3e-3, 1e-2, 3e-2)
 SPP = {"plain": (2, 8, 32), "rcv": (2, 8, 32)}
@@ -52,7 +54,9 @@ def descend(
     return [(h["seconds"], total_error(h["parameter_error"], start)) for h in history if "parameter_error" in h]
 
 
-def compare(name: str, loss: str, seconds: float, seeds: int, options: dict[str, Any]) -> dict[str, Any]:
+def compare(
+    name: str, loss: str, seconds: float, seeds: int, options: dict[str, Any], chosen: Grid | None
+) -> dict[str, Any]:
     """Tune every method, then run its best on the seeds."""
     problem = ur.gallery.problem(name, loss=loss, **options)
     found: dict[str, Any] = {"problem": name, "loss": loss, "seconds": seconds, "options": options, "methods": {}}
@@ -63,13 +67,18 @@ def compare(name: str, loss: str, seconds: float, seeds: int, options: dict[str,
             grid = [(found["methods"]["plain"]["spp"], rate) for rate in RATES]
         else:
             grid = [(spp, rate) for spp in counts[method] for rate in RATES]
+        grid = chosen.get(method, grid) if chosen else grid
         for spp, rate in grid:
-            error = descend(problem, method, spp, rate, seconds, TUNING_SEED)[-1][1]
+            if len(grid) == 1:  # nothing to choose
+                error = float("nan")
+            else:
+                error = descend(problem, method, spp, rate, seconds, TUNING_SEED)[-1][1]
             tried.append({"spp": spp, "rate": rate, "error": error})
             print(f"{name} {loss} {method} spp {spp} rate {rate}: {error:.3f}", flush=True)
         best = min(tried, key=lambda t: t["error"])
+        best = {**best, "error": best["error"] if len(grid) > 1 else None}
         runs = [descend(problem, method, best["spp"], best["rate"], seconds, seed) for seed in range(seeds)]
-        found["methods"][method] = {**best, "tried": tried, "runs": runs}
+        found["methods"][method] = {**best, "tried": tried if len(grid) > 1 else [], "runs": runs}
         print(f"{name} {loss} {method}: final {[round(r[-1][1], 3) for r in runs]}", flush=True)
     found["summary"] = summarise(found)
     print(found["summary"], flush=True)
@@ -124,6 +133,12 @@ def plot(results: dict[str, Any]) -> None:
     print(f"wrote {HERE / 'figure.png'}")
 
 
+def parse(given: list[str] | None) -> Grid | None:
+    """What `--grid` says."""
+    pairs = (text.split("=") for text in given or [])
+    return {m: [(int(t.split(":")[0]), float(t.split(":")[1])) for t in tries.split(",")] for m, tries in pairs} or None
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problem", action="append", choices=list(OPTIONS))
@@ -131,6 +146,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="budget of every run (default 15 for indirect-room, else 4)")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--resolution", type=int, help="film size, for GPUs")
+    parser.add_argument(
+        "--grid",
+        action="append",
+        metavar="METHOD=SPP:RATE,...",
+        help="try these in place of the grid; one is taken as it is",
+    )
     parser.add_argument("--plot-only", action="store_true")
     asked = parser.parse_args()
     if not asked.plot_only:
@@ -141,7 +162,7 @@ def main() -> None:
         for name, loss in itertools.product(asked.problem or OPTIONS, asked.loss or ("L1", "L2")):
             options = {**OPTIONS[name], **({"resolution": asked.resolution} if asked.resolution else {})}
             seconds = asked.seconds or BUDGETS.get(name, 4.0)
-            new = compare(name, loss, seconds, asked.seeds, options)
+            new = compare(name, loss, seconds, asked.seeds, options, parse(asked.grid))
             entries = [e for e in entries if (e["problem"], e["loss"]) != (name, loss)] + [new]
             write(HERE, {"entries": entries})
     plot(read(HERE))
