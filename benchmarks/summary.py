@@ -141,6 +141,22 @@ def lines(found: dict[str, Any], keys: tuple[str, ...]) -> str:
     return "\n\n".join(f"```json\n{json.dumps(found[key], indent=None)}\n```" for key in keys)
 
 
+INDIRECT_ROOM = """What decides `indirect-room` with L1, from trials on single seeds (error after 12 to 15 s of 128² films):
+
+- With 128² texels, more than the pixels that see them, and no preconditioner, what no pixel sees wanders with every noisy step, and many \
+cheap steps are worse than few dear ones: rcv at 8 spp and rate 0.003 ended at 0.18, plain at 32 spp and 0.01 at 0.15, stock at 32 spp and \
+0.03 at 0.26. Plain at 2 spp ended at 2.39, every texel at its upper bound, for any rate.
+- With 64² texels: rcv at 4 spp and 0.01 reached 0.20 after 2.4 s and 0.15 after 12 s; plain at 32 spp and 0.02 reached 0.16 after 7 s and stayed.
+- With 64² texels and LargeSteps(2), as the paper has it in its Fig. 9 and the gallery now has it: rcv at 4 spp and 0.02 reached 0.15 after 4 s \
+and 0.09 after 12 s; plain at 32 spp and 0.03 ended at 0.19.
+
+Tried without effect at 128², 300 steps of 2 spp at rate 0.01 (final error 0.343): faster means (α = 0.5) 0.344; faster statistics (β = 0.95) \
+0.343; (co)variances from the groups within a step 0.343. Predicted and measured deviations of the control variate agree (0.044 and 0.047 after \
+600 steps), its bias is 0.4 % of the mean: the image is as good as it says. At a constant rate, parameters that move by a share δ a step add \
+δ² of a render's variance to the memory each time, so its relative variance settles near δ instead of 1/n. With a reference at 1024 spp every \
+method that minimises the loss recovers the reference's noise too."""
+
+
 SECTIONS: list[tuple[str, str, Any, str]] = [
     (
         "Cost of a pair, a step, the loop",
@@ -154,8 +170,8 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
         reconstruction,
         "Error: each parameter's RMSE over its RMSE at the start, averaged over parameters; 1 is no progress. Final: median over 5 seeds "
         "(least to most). Every method was tuned on a seed of its own, over spp and learning rate, for the whole budget (grids in the "
-        "script; `stock` around plain's best). `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` and `rcv` are this "
-        "library's.",
+        "script, or in the command's `--grid`). `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` and `rcv` are this "
+        "library's. `glossy-room` has LargeSteps on two maps, which the stock loop lacks.\n\n" + INDIRECT_ROOM,
     ),
     ("The main job on scenes made by others", "real_input", real_input, ""),
     ("Steady state of the weights (paper Fig. 3)", "rcv/fig3_weights", weights, ""),

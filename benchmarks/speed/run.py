@@ -168,7 +168,9 @@ def main() -> None:
             "step_ms": steps,
             "step_ratios": ratios,
             "gradient_variance": {
-                name: gradient_variance(ur.gallery.problem(name, resolution=asked.resolution // 2, loss="L2"), asked.spp)
+                name: gradient_variance(
+                    ur.gallery.problem(name, resolution=asked.resolution // 2, loss="L2"), asked.spp
+                )
                 for name in ur.gallery.names()
             },
             "outside_kernels": {name: outside_kernels(problem, small) for name, problem in defaults.items()},

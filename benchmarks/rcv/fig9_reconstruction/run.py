@@ -33,7 +33,7 @@ TUNING_SEED = 1000
 BUDGETS = {"indirect-room": 15.0}
 # Noise in the reference is part of what the loss asks for: a method that minimises it well fits it. Here it must be small.
 OPTIONS: dict[str, dict[str, Any]] = {
-    "indirect-room": {"reference_spp": 16384},
+    "indirect-room": {"reference_spp": 4096},
     "glossy-room": {"resolution": 64, "reference_spp": 4096},
     "sunlit-vase": {"resolution": 64, "reference_spp": 4096},
     "lamp": {"resolution": 64, "reference_spp": 4096},

@@ -12,6 +12,7 @@ from typing import Any
 
 from unrender.gallery import fields, parts, textures
 from unrender.losses import L1, Loss
+from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
 
@@ -19,11 +20,11 @@ from unrender.problem.parameter import Parameter
 class IndirectRoom:
     """A photograph on the back wall of a room that is lit only by light bounced off its ceiling.
 
-    One view; one unknown, the wall's reflectance (texture_resolution², 3), from grey.
+    One view; one unknown, the wall's reflectance (texture_resolution², 3), from grey, with LargeSteps.
     """
 
     resolution: int = fields.resolution(128)
-    texture_resolution: int = fields.texture_resolution(128)
+    texture_resolution: int = fields.texture_resolution(64)
     reference_spp: int = fields.reference_spp(4096)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
@@ -45,8 +46,8 @@ class IndirectRoom:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The wall's texture, grey at first."""
-        return (Parameter("back.bsdf.reflectance.data", initial=0.5),)
+        """The wall's texture, grey at first, smoothed by LargeSteps as in the paper's own reconstruction (Fig. 9)."""
+        return (Parameter("back.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(2.0)),)
 
 
 def _lamp() -> dict[str, Any]:
