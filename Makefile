@@ -21,13 +21,15 @@ SECONDS := 30
 # One test process unless WORKERS says otherwise: two of them on two cores compile many kernels twice, and took 1.4 times the
 # processor time of one. With more cores they pay.
 PYTEST = $(BIN)/python -m pytest -q $(if $(WORKERS),-n $(WORKERS))
+# What does best on this problem in this time, for each: benchmarks/rcv/fig9_reconstruction.
+TUNED := --set plain.spp=32 --set plain.learning_rate=0.03 --set rcv.spp=4 --set rcv.learning_rate=0.02
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
 demo: .venv/ready
-	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo --overwrite
+	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo --overwrite $(TUNED)
 	@echo "the result, to open in a browser: file://$(CURDIR)/out/demo/compare.html"
 
 test: lint

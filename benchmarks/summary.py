@@ -143,17 +143,20 @@ def lines(found: dict[str, Any], keys: tuple[str, ...]) -> str:
 
 INDIRECT_ROOM = """What decides `indirect-room` with L1, from trials on single seeds (error after 12 to 15 s of 128² films):
 
-- With 128² texels, more than the pixels that see them, and no preconditioner, what no pixel sees wanders with every noisy step, and many \
-cheap steps are worse than few dear ones: rcv at 8 spp and rate 0.003 ended at 0.18, plain at 32 spp and 0.01 at 0.15, stock at 32 spp and \
-0.03 at 0.26. Plain at 2 spp ended at 2.39, every texel at its upper bound, for any rate.
-- With 64² texels: rcv at 4 spp and 0.01 reached 0.20 after 2.4 s and 0.15 after 12 s; plain at 32 spp and 0.02 reached 0.16 after 7 s and stayed.
-- With 64² texels and LargeSteps(2), as the paper has it in its Fig. 9 and the gallery now has it: rcv at 4 spp and 0.02 reached 0.15 after 4 s \
-and 0.09 after 12 s; plain at 32 spp and 0.03 ended at 0.19.
+- With 128² texels, more than the pixels that see them, and no preconditioner, what no pixel sees wanders with every
+  noisy step, and many cheap steps are worse than few dear ones: rcv at 8 spp and rate 0.003 ended at 0.18, plain at
+  32 spp and 0.01 at 0.15, stock at 32 spp and 0.03 at 0.26. Plain at 2 spp ended at 2.39, every texel at its upper
+  bound, for any rate.
+- With 64² texels: rcv at 4 spp and 0.01 reached 0.20 after 2.4 s and 0.15 after 12 s; plain at 32 spp and 0.02
+  reached 0.16 after 7 s and stayed.
+- With 64² texels and LargeSteps(2), as the paper has it in its Fig. 9 and the gallery now has it: rcv at 4 spp and
+  0.02 reached 0.15 after 4 s and 0.09 after 12 s; plain at 32 spp and 0.03 ended at 0.19.
 
-Tried without effect at 128², 300 steps of 2 spp at rate 0.01 (final error 0.343): faster means (α = 0.5) 0.344; faster statistics (β = 0.95) \
-0.343; (co)variances from the groups within a step 0.343. Predicted and measured deviations of the control variate agree (0.044 and 0.047 after \
-600 steps), its bias is 0.4 % of the mean: the image is as good as it says. At a constant rate, parameters that move by a share δ a step add \
-δ² of a render's variance to the memory each time, so its relative variance settles near δ instead of 1/n. With a reference at 1024 spp every \
+Tried without effect at 128², 300 steps of 2 spp at rate 0.01 (final error 0.343): faster means (α = 0.5) 0.344;
+faster statistics (β = 0.95) 0.343; (co)variances from the groups within a step 0.343. Predicted and measured
+deviations of the control variate agree (0.044 and 0.047 after 600 steps), its bias is 0.4 % of the mean: the image
+is as good as it says. At a constant rate, parameters that move by a share δ a step add δ² of a render's variance to
+the memory each time, so its relative variance settles near δ instead of 1/n. With a reference at 1024 spp every
 method that minimises the loss recovers the reference's noise too."""
 
 
