@@ -36,7 +36,7 @@ def speed(found: dict[str, Any]) -> str:
     """Costs as ratios."""
     primal, steps, ratios = found["primal_ms"], found["step_ms"], found["step_ratios"]
     variance = [
-        [name, *(f"{entry[place]['ratio']:.2f}" for place in ("start", "near the truth"))]
+        [name, *(f"{entry[place]['ratio']:.2f}" if place in entry else "" for place in ("start", "near the truth"))]
         for name, entry in found["gradient_variance"].items()
     ]
     outside = [
