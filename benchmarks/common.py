@@ -19,6 +19,7 @@ import numpy as np
 
 import unrender as ur
 from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.scene_pair import from_tensor
 from unrender.training.bounds import project
 from unrender.training.result import hardware, versions
 
@@ -66,10 +67,7 @@ def stock_loop(
         rates = {key: problem.learning_rates.get(key, learning_rate) for key in start}
         optimizer = mi.ad.Adam(lr=learning_rate)
         for key, value in start.items():
-            native = parameters[key]
-            optimizer[key] = (
-                mi.TensorXf(value) if dr.is_tensor_v(native) else type(native)(*np.atleast_1d(np.array(value)))
-            )
+            optimizer[key] = from_tensor(value, parameters[key])
         optimizer.set_learning_rate(rates)
         parameters.update(optimizer)
         clock, step = 0.0, 0

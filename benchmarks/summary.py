@@ -6,6 +6,7 @@ python benchmarks/summary.py
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def table(head: list[str], rows: list[list[Any]]) -> str:
 
 def command(found: dict[str, Any]) -> str:
     """How these figures were made, and on what."""
-    words = " ".join(w.split("/work/main/")[-1] for w in found["command"].split())
+    words = re.sub(r"\S*/(?=benchmarks/)", "", found["command"])
     hardware = found["hardware"]
     return f"`{words}`, {hardware['cores']} cores of {hardware['processor']}, Mitsuba {found['versions']['mitsuba']}."
 
@@ -171,7 +172,7 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
         "Equal-time reconstruction (paper Fig. 9)",
         "rcv/fig9_reconstruction",
         reconstruction,
-        "Error: each parameter's RMSE over its RMSE at the start, averaged over parameters; 1 is no progress. Final: median over 5 seeds "
+        "Error: each parameter's RMSE over its RMSE at the start, averaged over parameters; 1 is no progress. Final: median over the seeds "
         "(least to most). Every method was tuned on a seed of its own, over spp and learning rate, for the whole budget (grids in the "
         "script, or in the command's `--grid`). `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` and `rcv` are this "
         "library's. `glossy-room` has LargeSteps on two maps, which the stock loop lacks.\n\n" + INDIRECT_ROOM,
