@@ -179,6 +179,12 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ),
     ("The main job on scenes made by others", "real_input", real_input, ""),
     ("Steady state of the weights (paper Fig. 3)", "rcv/fig3_weights", weights, ""),
+    (
+        "Bias of the loss and of its derivative (paper Figs 6 and 7)",
+        "rcv/fig6_7_loss_bias",
+        lambda found: lines(found, ("fig7",)) if len(json.dumps(found["fig7"])) < 4000 else "Figures in results.json.",
+        "",
+    ),
 ]
 
 
