@@ -2,6 +2,6 @@
 
 import sys
 
-from unrender.cli.entry import main
+from unrender.cli.main import main
 
 sys.exit(main())
