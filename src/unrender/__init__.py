@@ -21,6 +21,7 @@ from unrender.variant import use
 if TYPE_CHECKING:
     from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, statistics
     from unrender.gradients.estimate import Estimate
+    from unrender.gradients.meta import MetaEstimator
     from unrender.gradients.path import PathGradient
     from unrender.keys import Key
     from unrender.problem.parameter import Parameter
@@ -36,6 +37,7 @@ _HOMES = {
     "Callback": "training.callbacks",
     "Estimate": "gradients.estimate",
     "Key": "keys",
+    "MetaEstimator": "gradients.meta",
     "Parameter": "problem.parameter",
     "PathGradient": "gradients.path",
     "Problem": "problem.problem",
@@ -55,6 +57,7 @@ __all__ = [
     "Estimate",
     "InputError",
     "Key",
+    "MetaEstimator",
     "Parameter",
     "PathGradient",
     "Problem",

@@ -18,13 +18,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, P
 from unrender import optimizers
 from unrender.errors import InputError
 from unrender.gradients.estimate import Estimator
+from unrender.gradients.meta import MetaEstimator
 from unrender.gradients.path import PathGradient
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.names import did_you_mean
 from unrender.optimizers import schedules
 from unrender.optimizers.base import Optimizer
-from unrender.problem.field import did_you_mean
+from unrender.statistics import meta
 
 SCHEDULES: dict[str, type] = {
     "constant": schedules.Constant,
@@ -79,6 +81,49 @@ class RecursiveControlVariateOptions(PathOptions):
     )
     alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
     beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")
+
+
+class MetaCommonOptions(Options):
+    """What the two forms of meta-estimation share."""
+
+    optimizer: Literal["meta-adam", "adam"] = Field(
+        "meta-adam",
+        description="what takes the steps; adam, which takes the gradients for independent, is for comparison",
+    )
+    learning_rate: PositiveFloat = Field(0.003, description="step size of the parameters that have none of their own")
+    schedule: str | None = AdamOptions.model_fields["schedule"]
+    space: Literal["auto", "path", "primary"] = Field(
+        "auto", description="what two steps share: paths, random numbers, or paths where all parameters allow it"
+    )
+    beta_proportional: FiniteFloat = Field(
+        meta.BETA_PROPORTIONAL, ge=0, lt=1, description="decay of the mean square of the gradient samples"
+    )
+    beta_difference: FiniteFloat = Field(
+        meta.BETA_DIFFERENCE, ge=0, lt=1, description="decay of the mean square of their differences, per step length"
+    )
+
+    def descent(self) -> Optimizer:
+        """The optimizer with these options."""
+        kind = optimizers.MetaAdam if self.optimizer == "meta-adam" else optimizers.Adam
+        return kind(self.learning_rate, schedule=parse_schedule(self.schedule))
+
+    def shared(self) -> dict[str, Any]:
+        """The arguments that both forms of `MetaEstimator` take."""
+        return {name: getattr(self, name) for name in ("space", "beta_proportional", "beta_difference")}
+
+
+class MetaOptions(MetaCommonOptions):
+    """Options of `meta`."""
+
+    proportional_spp: PositiveInt = Field(2, description="samples per pixel of the gradient itself")
+    difference_spp: PositiveInt = Field(1, description="samples per pixel of its change since the last step")
+
+
+class CoupledOptions(MetaCommonOptions):
+    """Options of `coupled`."""
+
+    spp: PositiveInt = Field(3, description="samples per pixel, each for the gradient and for its change")
+    image: Literal["plain", "rcv"] = Field("plain", description="what the loss sees: a fresh rendering, or rcv's")
 
 
 @dataclass(frozen=True)
@@ -141,6 +186,18 @@ def _rcv(options: RecursiveControlVariateOptions) -> tuple[Estimator, Optimizer]
     return options.estimator(image), options.optimizer()
 
 
+def _meta(options: MetaOptions) -> tuple[Estimator, Optimizer]:
+    estimator = MetaEstimator(options.proportional_spp, options.difference_spp, **options.shared())
+    return estimator, options.descent()
+
+
+def _coupled(options: CoupledOptions) -> tuple[Estimator, Optimizer]:
+    image = Plain()
+    if options.image == "rcv":
+        image = RecursiveControlVariate("primary" if options.space == "primary" else "path")
+    return MetaEstimator(coupled=True, spp=options.spp, image=image, **options.shared()), options.descent()
+
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -150,6 +207,18 @@ METHODS: dict[str, Method] = {
             "recursive control variates: the image keeps what earlier steps rendered (Nicolet et al. 2023), Adam",
             RecursiveControlVariateOptions,
             _rcv,
+        ),
+        Method(
+            "meta",
+            "meta-estimation: the gradient keeps earlier ones, moved along by finite differences (Balint et al. 2023), MetaAdam",
+            MetaOptions,
+            _meta,
+        ),
+        Method(
+            "coupled",
+            "the same recursion, every sample in both of its terms, MetaAdam",
+            CoupledOptions,
+            _coupled,
         ),
     )
 }

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes.util
-import difflib
 import functools
 import os
 import subprocess
@@ -19,6 +18,7 @@ from typing import Any
 
 from unrender import llvm, packages
 from unrender.errors import VariantError
+from unrender.names import did_you_mean
 
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
@@ -84,8 +84,7 @@ def use(variant: str = "auto") -> str:
             that it would abort the process. One line, with the command that installs what is missing.
     """
     if variant not in ("auto", *VARIANTS):
-        near = difflib.get_close_matches(variant, VARIANTS, n=1, cutoff=0.3)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(variant, VARIANTS, likeness=0.3)
         raise VariantError(f"unknown variant {variant!r}: expected 'auto', {CUDA!r} or {LLVM!r}{hint}")
     mi = _mitsuba()
     chosen = variant

@@ -69,7 +69,9 @@ def test_a_planted_bias_of_one_percent_is_seen() -> None:
 def test_mesh_attributes_are_read_from_the_shape_of_their_state() -> None:
     def description() -> dict[str, Any]:
         attribute = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
-        mesh = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.6]), "bsdf": attribute})
+        mesh = mi.load_dict(
+            {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.6]), "bsdf": attribute}
+        )
         count = mesh.vertex_count() * 3
         mesh.add_attribute("vertex_color", 3, np.random.default_rng(1).uniform(0.1, 0.9, count).astype(np.float32))
         return {**scene({"type": "diffuse"}), "ball": mesh}

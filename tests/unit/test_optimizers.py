@@ -161,7 +161,7 @@ def test_a_changing_python_number_would_be_noticed(gradients, monkeypatch):
         (lambda: SGD(momentum=1), "SGD: momentum must be a finite number >= 0 and < 1, got 1"),
         (
             lambda: Adam().init({"wall": np.zeros(2)}, {"wal": 0.1}),
-            'Adam: learning rate given for unknown parameter "wal"; did you mean "wall"?',
+            'Adam: learning rate given for unknown parameter "wal"; did you mean wall?',
         ),
         (
             lambda: SGD().init({"wall": np.zeros(2)}, {"wall": -1.0}),

@@ -27,8 +27,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from along import Moments, follow, gallery, read_maps, write_maps
 from common import read, write
-from rcv.along import Moments, follow, gallery, read_maps, write_maps
 
 import unrender as ur
 from unrender import arrays, statistics

@@ -26,8 +26,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from along import Moments, converged, descent, follow, gallery, paired_bias, read_maps, write_maps
 from common import read, write
-from rcv.along import Moments, converged, descent, follow, gallery, paired_bias, read_maps, write_maps
 
 import unrender as ur
 from unrender import arrays

@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from along import Moments, converged, descent, follow, gallery, read_maps, write_maps
 from common import median_time, read, write
-from rcv.along import Moments, converged, descent, follow, gallery, read_maps, write_maps
 
 import unrender as ur
 from unrender import arrays

@@ -14,7 +14,7 @@ import typer
 
 from unrender import gallery, variant
 from unrender.errors import InputError
-from unrender.problem.field import did_you_mean
+from unrender.names import did_you_mean
 from unrender.problem.problem import Problem
 
 DEFAULT_STEPS = 300

@@ -10,8 +10,8 @@ from typing import Any
 from unrender import checks
 from unrender.errors import InputError
 from unrender.losses import Loss
+from unrender.names import did_you_mean
 from unrender.problem.components import LOSSES, make
-from unrender.problem.field import did_you_mean
 
 
 @dataclass(frozen=True)

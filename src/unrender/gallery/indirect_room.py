@@ -31,45 +31,16 @@ class IndirectRoom:
 
     def scene(self) -> dict[str, Any]:
         """The room: x and y in [-1, 1], z in [-1, 2.2]; the camera inside, looking along -z."""
-        white, red, green = parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1)
         picture = textures.bitmap(textures.photograph("astronaut", self.texture_resolution))
+        room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
         return {
             "type": "scene",
             "camera": parts.camera((0, 0, 2.1), (0, 0, -1), 40.0, self.resolution),
+            **room,
             "back": parts.rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), {"type": "diffuse", "reflectance": picture}),
-            "left": parts.rectangle((-1, 0, 0.6), (0, 0, -1.6), (0, 1, 0), red),
-            "right": parts.rectangle((1, 0, 0.6), (0, 0, 1.6), (0, 1, 0), green),
-            "front": parts.rectangle((0, 0, 2.2), (-1, 0, 0), (0, 1, 0), white),
-            "floor": parts.rectangle((0, -1, 0.6), (1, 0, 0), (0, 0, -1.6), white),
-            "ceiling": parts.rectangle((0, 1, 0.6), (1, 0, 0), (0, 0, 1.6), white),
-            **_lamp(),
+            **parts.uplight((0.0, -0.999, 0.5), (40e3, 36e3, 30e3)),
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
         """The wall's texture, grey at first, smoothed by LargeSteps as in the paper's own reconstruction (Fig. 9)."""
         return (Parameter("back.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(2.0)),)
-
-
-def _lamp() -> dict[str, Any]:
-    """An uplight on the floor: a small square light at the bottom of a wide box that is open above.
-
-    From an edge of the light over the opposite edge of the box, light reaches the ceiling at most
-    2 (half + opening) / height - half = 0.94 aside of the lamp's axis: no wall sees any of it. The sides are seen from
-    outside only; inside they are black.
-    """
-    x, y, z = 0.0, -0.999, 0.5
-    half, opening, height = 0.03, 0.115, 0.3
-    metal = parts.diffuse(0.4)
-    pieces = {
-        "light": parts.rectangle(
-            (x, y, z), (half, 0, 0), (0, 0, -half), parts.diffuse(0.0), emitter=parts.light(40e3, 36e3, 30e3)
-        )
-    }
-    for name, (dx, dz) in {"left": (-1, 0), "right": (1, 0), "near": (0, 1), "far": (0, -1)}.items():
-        pieces[f"shade_{name}"] = parts.rectangle(
-            (x + opening * dx, y + height / 2, z + opening * dz),
-            (opening * dz, 0, -opening * dx),
-            (0, height / 2, 0),
-            metal,
-        )
-    return pieces

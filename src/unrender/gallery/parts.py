@@ -70,3 +70,48 @@ def twosided(bsdf: dict[str, Any]) -> dict[str, Any]:
 def light(*rgb: float) -> dict[str, Any]:
     """An area light of that radiance."""
     return {"type": "area", "radiance": colour(*rgb)}
+
+
+def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> dict[str, Any]:
+    """A closed room, x and y in [-1, 1], z in [-1, 2.2], its walls facing inward.
+
+    Args:
+        walls: the material of back, front, floor and ceiling.
+        left, right: of the other two.
+    """
+    return {
+        "back": rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), walls),
+        "left": rectangle((-1, 0, 0.6), (0, 0, -1.6), (0, 1, 0), left),
+        "right": rectangle((1, 0, 0.6), (0, 0, 1.6), (0, 1, 0), right),
+        "front": rectangle((0, 0, 2.2), (-1, 0, 0), (0, 1, 0), walls),
+        "floor": rectangle((0, -1, 0.6), (1, 0, 0), (0, 0, -1.6), walls),
+        "ceiling": rectangle((0, 1, 0.6), (1, 0, 0), (0, 0, 1.6), walls),
+    }
+
+
+def uplight(place: Vector, radiance: Sequence[float], name: str = "lamp") -> dict[str, Any]:
+    """A lamp that shines at the ceiling: a small square light at the bottom of a wide box that is open above.
+
+    From an edge of the light over the opposite edge of the box, light reaches a ceiling 2 above it at most
+    2 (half + opening) / height - half = 0.94 aside of the lamp's axis: no wall that is farther sees any of it. The sides
+    are seen from outside only; inside they are black.
+
+    Args:
+        place: the middle of the light.
+        radiance: RGB.
+        name: what its pieces' names begin with.
+    """
+    x, y, z = (float(v) for v in place)
+    half, opening, height = 0.03, 0.115, 0.3
+    metal = diffuse(0.4)
+    pieces = {
+        f"{name}_light": rectangle((x, y, z), (half, 0, 0), (0, 0, -half), diffuse(0.0), emitter=light(*radiance))
+    }
+    for side, (dx, dz) in {"left": (-1, 0), "right": (1, 0), "near": (0, 1), "far": (0, -1)}.items():
+        pieces[f"{name}_shade_{side}"] = rectangle(
+            (x + opening * dx, y + height / 2, z + opening * dz),
+            (opening * dz, 0, -opening * dx),
+            (0, height / 2, 0),
+            metal,
+        )
+    return pieces

@@ -6,13 +6,17 @@ from typing import Any
 
 from unrender.errors import InputError
 from unrender.gallery import fields
+from unrender.gallery.ajar import Ajar
+from unrender.gallery.chalice import Chalice
+from unrender.gallery.exponential import Exponential
 from unrender.gallery.fields import Option
 from unrender.gallery.glossy_room import GlossyRoom
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.lamp import Lamp
 from unrender.gallery.recipe import cook
+from unrender.gallery.spiral import Spiral
 from unrender.gallery.sunlit_vase import SunlitVase
-from unrender.problem.field import did_you_mean
+from unrender.names import did_you_mean
 from unrender.problem.problem import Problem
 
 _RECIPES: dict[str, type] = {
@@ -20,6 +24,10 @@ _RECIPES: dict[str, type] = {
     "glossy-room": GlossyRoom,
     "sunlit-vase": SunlitVase,
     "lamp": Lamp,
+    "spiral": Spiral,
+    "ajar": Ajar,
+    "chalice": Chalice,
+    "exponential": Exponential,
 }
 
 
@@ -45,8 +53,8 @@ def problem(name: str, **options: Any) -> Problem:
 
     Args:
         name: one of `names()`.
-        options: see `options(name)`. All have resolution (pixels along a side), texture_resolution, reference_spp,
-            max_depth and loss; the defaults take seconds on two CPU cores, a GPU wants larger ones.
+        options: see `options(name)`. All have loss, and those that are rendered resolution (pixels along a side),
+            texture_resolution, reference_spp and max_depth; the defaults take seconds on two CPU cores, a GPU wants larger ones.
 
     Returns:
         the problem. Its references hold noise of their own, which `reference_spp` lowers.
@@ -55,7 +63,8 @@ def problem(name: str, **options: Any) -> Problem:
         InputError: the name or an option is unknown, or an option is out of its range.
         VariantError: Mitsuba cannot run on this machine.
     """
-    return cook(name, fields.fill(name, _recipe(name), options))
+    recipe = fields.fill(name, _recipe(name), options)
+    return recipe.problem(name) if isinstance(recipe, Exponential) else cook(name, recipe)
 
 
 def _recipe(name: str) -> type:

@@ -19,6 +19,11 @@ from unrender.trees import Tree
 _MOST_GROUPS = 16
 
 
+def crossed_groups(spp: int) -> int:
+    """How many groups `spp` samples are cut into; 1 where they cannot be."""
+    return max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
+
+
 @dataclass(frozen=True)
 class PathGradientState:
     """The image estimator's state."""
@@ -66,9 +71,7 @@ class PathGradient:
     @property
     def groups(self) -> int:
         """How many groups are crossed; 1 where the adjoint has paths of its own."""
-        if self.adjoint_spp is not None:
-            return 1
-        return max(n for n in range(1, _MOST_GROUPS + 1) if self.spp % n == 0)
+        return 1 if self.adjoint_spp is not None else crossed_groups(self.spp)
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""

@@ -22,11 +22,13 @@ class ImageEstimate:
         images: (groups, H, W, 3), one estimate per group of samples, made without the other groups' samples.
         paths: the renderer's own, to replay these samples.
         info: for people, e.g. {"control_weight": array}.
+        previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
     """
 
     images: Array
     paths: Any
     info: Mapping[str, Any] = field(default_factory=dict)
+    previous: Array | None = None
 
     def mean(self) -> Array:
         """The image of all samples together, (H, W, 3)."""
@@ -34,8 +36,29 @@ class ImageEstimate:
 
     def others(self) -> Array:
         """For each group, the image of all other groups' samples, (groups, H, W, 3); of its own where it is alone."""
-        groups = self.images.shape[0]
-        return self.images if groups == 1 else (self.mean() * groups - self.images) / (groups - 1)
+        return _others(self.images)
+
+    def previous_others(self) -> Array:
+        """`others()` of the previous step's parameters."""
+        return _others(self.previous)
+
+
+def _others(images: Array) -> Array:
+    groups = images.shape[0]
+    return images if groups == 1 else (arrays.mean_first(images) * groups - images) / (groups - 1)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The state that is to be rendered beside the current one, from the same samples.
+
+    Attributes:
+        previous: the parameters of the last step that the estimator took.
+        space: where to share samples, for image estimators without a space of their own.
+    """
+
+    previous: Tree
+    space: Space
 
 
 class ImageEstimator(Protocol):
@@ -51,9 +74,17 @@ class ImageEstimator(Protocol):
         ...
 
     def estimate(
-        self, problem: Problem, parameters: Tree, state: Any, view: int, spp: int, groups: int, key: Key
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: Any,
+        view: int,
+        spp: int,
+        groups: int,
+        key: Key,
+        beside: Beside | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """The image of one view, and what is to be kept of it."""
+        """The image of one view, and what is to be kept of it; with `beside`, that of the previous parameters too."""
         ...
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from unrender.images.base import ImageEstimate
+from unrender.images.base import Beside, ImageEstimate
 from unrender.keys import Key
 from unrender.problem.problem import Problem
 from unrender.rendering.port import Shot, Space
@@ -32,13 +32,24 @@ class Plain:
         return PlainState()
 
     def estimate(
-        self, problem: Problem, parameters: Tree, state: PlainState, view: int, spp: int, groups: int, key: Key
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: PlainState,
+        view: int,
+        spp: int,
+        groups: int,
+        key: Key,
+        beside: Beside | None = None,
     ) -> tuple[ImageEstimate, None]:
         """See `ImageEstimator.estimate`."""
         del state
         shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
-        rendering = problem.renderer.image(parameters, shot)
-        return ImageEstimate(rendering.images, rendering.paths), None
+        if beside is None:
+            rendering = problem.renderer.image(parameters, shot)
+        else:
+            rendering = problem.renderer.image_pair(parameters, beside.previous, shot, beside.space)
+        return ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous), None
 
     def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:
         """See `ImageEstimator.advance`."""

@@ -11,7 +11,7 @@ from typing import Any
 from unrender import arrays, statistics, trees
 from unrender.arrays import Array
 from unrender.errors import InputError
-from unrender.images.base import ImageEstimate
+from unrender.images.base import Beside, ImageEstimate
 from unrender.keys import Key
 from unrender.problem.problem import Problem
 from unrender.rendering.port import Shot, Space
@@ -102,15 +102,21 @@ class RecursiveControlVariate:
         spp: int,
         groups: int,
         key: Key,
+        beside: Beside | None = None,
     ) -> tuple[ImageEstimate, ViewMemory]:
-        """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone."""
+        """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone.
+
+        The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
+        one as far as the two can share it: they differ by F − H.
+        """
+        del beside
         shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
         fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
         previous = parameters if fresh or state.parameters is None else state.parameters
         rendering = problem.renderer.image_pair(parameters, previous, shot, self.space)
         assert rendering.previous is not None
         if fresh:
-            estimate = ImageEstimate(rendering.images, rendering.paths)
+            estimate = ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous)
             return estimate, self._start(estimate.mean())
         memory = state.views[view]
         F, H = arrays.mean_first(rendering.images), arrays.mean_first(rendering.previous)
@@ -133,7 +139,9 @@ class RecursiveControlVariate:
         )
         known = var_current > 0
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
-        estimate = ImageEstimate(images, rendering.paths, {"control_weight": weight, "variance": variance})
+        told = {"control_weight": weight, "variance": variance}
+        beside_it = advance(memory.image, rendering.previous, rendering.previous, weight)
+        estimate = ImageEstimate(images, rendering.paths, told, beside_it)
         return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
 
     def advance(

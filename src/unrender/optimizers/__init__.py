@@ -3,6 +3,7 @@
 from unrender.optimizers import schedules
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.meta_adam import MetaAdam
 from unrender.optimizers.sgd import SGD
 
-__all__ = ["SGD", "Adam", "Optimizer", "schedules"]
+__all__ = ["SGD", "Adam", "MetaAdam", "Optimizer", "schedules"]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from unrender import checks
 from unrender.errors import InputError
+from unrender.names import did_you_mean
 from unrender.optimizers.schedules import Schedule
 
 
@@ -27,8 +27,7 @@ def per_parameter(owner: str, keys: Iterable[str], common: float, own: Mapping[s
     keys, own = list(keys), dict(own or {})
     for key, rate in own.items():
         if key not in keys:
-            near = difflib.get_close_matches(key, keys, 1)
-            hint = f'; did you mean "{near[0]}"?' if near else ""
+            hint = did_you_mean(key, keys)
             raise InputError(f'{owner}: learning rate given for unknown parameter "{key}"{hint}')
         checks.number(owner, f'learning rate of "{key}"', rate, above=0.0)
     return {key: float(own.get(key, common)) for key in keys}

@@ -8,7 +8,7 @@ from typing import Any
 
 from unrender import losses, preconditioners
 from unrender.errors import InputError
-from unrender.problem.field import did_you_mean
+from unrender.names import did_you_mean
 
 LOSSES: dict[str, type] = {"L1": losses.L1, "L2": losses.L2, "RelativeL2": losses.RelativeL2, "Huber": losses.Huber}
 PRECONDITIONERS: dict[str, type] = {"LargeSteps": preconditioners.LargeSteps}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
-
 from unrender.errors import InputError
 
 Place = tuple[str | int, ...]
@@ -32,9 +29,3 @@ def dotted(place: Place) -> str:
     for part in place:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
     return text
-
-
-def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
-    """The words "; did you mean X?" for the nearest known name, "" where none is alike enough (0: any, 1: equal)."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=likeness)
-    return f"; did you mean {near[0]}?" if near else ""

@@ -30,9 +30,11 @@ from typing import Any
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
+from unrender import files
 from unrender.errors import InputError
+from unrender.names import did_you_mean
 from unrender.problem import components, lines
-from unrender.problem.field import FieldError, Place, did_you_mean, dotted
+from unrender.problem.field import FieldError, Place, dotted
 from unrender.problem.lines import tomllib
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
@@ -85,7 +87,7 @@ def read(path: str | Path) -> Problem:
         InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
     """
     file = Path(path)
-    text = _text(file)
+    text = files.read_text(file).replace("\r\n", "\n")
     try:
         model = _Problem.model_validate(_parse(file, text))
         return _build(model, file)
@@ -103,19 +105,6 @@ def read(path: str | Path) -> Problem:
 
 def _message(file: Path, text: str, place: Place, what: str) -> str:
     return f"{file}:{lines.find(text, place)}: {dotted(place)}: {what}"
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
-    except FileNotFoundError as error:
-        raise InputError(f"{file}: no such file") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{file}: a folder, expected a TOML file") from error
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: not a TOML file: not UTF-8 text") from error
 
 
 def _parse(file: Path, text: str) -> dict[str, Any]:

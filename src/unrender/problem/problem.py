@@ -14,9 +14,10 @@ from unrender import arrays
 from unrender.arrays import Array
 from unrender.errors import InputError
 from unrender.losses import L2, Loss
+from unrender.names import did_you_mean
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem import pictures, values
-from unrender.problem.field import FieldError, did_you_mean
+from unrender.problem.field import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.view import View
 from unrender.rendering.port import ParameterInfo, Renderer
@@ -138,6 +139,11 @@ class Problem:
         slope, mask = self.loss.derivative(image, self.reference(view)), self.mask(view)
         factor = self.views[view].weight / math.prod(arrays.shape(self.reference(view)))
         return (slope if mask is None else slope * mask) * factor
+
+    def precondition(self, tree: Tree) -> Tree:
+        """S x for each parameter that has a preconditioner S, x for the others."""
+        maps = self.preconditioners
+        return {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
         """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""

@@ -118,6 +118,12 @@ class AnalyticRenderer:
                 gradient[key] = part
         return gradient
 
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: AnalyticPaths, weights: np.ndarray, weights_previous: np.ndarray
+    ) -> tuple[Tree, Tree]:
+        """See `Renderer.adjoint_pair`."""
+        return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
+
     def _flat(self, parameters: Tree) -> np.ndarray:
         return np.concatenate([np.ravel(parameters.get(key, value)) for key, value in self._values.items()])
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import difflib
 import gc
 import logging
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.errors import InputError
+from unrender.names import did_you_mean
 from unrender.rendering import camera
 from unrender.rendering.path_pair import DELTA_EQUAL, PathPair
 from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
@@ -33,10 +33,14 @@ class Paths:
     Attributes:
         shot: the samples taken.
         radiance: per lane.
+        previous: likewise of the previous state; None unless a pair was rendered.
+        space: where the pair shares its samples.
     """
 
     shot: Shot
     radiance: Any
+    previous: Any = None
+    space: Space = "path"
 
 
 class MitsubaRenderer:
@@ -59,6 +63,7 @@ class MitsubaRenderer:
         self._keys: list[str] = []
         self._native: dict[str, Any] = {}
         self._leaves: dict[str, Any] = {}
+        self._leaves_previous: dict[str, Any] = {}
         self._loaded: Tree = {}
         self._loaded_previous: Tree = {}
         self._geometric = False
@@ -89,10 +94,7 @@ class MitsubaRenderer:
         """Announce the parameters to recover. See `Renderer.select`."""
         for key in keys:
             if key not in self._info:
-                near = difflib.get_close_matches(key, self._info, n=1)
-                raise InputError(
-                    f"parameter {key}: the scene has none of that name" + (f"; did you mean {near[0]}?" if near else "")
-                )
+                raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
             info = self._info[key]
             if not info.differentiable:
                 raise InputError(f"parameter {key}: it cannot be recovered by gradients, since {info.reason}")
@@ -111,7 +113,7 @@ class MitsubaRenderer:
             changing = [ride for ride in rides if ride.delta != DELTA_EQUAL]
             self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
             self._delta_table = self._delta_kinds(changing)
-            self._leaves, self._loaded, self._loaded_previous = {}, {}, {}
+            self._leaves, self._leaves_previous, self._loaded, self._loaded_previous = {}, {}, {}, {}
             self._frozen.clear()
 
     def _delta_kinds(self, changing: list[Carriage]) -> Any:
@@ -140,20 +142,44 @@ class MitsubaRenderer:
             radiance = self._run("image", shot)
             radiance_previous = self._run("previous image", shot)
         else:
-            tables = dict(self.pair.tables(), delta=self._delta_table)
-            radiance, radiance_previous = self._run("pair", shot, tables)
+            radiance, radiance_previous = self._run("pair", shot, self._tables())
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, shot), self._develop(radiance_previous, shot)
-        return Rendering(*images, Paths(shot, radiance))
+        return Rendering(*images, Paths(shot, radiance, radiance_previous, space))
 
     def adjoint(self, parameters: Tree, paths: Paths, weights: Any) -> Tree:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `Renderer.adjoint`."""
         self._set_current(parameters)
         shot = paths.shot
         self._run("adjoint", shot, {"delta": self._delta_table}, paths.radiance, weights)
-        gradient = {key: to_tensor(dr.grad(leaf)) for key, leaf in self._leaves.items()}
+        gradient = _gradients(self._leaves)
         dr.eval(gradient)
         return gradient
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Paths, weights: Any, weights_previous: Any
+    ) -> tuple[Tree, Tree]:
+        """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space each on its own.
+        See `Renderer.adjoint_pair`."""
+        self._set_current(current)
+        self._set_previous(previous)
+        shot = paths.shot
+        if paths.space == "primary":
+            tables = {"delta": self._delta_table}
+            self._run("adjoint", shot, tables, paths.radiance, weights)
+            gradient = _gradients(self._leaves)
+            dr.eval(gradient)
+            self._run("previous adjoint", shot, tables, paths.previous, weights_previous)
+        else:
+            states = (paths.radiance, weights, paths.previous, weights_previous)
+            self._run("adjoint pair", shot, self._tables(), *states)
+            gradient = _gradients(self._leaves)
+        gradient_previous = _gradients(self._leaves_previous)
+        dr.eval(gradient, gradient_previous)
+        return gradient, gradient_previous
+
+    def _tables(self) -> dict[str, Any]:
+        return dict(self.pair.tables(), delta=self._delta_table)
 
     def _count(self, shot: Shot) -> int:
         if shot.pixels is not None:
@@ -171,7 +197,7 @@ class MitsubaRenderer:
         key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None)
         if key not in self._frozen:
             self._frozen[key] = _uncollected(dr.freeze(self._trace(what, shot.sensor, shot.spp, count)))
-        scene = self.pair.previous if what == "previous image" else self.pair.current
+        scene = self.pair.previous if what.startswith("previous") else self.pair.current
         arguments = (scene, [self.pair.current, *self.pair.others()], tables, mi.UInt32(shot.seed), shot.pixels, *more)
         try:
             self._clear_gradients()
@@ -188,24 +214,28 @@ class MitsubaRenderer:
             return self._frozen[key](*arguments)
 
     def _clear_gradients(self) -> None:
-        for leaf in self._leaves.values():
+        for leaf in (*self._leaves.values(), *self._leaves_previous.values()):
             dr.clear_grad(leaf)
 
     def _trace(self, what: str, sensor: int, spp: int, count: int) -> Callable[..., Any]:
         kernel = self._geometric_kernel() if self._geometric else self._kernel
 
-        def trace(scene, living, tables, seed, pixels, radiance=None, weights=None):
+        pair = what.endswith("pair")
+        backward = "adjoint" in what
+
+        def trace(scene, living, tables, seed, pixels, radiance=None, weights=None, radianceₚ=None, weightsₚ=None):
             del living  # read through pointers, if at all
             # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
             sampler = self._sampler.clone()
             with dr.suspend_grad():
                 ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
-                if what == "adjoint":
+                if backward:
                     δL = camera.expose(weights, spp, count) * ray_weight
-                    kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, δL, radiance)
+                    δLₚ = camera.expose(weightsₚ, spp, count) * ray_weight if pair else None
+                    kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ)
                     return None
-                L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, sampler, ray, pair=what == "pair")
-                return (L * ray_weight, Lₚ * ray_weight) if what == "pair" else L * ray_weight
+                L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, sampler, ray, pair=pair)
+                return (L * ray_weight, Lₚ * ray_weight) if pair else L * ray_weight
 
         return trace
 
@@ -215,29 +245,30 @@ class MitsubaRenderer:
     # ------------------------------------------------------------------ the two states
 
     def _set_current(self, parameters: Tree) -> None:
-        """Bring the current scene to `parameters`, as fresh leaves of the gradient: attached always, since frozen kernels
-        would be traced anew if that changed between the primal and the adjoint pass."""
-        changed = False
-        for key, value in parameters.items():
-            if self._loaded.get(key) is not value:
-                leaf = from_tensor(value, self._native[key])
-                dr.enable_grad(leaf)
-                self.pair.current_parameters[key] = leaf
-                self._leaves[key] = leaf
-                self._loaded[key] = value
-                changed = True
-        if changed:
-            self.pair.current_parameters.update()
+        _bring(self.pair.current_parameters, parameters, self._native, self._loaded, self._leaves)
 
     def _set_previous(self, parameters: Tree) -> None:
-        changed = False
-        for key, value in parameters.items():
-            if self._loaded_previous.get(key) is not value:
-                self.pair.previous_parameters[key] = from_tensor(value, self._native[key])
-                self._loaded_previous[key] = value
-                changed = True
-        if changed:
-            self.pair.previous_parameters.update()
+        _bring(self.pair.previous_parameters, parameters, self._native, self._loaded_previous, self._leaves_previous)
+
+
+def _bring(scene: Any, parameters: Tree, native: dict[str, Any], loaded: Tree, leaves: dict[str, Any]) -> None:
+    """Bring a scene to `parameters`, as fresh leaves of the gradient: attached always, since frozen kernels would be traced
+    anew if that changed between the primal and the adjoint pass."""
+    changed = False
+    for key, value in parameters.items():
+        if loaded.get(key) is not value:
+            leaf = from_tensor(value, native[key])
+            dr.enable_grad(leaf)
+            scene[key] = leaf
+            leaves[key] = leaf
+            loaded[key] = value
+            changed = True
+    if changed:
+        scene.update()
+
+
+def _gradients(leaves: dict[str, Any]) -> Tree:
+    return {key: to_tensor(dr.grad(leaf)) for key, leaf in leaves.items()}
 
 
 def _uncollected(frozen: Callable[..., Any]) -> Callable[..., Any]:
@@ -262,9 +293,11 @@ class PrbKernel:
     def __init__(self, max_depth: int):
         self._integrator = mi.load_dict({"type": "prb", "max_depth": max_depth})
 
-    def sample(self, mode, scene, tables, sampler, ray, δL=None, state_in=None, pair=False) -> tuple[Any, Any]:
+    def sample(
+        self, mode, scene, tables, sampler, ray, δL=None, state_in=None, pair=False, δLₚ=None, stateₚ_in=None
+    ) -> tuple[Any, Any]:
         """See `PathPair.sample`; never a pair."""
-        del tables, pair
+        del tables, pair, δLₚ, stateₚ_in
         active = mi.Bool(True)
         L = self._integrator.sample(mode, scene, sampler, ray, δL, state_in, active)[0]
         return L, None

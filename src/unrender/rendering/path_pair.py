@@ -49,19 +49,23 @@ class PathPair:
         δL: Any = None,
         state_in: Any = None,
         pair: bool = False,
+        δLₚ: Any = None,
+        stateₚ_in: Any = None,
     ) -> tuple[Any, Any]:
         """Trace one path per lane.
 
         Args:
             mode: `Primal`, or `Backward` to replay the paths of a primal pass and back-propagate `δL` into the parameters
-                of `scene` (path replay, Vicini et al. 2021). Call under `dr.suspend_grad()`.
+                of `scene`, with `pair` also `δLₚ` into those of the previous scene (path replay, Vicini et al. 2021). Call
+                under `dr.suspend_grad()`.
             scene: the current scene.
             tables: of `ScenePair.tables()`, used with `pair`; its "delta" entry, used with `changing_delta`.
             sampler: seeded; the same seed replays the same paths.
             ray: camera rays.
             δL: adjoint radiance per lane, with `Backward`.
             state_in: radiance per lane that the primal pass returned, with `Backward`.
-            pair: whether to return the previous state's radiance too; with `Primal` only.
+            pair: whether the previous state rides along.
+            δLₚ, stateₚ_in: likewise for the previous state, with `Backward` and `pair`.
 
         Returns:
             radiance of the current and of the previous state per lane. Both unbiased.
@@ -74,8 +78,9 @@ class PathPair:
         ray = mi.Ray3f(dr.detach(ray))
         depth = mi.UInt32(0)
         L = mi.Spectrum(0 if primal else state_in)
-        Lₚ = mi.Spectrum(0)
+        Lₚ = mi.Spectrum(stateₚ_in if stateₚ_in is not None else 0)
         δL = mi.Spectrum(δL if δL is not None else 0)
+        δLₚ = mi.Spectrum(δLₚ if δLₚ is not None else 0)
         β = mi.Spectrum(1)
         βₚ = mi.Spectrum(1)
         η = mi.Float(1)
@@ -97,7 +102,9 @@ class PathPair:
             if dr.hint(pair, mode="scalar"):
                 siₚ = mi.SurfaceInteraction3f(si)
                 siₚ.shape = remap(mi.ShapePtr, tables["shape"], si.shape)
-                Lₚ += βₚ * mis * remap(mi.EmitterPtr, tables["emitter"], ds.emitter).eval(siₚ, active)
+                emitterₚ = remap(mi.EmitterPtr, tables["emitter"], ds.emitter)
+                with dr.resume_grad(when=not primal):
+                    Leₚ = βₚ * mis * emitterₚ.eval(siₚ, active)
 
             # ---------------------- Emitter sampling ----------------------
             active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
@@ -115,9 +122,10 @@ class PathPair:
             if dr.hint(pair, mode="scalar"):
                 bsdfₚ = remap(mi.BSDFPtr, tables["bsdf"], bsdf)
                 emitterₚ = remap(mi.EmitterPtr, tables["emitter"], ds.emitter)
-                fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, wo, active_em)
-                emₚ = emitterₚ.eval_direction(siₚ, ds, active_em) * inv_pdf
-                Lₚ += dr.select(active_em, βₚ * mis_em * fₚ * emₚ, 0)
+                with dr.resume_grad(when=not primal):
+                    fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, wo, active_em)
+                    emₚ = emitterₚ.eval_direction(siₚ, ds, active_em) * inv_pdf
+                    Ldₚ = dr.select(active_em, βₚ * mis_em * fₚ * emₚ, 0)
 
             # ------------------ Detached BSDF sampling -------------------
             sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
@@ -131,15 +139,20 @@ class PathPair:
             inv_pdf = dr.select(smooth & (pdf > 0), dr.rcp(pdf), 0)
             weight = dr.select(delta, weight, dr.detach(f) * inv_pdf)
             if dr.hint(pair, mode="scalar"):
-                weightₚ = weight
+                with dr.resume_grad(when=not primal):
+                    valueₚ = bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth)
+                weightₚ = dr.select(delta, weight, dr.detach(valueₚ) * inv_pdf)
                 if dr.hint(follow_delta, mode="scalar"):
-                    lobe = self._delta_value(kind, bsdfₚ, siₚ, bs, sample_1, sample_2, active_next & delta)
-                    weightₚ = dr.select(kind == DELTA_EQUAL, weight, lobe * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0))
-                fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth)
-                βₚ *= dr.select(delta, weightₚ, fₚ * inv_pdf)
+                    with dr.resume_grad(when=not primal):
+                        lobeₚ = self._delta_value(kind, bsdfₚ, siₚ, bs, sample_1, sample_2, active_next & delta)
+                        valueₚ = dr.select(delta, lobeₚ, valueₚ)
+                    changed = delta & (kind != DELTA_EQUAL)
+                    weightₚ = dr.select(changed, dr.detach(lobeₚ) * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0), weightₚ)
 
             # ---- Update loop variables based on current interaction -----
             L = (L + Le + Ld) if primal else (L - Le - Ld)
+            if dr.hint(pair, mode="scalar"):
+                Lₚ = (Lₚ + Leₚ + Ldₚ) if primal else (Lₚ - Leₚ - Ldₚ)
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
                     # L now holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
@@ -147,11 +160,15 @@ class PathPair:
                     if dr.hint(follow_delta, mode="scalar"):
                         lobe = self._delta_value(kind, bsdf, si, bs, sample_1, sample_2, active_next & delta)
                         value = dr.select(delta, lobe, f)
-                    Lo = Le + Ld + L * relative(value)
-                    dr.backward_from(δL * Lo)
+                    Lo = δL * (Le + Ld + L * relative(value))
+                    if dr.hint(pair, mode="scalar"):
+                        Lo += δLₚ * (Leₚ + Ldₚ + Lₚ * relative(valueₚ))
+                    dr.backward_from(Lo)
             ray = si.spawn_ray(si.to_world(bs.wo))
             η *= bs.eta
             β *= weight
+            if dr.hint(pair, mode="scalar"):
+                βₚ *= weightₚ
             si_last = dr.detach(si, True)
             pdf_last = dr.select(delta, 1, pdf)  # no emitter sample competes with a delta lobe
             delta_last = delta

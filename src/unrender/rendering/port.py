@@ -116,3 +116,11 @@ class Renderer(Protocol):
         Unbiased where `weights[g]` is independent of group g.
         """
         ...
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Any, weights: Array, weights_previous: Array
+    ) -> tuple[Tree, Tree]:
+        """`adjoint` of both states of an `image_pair`, on its paths and in its space: the gradient of sum(weights[g] * images[g])
+        with respect to `current`, and of sum(weights_previous[g] * previous[g]) with respect to `previous`.
+        """
+        ...

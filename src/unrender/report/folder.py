@@ -7,14 +7,15 @@ import math
 import re
 import zipfile
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from unrender import files
 from unrender.errors import InputError
+from unrender.names import did_you_mean
 
 _FinitePositive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _PICTURE = re.compile(r"view(\d+)/(reference|initial|result|control_weight)")
@@ -120,7 +121,7 @@ def read(directory: str | Path) -> RunFolder:
     initial = _read_arrays(path / "initial.npz")
     for key in parameters:
         if key not in initial:
-            raise InputError(f"{path / 'initial.npz'}: {key} is missing{_near(key, initial)}")
+            raise InputError(f"{path / 'initial.npz'}: {key} is missing{did_you_mean(key, initial)}")
     truth = _read_arrays(path / "truth.npz") if (path / "truth.npz").exists() else {}
     views = _read_pictures(path / "pictures.npz") if (path / "pictures.npz").exists() else {}
     known = {key: value for key, value in truth.items() if key in parameters}
@@ -130,28 +131,16 @@ def read(directory: str | Path) -> RunFolder:
 def _check_place(path: Path) -> None:
     if not path.is_dir():
         beside = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
-        what = "is a file, expected a run folder" if path.exists() else f"no such run folder{_near(path.name, beside)}"
+        what = (
+            "is a file, expected a run folder"
+            if path.exists()
+            else f"no such run folder{did_you_mean(path.name, beside)}"
+        )
         raise InputError(f"{path}: {what}")
     if not (path / "run.json").is_file():
         inside = sorted(p.parent.name for p in path.glob("*/run.json"))
         hint = f" (run folders inside it: {', '.join(inside[:5])})" if inside else ""
         raise InputError(f"{path}: not a run folder: run.json is missing{hint}")
-
-
-def _near(name: str, names: Any) -> str:
-    close = get_close_matches(name, list(names), n=1)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: the file is missing") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text ({error.reason} at byte {error.start})") from error
 
 
 def _parse(text: str, where: str) -> dict[str, Any]:
@@ -168,14 +157,14 @@ def _parse(text: str, where: str) -> dict[str, Any]:
 
 
 def _read_record(path: Path) -> RunRecord:
-    found = _parse(_read_text(path), str(path))
+    found = _parse(files.read_text(path), str(path))
     try:
         return RunRecord.model_validate(found)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
         if first["type"] == "missing":
-            raise InputError(f"{path}: {field} is missing{_near(field, found)}") from error
+            raise InputError(f"{path}: {field} is missing{did_you_mean(field, found)}") from error
         message = first["msg"].removeprefix("Input should be ")
         raise InputError(f"{path}: {field}: expected {message}, got {_short(first['input'])}") from error
 
@@ -184,7 +173,7 @@ def _read_history(path: Path) -> History:
     columns: dict[str, list[float]] = {"seconds": [], "samples": [], "loss": [], "gradient_noise": []}
     errors: dict[str, tuple[list[int], list[float]]] = {}
     last = {"seconds": 0.0, "samples": 0.0}
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         where = f"{path}:{number}"

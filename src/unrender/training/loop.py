@@ -186,13 +186,12 @@ def estimate(
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))
-    return Estimate(
-        found.loss,
-        trees.numpy(found.gradient),
-        None if found.variance is None else trees.numpy(found.variance),
-        None if found.hessian is None else arrays.numpy(found.hessian),
-        found.hvp,
-        _as_numpy(found.info),
+    return replace(
+        found,
+        gradient=trees.numpy(found.gradient),
+        variance=None if found.variance is None else trees.numpy(found.variance),
+        hessian=None if found.hessian is None else arrays.numpy(found.hessian),
+        info=_as_numpy(found.info),
     )
 
 
@@ -237,11 +236,10 @@ def _apply(
     problem: Problem, estimate: Estimate, memory: Any, optimizer: Optimizer, parameters: Tree
 ) -> tuple[Tree, Any]:
     """Precondition, update, bound. The optimizer sees S g, the parameters S (step): descent in u where x = S u."""
-    maps = problem.preconditioners
-    gradient = {k: maps[k].apply(g) if k in maps else g for k, g in estimate.gradient.items()}
-    seen = Estimate(estimate.loss, gradient, estimate.variance, estimate.hessian, estimate.hvp, estimate.info)
-    steps, memory = optimizer.update(seen, memory, parameters)
-    moved = {k: x + (maps[k].apply(steps[k]) if k in maps else steps[k]) for k, x in parameters.items()}
+    if not estimate.preconditioned:
+        estimate = replace(estimate, gradient=problem.precondition(estimate.gradient), preconditioned=True)
+    steps, memory = optimizer.update(estimate, memory, parameters)
+    moved = trees.add(parameters, problem.precondition(steps))
     moved = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
     arrays.evaluate(moved, memory)
     return moved, memory

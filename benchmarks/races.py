@@ -1,0 +1,115 @@
+"""Equal-time races between methods: each tuned over a grid on a seed of its own, its best run on several seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from common import total_error
+
+import unrender as ur
+from unrender.gradients.estimate import Estimator
+from unrender.optimizers.base import Optimizer
+
+TUNING_SEED = 1000
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A method at one cost per step, to be tuned by its learning rate.
+
+    Attributes:
+        name: unique in its race.
+        group: what it is plotted as.
+        estimator: where its gradients come from.
+        optimizer: makes its optimizer from a learning rate.
+        rates: those to try.
+    """
+
+    name: str
+    group: str
+    estimator: Estimator
+    optimizer: Callable[[float], Optimizer]
+    rates: tuple[float, ...]
+
+
+def descend(
+    problem: ur.Problem,
+    entrant: Entrant,
+    rate: float,
+    seed: int,
+    seconds: float | None = None,
+    steps: int | None = None,
+) -> list[tuple[float, float, float]]:
+    """(seconds, samples, error) along one run: each parameter's RMSE relative to where it began, averaged over parameters."""
+    result = ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), seconds=seconds, steps=steps, seed=seed)
+    start = problem.parameter_error(problem.initial())
+    return [
+        (h["seconds"], float(h["samples"]), total_error(h["parameter_error"], start))
+        for h in result.history
+        if "parameter_error" in h
+    ]
+
+
+def tune(problem: ur.Problem, entrant: Entrant, **budget: Any) -> tuple[float, list[dict[str, float]]]:
+    """The rate whose final error is least, and all that were tried. A best rate at an end of the grid extends it once."""
+    tried: dict[float, float] = {}
+
+    def attempt(rate: float) -> None:
+        error = descend(problem, entrant, rate, TUNING_SEED, **budget)[-1][2]
+        tried[rate] = error if math.isfinite(error) else float("inf")
+        print(f"{problem.name} {entrant.name} rate {rate:g}: {error:.4f}", flush=True)
+
+    for rate in entrant.rates:
+        attempt(rate)
+    best = min(tried, key=tried.__getitem__)
+    if best in (min(tried), max(tried)) and len(tried) > 1:
+        factor = sorted(tried)[1] / sorted(tried)[0]
+        attempt(best / factor if best == min(tried) else best * factor)
+        best = min(tried, key=tried.__getitem__)
+    return best, [{"rate": rate, "error": error} for rate, error in sorted(tried.items())]
+
+
+def race(problem: ur.Problem, entrants: list[Entrant], seeds: int, **budget: Any) -> dict[str, Any]:
+    """Every entrant, tuned, over seeds 0, 1, ...: {name: {"group", "rate", "tried", "runs", "final"}}."""
+    found: dict[str, Any] = {}
+    for entrant in entrants:
+        rate, tried = tune(problem, entrant, **budget)
+        runs = [descend(problem, entrant, rate, seed, **budget) for seed in range(seeds)]
+        final = [run[-1][2] for run in runs]
+        found[entrant.name] = {
+            "group": entrant.group,
+            "rate": rate,
+            "tried": tried,
+            "runs": runs,
+            "final": [float(np.median(final)), min(final), max(final)],
+        }
+        print(f"{problem.name} {entrant.name} rate {rate:g}: final {[round(f, 4) for f in final]}", flush=True)
+    return found
+
+
+def reached(runs: list[list[tuple[float, float, float]]], error: float, column: int) -> float | None:
+    """The median over runs of the seconds (column 0) or samples (1) at which the error is first at most `error`; None
+    where half of the runs never get there."""
+    firsts = [next((point[column] for point in run if point[2] <= error), math.inf) for run in runs]
+    middle = float(np.median(firsts))
+    return middle if math.isfinite(middle) else None
+
+
+def draw(axis: Any, entry: dict[str, Any], column: int, colour: Any, label: str, style: str = "-") -> None:
+    """Median and range over seeds of the error, against seconds (column 0) or samples (1)."""
+    end = min(run[-1][column] for run in entry["runs"])
+    first = max(run[0][column] for run in entry["runs"])
+    grid = np.linspace(first, end, 200)
+    curves = np.stack([np.interp(grid, np.array(run)[:, column], np.array(run)[:, 2]) for run in entry["runs"]])
+    axis.plot(grid, np.median(curves, 0), color=colour, label=label, ls=style)
+    axis.fill_between(grid, curves.min(0), curves.max(0), color=colour, alpha=0.15, lw=0)
+
+
+def colours(count: int) -> Any:
+    """So many greys to oranges for a family of baselines."""
+    return plt.get_cmap("YlOrBr")(np.linspace(0.3, 0.95, count))

@@ -1,0 +1,121 @@
+"""`ajar`: a room whose only light comes from the corridor, through a door ajar; its paint and a potted plant are unknown.
+
+After Balint et al. 2023, Fig. 6, and the scene of Veach that it builds on. Nearly every emitter sample is lost in the wall: what arrives
+has passed the gap, mostly after a bounce in the corridor, and few samples see any of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, meshes, parts, textures
+from unrender.losses import Loss, RelativeL2
+from unrender.preconditioners import LargeSteps
+from unrender.problem.parameter import Parameter
+
+_LEAVES = 7
+
+
+@dataclass(frozen=True)
+class Ajar:
+    """The paint of a wall and the textures of a potted plant, in a room lit through a door ajar.
+
+    One view; three unknown reflectances of texture_resolution² texels, from grey, with LargeSteps.
+    """
+
+    resolution: int = fields.resolution(96)
+    texture_resolution: int = fields.texture_resolution(32)
+    reference_spp: int = fields.reference_spp(8192)
+    max_depth: int = fields.max_depth(6, at_least=3)
+    loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The room: x in [-1.5, 1.5], y in [0, 2], z in [-1, 2]; the corridor beyond x = -1.5; the camera looks along -z."""
+        grey, white = parts.diffuse(0.5), parts.twosided(parts.diffuse(0.7))
+        size = self.texture_resolution
+        wall = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("coffee", size))}
+        clay = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("brick", size))}
+        return {
+            "type": "scene",
+            "camera": parts.camera((0.25, 0.95, 1.95), (0.1, 0.8, -1), 58.0, self.resolution),
+            "back": parts.rectangle((0, 1, -1), (1.5, 0, 0), (0, 1, 0), wall),
+            "right": parts.rectangle((1.5, 1, 0.5), (0, 0, 1.5), (0, 1, 0), parts.diffuse(0.6, 0.5, 0.35)),
+            "front": parts.rectangle((0, 1, 2), (-1.5, 0, 0), (0, 1, 0), grey),
+            "floor": parts.rectangle((-1, 0, 0.5), (2.5, 0, 0), (0, 0, -1.5), parts.diffuse(0.45, 0.35, 0.25)),
+            "ceiling": parts.rectangle((-1, 2, 0.5), (2.5, 0, 0), (0, 0, 1.5), parts.diffuse(0.75)),
+            **_doorway(white),
+            **_corridor(white),
+            "pot": meshes.sheet("pot", meshes.lathe(*_pot_profile(24), 48) + _PLACE, parts.twosided(clay), closed=True),
+            "leaves": meshes.sheet("leaves", _rosette(20, 168) + _PLACE, _leaf(size), closed=True),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The three textures, grey at first."""
+        return (
+            Parameter("back.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
+            Parameter("pot.bsdf.brdf_0.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
+            Parameter("leaves.bsdf.brdf_0.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
+        )
+
+
+_PLACE = np.array([0.55, 0.0, 0.1])
+_OPENING = (-0.5, 0.3)  # of the doorway in z
+_DOOR_HEIGHT = 1.7
+_ANGLE = np.radians(28)  # by which the door stands open, into the corridor
+
+
+def _doorway(bsdf: dict[str, Any]) -> dict[str, Any]:
+    """The wall at x = -1.5 around the doorway, and the door, hinged at its near edge."""
+    low, high = _OPENING
+    pieces = {
+        "left_far": ((low - 1) / 2, 1.0, (low + 1) / 2, 1.0),
+        "left_near": ((high + 2) / 2, 1.0, (2 - high) / 2, 1.0),
+        "left_above": ((low + high) / 2, (_DOOR_HEIGHT + 2) / 2, (high - low) / 2, (2 - _DOOR_HEIGHT) / 2),
+    }
+    found: dict[str, Any] = {
+        name: parts.rectangle((-1.5, y, z), (0, 0, -half), (0, tall, 0), bsdf)
+        for name, (z, y, half, tall) in pieces.items()
+    }
+    width = high - low
+    direction = np.array([-np.sin(_ANGLE), 0.0, -np.cos(_ANGLE)])
+    centre = np.array([-1.5, _DOOR_HEIGHT / 2, high]) + direction * width / 2
+    found["door"] = parts.rectangle(centre, direction * width / 2, (0, _DOOR_HEIGHT / 2, 0), bsdf)
+    return found
+
+
+def _corridor(bsdf: dict[str, Any]) -> dict[str, Any]:
+    """The corridor, x in [-3.5, -1.5], with a lamp below its ceiling, behind the door."""
+    return {
+        "beyond": parts.rectangle((-3.5, 1, 0.5), (0, 0, -1.5), (0, 1, 0), bsdf),
+        "corridor_far": parts.rectangle((-2.5, 1, -1), (1, 0, 0), (0, 1, 0), bsdf),
+        "corridor_near": parts.rectangle((-2.5, 1, 2), (-1, 0, 0), (0, 1, 0), bsdf),
+        "light": parts.rectangle(
+            (-2.6, 1.95, 0.4), (0.3, 0, 0), (0, 0, 0.3), parts.diffuse(0.0), emitter=parts.light(420.0, 390.0, 340.0)
+        ),
+    }
+
+
+def _pot_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    t = np.linspace(0, 1, rows)
+    return 0.2 + 0.1 * t + 0.035 * textures.ramp(t, 0.78, 0.82), 0.42 * t
+
+
+def _rosette(rows: int, columns: int) -> np.ndarray:
+    """Leaves around one stem, as one sheet: its radius falls between the leaves, its tips bend down. (rows, columns + 1, 3)."""
+    angle = np.linspace(-np.pi, np.pi, columns + 1)[None, :]
+    reach = np.linspace(0.02, 1, rows)[:, None]
+    lobe = np.abs(np.cos(_LEAVES / 2 * angle)) ** 0.8
+    alternate = 0.75 + 0.25 * np.cos(2 * angle + 0.7)
+    radius = reach * (0.12 + 0.5 * lobe * alternate)
+    height = 0.42 + 0.95 * alternate * reach * (1 - 0.55 * reach * lobe) + 0.02 * np.sin(3 * np.pi * reach)
+    return np.stack([radius * np.sin(angle), np.broadcast_to(height, radius.shape), radius * np.cos(angle)], axis=-1)
+
+
+def _leaf(resolution: int) -> dict[str, Any]:
+    u, v = textures.grid(resolution)
+    veins = np.abs(np.sin(np.pi * (_LEAVES * u + 3 * v)))[..., None] ** 0.5
+    young, old = np.array([0.45, 0.6, 0.1]), np.array([0.05, 0.25, 0.06])
+    return parts.twosided({"type": "diffuse", "reflectance": textures.bitmap(young + (old - young) * veins)})

@@ -1,0 +1,37 @@
+"""`exponential`: the toy problem of Balint et al. 2023, Fig. 2, which needs no renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from unrender.gallery import fields
+from unrender.losses import L2, Loss
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.exponential import RATE, ExponentialRenderer
+
+_MEAN, _START = 2.0, 1.5
+
+
+@dataclass(frozen=True)
+class Exponential:
+    """The rate of an exponential distribution, from its mean: one number, no renderer.
+
+    The mean is 2, the rate 0.5, the start 1.5.
+    """
+
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def problem(self, name: str) -> Problem:
+        """The problem: a picture of one pixel that shows the mean."""
+        return Problem(
+            ExponentialRenderer(1 / _MEAN),
+            [Parameter(RATE, initial=_START)],
+            [View(np.full((1, 1, 3), _MEAN, np.float32))],
+            self.loss,
+            truth={RATE: 1 / _MEAN},
+            name=name,
+        )

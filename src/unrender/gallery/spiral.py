@@ -1,0 +1,74 @@
+"""`spiral`: a glossy ribbon wound into a spiral, its colour, metalness and roughness unknown all at once.
+
+After Balint et al. 2023, Fig. 1. The three trade against one another: a darker metal and a rougher dielectric look alike from one
+side. The ribbon is lit by a lamp that shines at the ceiling only and by its own windings, so that every sample is noisy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, meshes, parts, textures
+from unrender.losses import Loss, RelativeL2
+from unrender.problem.parameter import Parameter
+
+_TURNS = 2.5
+
+
+@dataclass(frozen=True)
+class Spiral:
+    """Base colour, metalness and roughness of a glossy spiral ribbon, all at once, by indirect light.
+
+    One view; three unknown maps of texture_resolution² texels, each from one value.
+    """
+
+    resolution: int = fields.resolution(96)
+    texture_resolution: int = fields.texture_resolution(8)
+    reference_spp: int = fields.reference_spp(4096)
+    max_depth: int = fields.max_depth(6, at_least=3)
+    loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The room: x and y in [-1, 1], z in [-1, 2.2]; the spiral around the y axis, the camera inside, looking along -z."""
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 0.55, 2.1), (0, -0.12, 0), 36.0, self.resolution),
+            **parts.room(parts.diffuse(0.7), left=parts.diffuse(0.55, 0.2, 0.1), right=parts.diffuse(0.1, 0.3, 0.55)),
+            **parts.uplight((-0.7, -0.999, 1.6), (40e3, 37e3, 33e3)),
+            **parts.uplight((0.7, -0.999, -0.6), (22e3, 24e3, 30e3), name="second"),
+            "spiral": meshes.sheet("spiral", _ribbon(24, 400), _lacquer(self.texture_resolution)),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The three maps."""
+        return (
+            Parameter("spiral.bsdf.brdf_0.base_color.data", initial=0.5),
+            Parameter("spiral.bsdf.brdf_0.metallic.data", initial=0.5),
+            Parameter("spiral.bsdf.brdf_0.roughness.data", initial=0.5),
+        )
+
+
+def _ribbon(rows: int, columns: int) -> np.ndarray:
+    """A ribbon that climbs and narrows as it turns: points (rows, columns, 3)."""
+    across, along = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+    angle = 2 * np.pi * _TURNS * along
+    radius = 0.62 - 0.32 * along
+    height = -0.82 + 1.25 * along + 0.16 * across
+    return np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=-1)
+
+
+def _lacquer(resolution: int) -> dict[str, Any]:
+    u, v = textures.grid(resolution)
+    bands = textures.ramp(np.sin(6 * np.pi * u), -0.4, 0.4)[..., None]
+    copper, teal = np.array([0.85, 0.42, 0.2]), np.array([0.08, 0.25, 0.5])
+    return parts.twosided(
+        {
+            "type": "principled",
+            "base_color": textures.bitmap(teal + (copper - teal) * bands),
+            "metallic": textures.bitmap(0.1 + 0.8 * textures.ramp(np.cos(4 * np.pi * u), -0.5, 0.5)),
+            "roughness": textures.bitmap(0.2 + 0.45 * v),
+        }
+    )

@@ -1,0 +1,78 @@
+"""The step rule that goes with a gradient of known variance (Balint et al. 2023, section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from unrender import arrays, checks
+from unrender.gradients.estimate import GRADIENT, VARIANCE, Estimate
+from unrender.optimizers import rates
+from unrender.optimizers.schedules import Schedule
+from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class MetaAdamState:
+    """State between steps.
+
+    Attributes:
+        step: steps made so far.
+        learning_rates: of each parameter, before the schedule.
+    """
+
+    step: int
+    learning_rates: dict[str, float]
+
+
+@dataclass(frozen=True)
+class MetaAdam:
+    """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator itself gives.
+
+    Adam divides by the root mean square of many gradients, which it takes for independent; a meta-estimate is an average already and
+    resembles the ones before it. Here the divisor is the standard deviation of this very gradient: where it is lost in noise the step
+    is short, about η at most; where many samples agree it grows with their number, up to η √n after n steps of a constant gradient
+    (Var g counts the mean square of a sample as its variance), and falls as soon as the gradient turns small or its memory is cut.
+    So learning rates are lower than Adam's, and the same rate serves the start and the end of a descent.
+
+    The start: before there is a past, a meta-estimate's variance is its square, and the first step is −η sign(g), as Adam's.
+
+    Args:
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 stay where they are.
+            It is far below Adam's (whose ε stands outside the root): a texel's share of a mean over pixels is small.
+        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        longest: the longest step of an element in units of η, > 0; None for no limit.
+    """
+
+    learning_rate: float = 0.01
+    epsilon: float = 1e-24
+    schedule: Schedule | None = None
+    longest: float | None = None
+
+    def __post_init__(self):
+        rates.check("MetaAdam", self.learning_rate, self.schedule)
+        checks.number("MetaAdam", "epsilon", self.epsilon, above=0.0)
+        if self.longest is not None:
+            checks.number("MetaAdam", "longest", self.longest, above=0.0)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """A gradient and its variance."""
+        return frozenset({GRADIENT, VARIANCE})
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> MetaAdamState:
+        """See `Optimizer.init`."""
+        return MetaAdamState(0, rates.per_parameter("MetaAdam", parameters, self.learning_rate, learning_rates))
+
+    def update(self, estimate: Estimate, state: MetaAdamState, parameters: Tree) -> tuple[Tree, MetaAdamState]:
+        """See `Optimizer.update`. Lazy on Dr.Jit."""
+        del parameters
+        assert estimate.variance is not None
+        factor = rates.factor("MetaAdam", self.schedule, state.step)
+        steps: Tree = {}
+        for key, gradient in estimate.gradient.items():
+            rate = arrays.scalar(-state.learning_rates[key] * factor, gradient)
+            step = gradient / arrays.sqrt(estimate.variance[key] + self.epsilon)
+            steps[key] = rate * (step if self.longest is None else arrays.clip(step, -self.longest, self.longest))
+        return steps, replace(state, step=state.step + 1)

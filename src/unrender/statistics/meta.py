@@ -1,0 +1,220 @@
+"""Meta-estimation: a gradient that is carried from step to step, with its own variance (Balint et al. 2023, sections 3 and 4).
+
+F_i is a *proportional* estimate of the quantity at step i, ΔF_i a *finite-difference* estimate of its change since step i − 1,
+independent of F_i. The meta-estimate is their combination of least variance with all that came before,
+
+    M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i,        M_0 = F_0                              (Eq. 7)
+    α_i = Var F / (Var F + Var M_{i-1} + Var ΔF)                                              (Eq. 8)
+    Var M_i = α_i² (Var M_{i-1} + Var ΔF) + (1 − α_i)² Var F                                  (Eq. 15)
+
+with Var F the running mean of F² (Eq. 9), Var ΔF that of (ΔF / ‖Δπ‖)² times ‖Δπ‖² of the present step (Eqs 13 and 14), and α_i held
+below 1 / (2 − α_{i-1}) (Eq. 17, which from α_0 = 0 on is the bound i / (i + 1) of Eq. 16).
+
+The *coupled* form, which the paper does not have, takes F_i and the previous state's H_i from the same samples, so that ΔF_i = F_i − H_i
+is not independent of F_i. Its recursion M_i = F_i + w_i (M_{i-1} − H_i) is the same one (put F − ΔF for H in Eq. 7), its weight and
+variance are those of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2.
+
+Where this departs from the paper's text: the running means are divided by the sum of their weights, as Adam does, since Eqs 9 and 13 say
+nothing of their start; and an element whose samples have all been zero so far, such as a texel that no path has met, counts its zeros: α
+follows its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight of 0 it would
+start anew from that sample, and be i times too large.
+
+Bias. α knows F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero that fades as the means settle
+(section 6 of the paper, "sample reuse"). With statistics from other samples (`observed`) every M_i is unbiased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from unrender import arrays
+from unrender.arrays import Array
+from unrender.statistics.control_weight import control_variate_variance, control_weight
+from unrender.statistics.recursion import advance
+
+BETA_PROPORTIONAL = 0.99
+"""β_F: large, since Var F is stable and should hardly know any one sample."""
+
+BETA_DIFFERENCE = 0.9
+"""β_Δ: small, since the decoupled variance of ΔF is quiet and follows the scene."""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Exponentially weighted sums of a sample and of its square, and of their weights, 1 − βⁿ (a device number)."""
+
+    mean: Array
+    square: Array
+    weight: Array
+
+
+@dataclass(frozen=True)
+class State:
+    """What is carried from step to step. Every array has the shape given to `init`, but for the two counts.
+
+    Attributes:
+        gradient: M.
+        variance: Var M.
+        alpha: the last weight of the past.
+        proportional: of F.
+        difference: of ΔF / ‖Δπ‖.
+        steps: how many there were (a device number).
+    """
+
+    gradient: Array
+    variance: Array
+    alpha: Array
+    proportional: Moments
+    difference: Moments
+    steps: Array
+
+
+def init(like: Array) -> State:
+    """Nothing seen yet. `like` gives shape and kind of the samples."""
+    zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
+    empty = Moments(zeros, zeros, zero)
+    return State(zeros, zeros, zeros, empty, empty, zero)
+
+
+def update(
+    state: State,
+    proportional: Array,
+    difference: Array,
+    step_norm: Array,
+    *,
+    beta_proportional: float = BETA_PROPORTIONAL,
+    beta_difference: float = BETA_DIFFERENCE,
+    clip: bool = True,
+    centred: bool = False,
+    decouple: bool = True,
+    observed: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array, Array, State]:
+    """One step of the paper's form, whose F and ΔF are independent.
+
+    Args:
+        state: from `init` or `update`.
+        proportional: F_i.
+        difference: ΔF_i = F_i − F_{i-1}; without effect at the first step.
+        step_norm: ‖π_i − π_{i-1}‖₂ over all parameters, a number or a device number. Where it is 0 nothing is learnt of ΔF.
+        beta_proportional: β_F of Eq. 9, in [0, 1).
+        beta_difference: β_Δ of Eq. 13, in [0, 1).
+        clip: hold α below Eq. 17.
+        centred: take variances about the mean in place of mean squares. For comparison (Fig. 5): unreliable.
+        decouple: divide differences by the step before averaging (Eq. 13). For comparison.
+        observed: (F, ΔF) to learn the variances from in place of those that are summed; independent ones leave M unbiased.
+
+    Returns:
+        (M_i, Var M_i, α_i, the next state).
+    """
+    seen = observed or (proportional, difference)
+    state, var_f, var_d, var_m = _observe(
+        state, *seen, step_norm, beta_proportional, beta_difference, centred, decouple
+    )
+    alpha = _held(state, optimal_alpha(var_f, var_m, var_d), var_f, clip)
+    gradient = advance(state.gradient, proportional, proportional - difference, alpha)
+    return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha)
+
+
+def update_coupled(
+    state: State,
+    current: Array,
+    previous: Array,
+    step_norm: Array,
+    *,
+    beta_proportional: float = BETA_PROPORTIONAL,
+    beta_difference: float = BETA_DIFFERENCE,
+    clip: bool = True,
+    centred: bool = False,
+    decouple: bool = True,
+    observed: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array, Array, State]:
+    """One step of the coupled form, whose two states share all samples.
+
+    Args:
+        current: F_i.
+        previous: H_i, of the state of step i − 1, from the samples of F_i; without effect at the first step.
+        observed: (F, H) to learn from in their place.
+
+    The others, and what is returned, are those of `update`.
+    """
+    F, H = observed or (current, previous)
+    state, var_f, var_d, var_m = _observe(
+        state, F, F - H, step_norm, beta_proportional, beta_difference, centred, decouple
+    )
+    cov = arrays.maximum(var_f - 0.5 * var_d, 0.0)
+    alpha = _held(state, control_weight(cov, var_f, var_m), var_f, clip)
+    gradient = advance(state.gradient, current, previous, alpha)
+    return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha)
+
+
+def optimal_alpha(var_proportional: Array, var_memory: Array, var_difference: Array) -> Array:
+    """Eq. 8: the weight of the past that leaves the least variance, in [0, 1]; 0 where all three are 0."""
+    total = var_proportional + var_memory + var_difference
+    return arrays.where(total > 0, var_proportional, 0.0) / arrays.where(total > 0, total, 1.0)
+
+
+def clip_alpha(alpha: Array, before: Array) -> Array:
+    """Eq. 17: at most 1 / (2 − α_{i-1}), the weight that an average of equal samples would give the past."""
+    return arrays.minimum(alpha, 1.0 / (2.0 - before))
+
+
+def meta_variance(alpha: Array, var_proportional: Array, var_memory: Array, var_difference: Array) -> Array:
+    """Eq. 15: the variance of M for independent F and ΔF and a weight that is independent of them."""
+    rest = 1.0 - alpha
+    return alpha * alpha * (var_memory + var_difference) + rest * rest * var_proportional
+
+
+def _observe(
+    state: State,
+    F: Array,
+    difference: Array,
+    step_norm: Array,
+    beta_proportional: float,
+    beta_difference: float,
+    centred: bool,
+    decouple: bool,
+) -> tuple[State, Array, Array, Array]:
+    """The state that has seen F and ΔF, Var F, Var ΔF, and Var M of the step before."""
+    if isinstance(step_norm, (int, float)):
+        step_norm = arrays.scalar(float(step_norm), F)
+    unseen, first = state.proportional.square == 0.0, state.steps == 0.0
+    proportional = _average(state.proportional, F, beta_proportional, 1.0)
+    var_f = _variance(proportional, centred)
+    # Two masks: the first step has no difference, and a step of length 0 tells nothing of it.
+    told = arrays.where(first, 0.0, 1.0) * arrays.where(step_norm > 0.0, 1.0, 0.0)
+    unit = arrays.where(step_norm > 0.0, step_norm, 1.0) if decouple else step_norm * 0.0 + 1.0
+    changes = _average(state.difference, difference / unit, beta_difference, told)
+    var_d = _variance(changes, centred) * (step_norm * step_norm if decouple else told)
+    var_m = arrays.where(unseen, var_f / arrays.maximum(state.steps, 1.0), state.variance)
+    return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m
+
+
+def _average(moments: Moments, sample: Array, beta: float, told: Array) -> Moments:
+    """The moments with one more sample, where `told` is 1; as they were where it is 0."""
+    gain = (1.0 - beta) * told
+    keep = 1.0 - gain
+    return Moments(
+        keep * moments.mean + gain * sample,
+        keep * moments.square + gain * (sample * sample),
+        keep * moments.weight + gain,
+    )
+
+
+def _variance(moments: Moments, centred: bool) -> Array:
+    known = moments.weight > 0.0
+    scale = arrays.where(known, 1.0, 0.0) / arrays.where(known, moments.weight, 1.0)
+    square, mean = moments.square * scale, moments.mean * scale
+    return arrays.maximum(square - mean * mean, 0.0) if centred else square
+
+
+def _held(state: State, alpha: Array, var_f: Array, clip: bool) -> Array:
+    """α of this step: 0 at the first; within Eq. 17 where nothing but zeros was seen, and everywhere with `clip`."""
+    bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
+    alpha = arrays.where(var_f > 0.0, alpha, bound)
+    alpha = arrays.minimum(alpha, bound) if clip else alpha
+    return alpha * arrays.where(state.steps > 0.0, 1.0, 0.0)
+
+
+def _next(state: State, gradient: Array, variance: Array, alpha: Array) -> tuple[Array, Array, Array, State]:
+    after = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=state.steps + 1.0)
+    return gradient, variance, alpha, after

@@ -1,0 +1,175 @@
+"""Meta-estimation's formulas against the paper's equations written out, against averages, and on both kinds of arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import kernels
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unrender import arrays
+from unrender.statistics import meta
+
+FORMS = {"independent": meta.update, "coupled": meta.update_coupled}
+
+
+def stream(steps: int, shape: tuple[int, ...] = (5, 3), seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """F, ΔF and step lengths."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(1.0, 2.0, (steps, *shape)), rng.normal(0.0, 0.1, (steps, *shape)), rng.uniform(0.5, 2.0, steps)
+
+
+def equations(F: np.ndarray, D: np.ndarray, norms: np.ndarray, bf: float, bd: float) -> list[tuple[Any, Any, Any]]:
+    """Eqs 7, 8, 9, 13, 14, 15 and 17 as printed, the moving averages debiased, one element at a time."""
+    found = []
+    m, var_m, alpha = F[0], F[0] ** 2, 0.0 * F[0]
+    square_f, square_d = (1 - bf) * F[0] ** 2, 0.0
+    found.append((m, var_m, alpha))
+    for i in range(1, len(F)):
+        square_f = bf * square_f + (1 - bf) * F[i] ** 2
+        square_d = bd * square_d + (1 - bd) * D[i] ** 2 / norms[i] ** 2
+        var_f = square_f / (1 - bf ** (i + 1))
+        var_d = square_d / (1 - bd**i) * norms[i] ** 2
+        alpha = np.minimum(var_f / (var_f + var_m + var_d), 1 / (2 - alpha))
+        m = alpha * (m + D[i]) + (1 - alpha) * F[i]
+        var_m = alpha**2 * (var_m + var_d) + (1 - alpha) ** 2 * var_f
+        found.append((m, var_m, alpha))
+    return found
+
+
+@pytest.mark.parametrize(("bf", "bd"), [(0.99, 0.9), (0.5, 0.0)])
+def test_the_equations(bf: float, bd: float) -> None:
+    F, D, norms = stream(40)
+    expected = equations(F, D, norms, bf, bd)
+    state = meta.init(F[0])
+    for i in range(len(F)):
+        *found, state = meta.update(state, F[i], D[i], norms[i], beta_proportional=bf, beta_difference=bd)
+        for a, b in zip(found, expected[i], strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+    other = equations(F, D, norms, 0.98 * bf, bd)
+    assert not np.allclose(found[0], other[-1][0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_without_change_it_is_the_average(form: str) -> None:
+    """Samples of one magnitude that never change: the weight is i / (i + 1), the variance that of a mean, exactly."""
+    rng = np.random.default_rng(1)
+    F = rng.choice([-1.0, 1.0], (60, 7))
+    state = meta.init(F[0])
+    for i in range(len(F)):
+        second = np.zeros(7) if form == "independent" else F[i]
+        gradient, variance, alpha, state = FORMS[form](state, F[i], second, 0.1)
+        np.testing.assert_allclose(alpha, i / (i + 1), rtol=1e-12)
+        np.testing.assert_allclose(gradient, F[: i + 1].mean(0), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(variance, 1 / (i + 1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_element_that_was_only_zero_counts_its_zeros(form: str) -> None:
+    """As a texel that no path met in nine steps: its first sample is one tenth of a mean, its variance that of ten."""
+    state = meta.init(np.zeros(1))
+    for i in range(10):
+        F = np.array([10.0 if i == 9 else 0.0])
+        gradient, variance, alpha, state = FORMS[form](state, F, 0 * F if form == "independent" else F, 0.0)
+    assert gradient == pytest.approx(1.0)
+    assert alpha == pytest.approx(0.9)
+    mean_square = 100 * (1 - meta.BETA_PROPORTIONAL) / (1 - meta.BETA_PROPORTIONAL**10)
+    assert variance == pytest.approx(mean_square / 10)
+
+
+def test_a_noisy_difference_forgets_the_past() -> None:
+    quiet, noisy = meta.init(np.zeros(1)), meta.init(np.zeros(1))
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        F = rng.normal(size=1)
+        *_, a, quiet = meta.update(quiet, F, np.array([1e-4]), 1.0)
+        *_, b, noisy = meta.update(noisy, F, rng.normal(size=1) * 10, 1.0)
+    assert a > 0.95
+    assert b < 0.05
+
+
+def test_a_step_of_no_length_teaches_nothing_of_differences() -> None:
+    F, D, norms = stream(6)
+    state = meta.init(F[0])
+    for i in range(5):
+        *_, state = meta.update(state, F[i], D[i], norms[i])
+    gradient, _, alpha, after = meta.update(state, F[5], 0 * D[5], 0.0)
+    np.testing.assert_array_equal(after.difference.square, state.difference.square)
+    assert np.isfinite(gradient).all()
+    with_step = meta.update(state, F[5], 0 * D[5], 1.0)[2]
+    assert (alpha >= with_step).all()
+
+
+def test_longer_steps_are_foreseen_by_decoupling() -> None:
+    """Eq. 14: the step ten times longer has a hundred times the variance at once; without decoupling it takes a while."""
+    rng = np.random.default_rng(3)
+    alphas = {}
+    for decouple in (True, False):
+        state = meta.init(np.zeros(1000))
+        for i in range(40):
+            step = 0.1 if i < 39 else 1.0
+            F = rng.normal(size=1000)
+            *_, alpha, state = meta.update(state, F, rng.normal(size=1000) * step * 0 + step, step, decouple=decouple)
+        alphas[decouple] = alpha.mean()
+    assert alphas[True] < alphas[False] - 0.1
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("options", [{}, {"clip": False}, {"centred": True}, {"decouple": False}, {"observed": True}])
+def test_the_same_on_the_device(form: str, options: dict[str, Any]) -> None:
+    F, D, norms = stream(12, (4, 3))
+    second = D if form == "independent" else F - D
+    other, _, _ = stream(12, (4, 3), seed=9)
+
+    def go(array: Any) -> list[np.ndarray]:
+        state = meta.init(array(F[0]))
+        rows = []
+        for i in range(len(F)):
+            more = dict(options)
+            if "observed" in options:
+                more["observed"] = (array(other[i]), array(second[i]))
+            *found, state = FORMS[form](state, array(F[i]), array(second[i]), float(norms[i]), **more)
+            rows.append(np.stack([arrays.numpy(x) for x in found]))
+        return rows
+
+    for a, b in zip(
+        go(lambda x: np.asarray(x, np.float64)), go(lambda x: mi.TensorXf(x.astype(np.float32))), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)
+
+
+def test_no_step_compiles_a_kernel() -> None:
+    F, D, norms = stream(30, (64,))
+
+    def go(steps: range, state: meta.State) -> meta.State:
+        for i in steps:
+            *found, state = meta.update(state, mi.TensorXf(F[i]), mi.TensorXf(D[i]), float(norms[i]))
+            dr.eval(found, state)
+        return state
+
+    state = go(range(10), meta.init(mi.TensorXf(F[0])))
+    with kernels.recorded() as new:
+        go(range(10, 30), state)
+    assert new
+    assert not any(new)
+
+
+def test_alpha_that_knows_its_samples_is_biased_and_observed_ones_are_not() -> None:
+    """Skewed samples of mean 1: shared statistics weigh the large ones less."""
+    rng = np.random.default_rng(4)
+    means = {}
+    for observed in (False, True):
+        F = rng.exponential(size=(6, 200_000))
+        G = rng.exponential(size=(6, 200_000))
+        state = meta.init(F[0])
+        for i in range(len(F)):
+            zero = np.zeros_like(F[i])
+            gradient, _, _, state = meta.update(
+                state, F[i], zero, 1.0, beta_proportional=0.5, observed=(G[i], zero) if observed else None
+            )
+        means[observed] = (gradient.mean(), gradient.std() / np.sqrt(gradient.size))
+    assert abs(means[True][0] - 1) < 4 * means[True][1]
+    assert abs(means[False][0] - 1) > 8 * means[False][1]
