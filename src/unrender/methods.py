@@ -90,7 +90,7 @@ class MetaCommonOptions(Options):
         "meta-adam",
         description="what takes the steps; adam, which takes the gradients for independent, is for comparison",
     )
-    learning_rate: PositiveFloat = Field(0.003, description="step size of the parameters that have none of their own")
+    learning_rate: PositiveFloat = Field(0.002, description="step size of the parameters that have none of their own")
     schedule: str | None = AdamOptions.model_fields["schedule"]
     space: Literal["auto", "path", "primary"] = Field(
         "auto", description="what two steps share: paths, random numbers, or paths where all parameters allow it"

@@ -117,30 +117,23 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
 
 
 @pytest.mark.parametrize("coupled", [False, True])
-def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift_and_knows_its_variance(coupled: bool) -> None:
-    """400 runs: the mean within 3 standard errors at each of 30 steps, the recurrent variance within a factor 2 of the measured."""
+def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(coupled: bool) -> None:
+    """400 runs, alpha bounded, statistics from independent samples: the mean gradient is the true one at each of ten steps."""
     asked = problem(noise=0.9)
-    estimator = ur.MetaEstimator(2, 2, coupled=coupled, spp=4, statistics="independent")
-    path = [{k: v - 0.01 * step for k, v in asked.initial().items()} for step in range(30)]
-    rows, variances = [], []
-    for seed in range(400):
+    estimator = ur.MetaEstimator(coupled=coupled, spp=2, statistics="independent")
+    path = [{k: v - 0.02 * step for k, v in asked.initial().items()} for step in range(10)]
+    exact = [np.concatenate([g.ravel() for g in exact_gradient(asked, p).values()]) for p in path]
+    rows = np.zeros((400, len(path), exact[0].size))
+    for seed in range(len(rows)):
         state = estimator.init(asked, path[0])
-        row, variance = [], []
         for step, parameters in enumerate(path):
             found, state = estimator.estimate(asked, parameters, state, Key(seed, step))
-            assert found.variance is not None
-            row.append(np.concatenate([g.ravel() for g in found.gradient.values()]))
-            variance.append(np.concatenate([v.ravel() for v in found.variance.values()]))
-        rows.append(row)
-        variances.append(variance)
-    gradient, predicted = np.array(rows), np.array(variances)
-    print(np.median(predicted.mean(0) / gradient.var(0, ddof=1), axis=1))
-    exact = np.array([np.concatenate([g.ravel() for g in exact_gradient(asked, p).values()]) for p in path])
-    z = (gradient.mean(0) - exact) / (gradient.std(0, ddof=1) / np.sqrt(400))
-    # The elements are all but copies of one another, so their mean |z| counts as one; 30 steps are not independent either.
-    assert np.abs(z.mean(1)).max() < 3
-    assert np.abs((gradient.mean(0) * 1.1 - exact) / (gradient.std(0, ddof=1) / np.sqrt(400))).max() > 3
-    assert (gradient[:, -1].std(0) < 0.7 * gradient[:, 0].std(0)).all(), "it should be quieter than its samples"
+            rows[seed, step] = np.concatenate([g.ravel() for g in found.gradient.values()])
+    for step in range(len(path)):
+        worst, limit = worst_z(rows[:, step], exact[step])
+        assert worst < limit, step
+    assert worst_z(rows[:, -1] * 1.1, exact[-1])[0] > limit, "a planted bias of 10 % went unseen"
+    assert (rows[:, -1].std(0) < 0.7 * rows[:, 0].std(0)).all(), "it should be quieter than its samples"
 
 
 def test_meta_refuses_what_makes_no_sense() -> None:

@@ -141,8 +141,9 @@ def test_the_same_on_the_device(form: str, options: dict[str, Any]) -> None:
         np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)
 
 
-def test_no_step_compiles_a_kernel() -> None:
-    F, D, norms = stream(30, (64,))
+def test_no_step_compiles_a_kernel_of_its_own() -> None:
+    """Dr.Jit orders the inputs of one and the same kernel in a handful of ways; a number that became a literal would make one per step."""
+    F, D, norms = stream(60, (64,))
 
     def go(steps: range, state: meta.State) -> meta.State:
         for i in steps:
@@ -152,9 +153,60 @@ def test_no_step_compiles_a_kernel() -> None:
 
     state = go(range(10), meta.init(mi.TensorXf(F[0])))
     with kernels.recorded() as new:
-        go(range(10, 30), state)
-    assert new
-    assert not any(new)
+        go(range(10, 60), state)
+    assert len(new) >= 50
+    assert sum(new) <= 6
+
+
+RUNS, LENGTH = 40_000, 60
+
+
+def drifting(form: str, observed: bool, steps: int = LENGTH) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(true, estimate (steps, runs), predicted variance (steps, runs)) of a quantity that moves in a line while its noise does not.
+
+    One element per run. F = a_i + noise, its change per step with noise of its own (independent) or with that of F scaled by the
+    state, as common random numbers leave it (coupled).
+    """
+    rng = np.random.default_rng(7)
+    true = 0.4 - 0.01 * np.arange(steps)
+
+    def draw(i: int) -> tuple[np.ndarray, np.ndarray]:
+        e, d = rng.exponential(size=(2, RUNS)) - 1
+        if form == "coupled":  # the same noise, a little different in the state before
+            return true[i] + e, true[max(i - 1, 0)] + 0.98 * e + 0.02 * d
+        return true[i] + e, (true[i] - true[max(i - 1, 0)]) * (1 + 4 * d)
+
+    state = meta.init(np.zeros(RUNS))
+    estimates, variances = [], []
+    for i in range(steps):
+        gradient, variance, _, state = FORMS[form](state, *draw(i), 0.01, observed=draw(i) if observed else None)
+        estimates.append(gradient)
+        variances.append(variance)
+    return true, np.array(estimates), np.array(variances)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_drift_is_followed_without_bias_and_the_variance_is_known(form: str) -> None:
+    """With statistics from independent samples, alpha bounded: the mean is true at each step, the variance within a factor 2 on average."""
+    true, estimates, variances = drifting(form, observed=True)
+    z = (estimates.mean(1) - true) / (estimates.std(1, ddof=1) / np.sqrt(RUNS))
+    limit = 3 + 0.7  # 3 standard errors at one step are 3.7 at the worst of sixty
+    assert np.abs(z).max() < limit
+    shifted = (estimates.mean(1) + 0.03 * estimates.std(1) - true) / (estimates.std(1, ddof=1) / np.sqrt(RUNS))
+    assert (np.abs(shifted) > limit).mean() > 0.9, "a planted bias of three hundredths of a deviation went unseen"
+    ratio = variances.mean(1) / estimates.var(1, ddof=1)
+    assert ratio.min() > 0.5
+    assert ratio.max() < 2
+    assert estimates[-1].var() < 0.25 * estimates[0].var(), "it should have kept the past"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_shared_statistics_know_the_variance_too(form: str) -> None:
+    """The paper's choice: the recurrence is within a factor 2 of what was measured, but for the first three steps."""
+    _, estimates, variances = drifting(form, observed=False)
+    ratio = (variances.mean(1) / estimates.var(1, ddof=1))[3:]
+    assert ratio.min() > 0.5
+    assert ratio.max() < 2
 
 
 def test_alpha_that_knows_its_samples_is_biased_and_observed_ones_are_not() -> None:

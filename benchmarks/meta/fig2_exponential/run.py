@@ -24,7 +24,7 @@ from unrender.rendering.exponential import RATE
 
 HERE = Path(__file__).resolve().parent
 HORIZONS = (200, 400)
-TUNING_SEEDS = range(10_000, 10_040)
+TUNING_SEEDS = range(10_000, 10_024)
 ADAM_RATES = tuple(float(r) for r in np.geomspace(0.002, 0.05, 9).round(5))
 META_RATES = tuple(float(r) for r in np.geomspace(0.0003, 0.02, 10).round(5))
 ADAM, META = ur.optimizers.Adam, ur.optimizers.MetaAdam

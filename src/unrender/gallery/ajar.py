@@ -93,7 +93,7 @@ def _corridor(bsdf: dict[str, Any]) -> dict[str, Any]:
         "corridor_far": parts.rectangle((-2.5, 1, -1), (1, 0, 0), (0, 1, 0), bsdf),
         "corridor_near": parts.rectangle((-2.5, 1, 2), (-1, 0, 0), (0, 1, 0), bsdf),
         "light": parts.rectangle(
-            (-2.6, 1.95, 0.4), (0.3, 0, 0), (0, 0, 0.3), parts.diffuse(0.0), emitter=parts.light(420.0, 390.0, 340.0)
+            (-2.6, 1.95, 0.4), (0.3, 0, 0), (0, 0, 0.3), parts.diffuse(0.0), emitter=parts.light(1900.0, 1750.0, 1550.0)
         ),
     }
 

@@ -22,11 +22,11 @@ _TURNS = 2.5
 class Spiral:
     """Base colour, metalness and roughness of a glossy spiral ribbon, all at once, by indirect light.
 
-    One view; three unknown maps of texture_resolution² texels, each from one value.
+    One view; five unknown numbers, or three maps of texture_resolution² texels, each from one value.
     """
 
     resolution: int = fields.resolution(96)
-    texture_resolution: int = fields.texture_resolution(8)
+    texture_resolution: int = fields.whole(1, "texels along a side of each unknown map; 1: no maps, plain values")
     reference_spp: int = fields.reference_spp(4096)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
@@ -43,12 +43,10 @@ class Spiral:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The three maps."""
-        return (
-            Parameter("spiral.bsdf.brdf_0.base_color.data", initial=0.5),
-            Parameter("spiral.bsdf.brdf_0.metallic.data", initial=0.5),
-            Parameter("spiral.bsdf.brdf_0.roughness.data", initial=0.5),
-        )
+        """Colour, metalness and roughness."""
+        leaf = "value" if self.texture_resolution == 1 else "data"
+        start = {"base_color": 0.5, "metallic": 0.3, "roughness": 0.6}
+        return tuple(Parameter(f"spiral.bsdf.brdf_0.{name}.{leaf}", initial=value) for name, value in start.items())
 
 
 def _ribbon(rows: int, columns: int) -> np.ndarray:
@@ -61,14 +59,16 @@ def _ribbon(rows: int, columns: int) -> np.ndarray:
 
 
 def _lacquer(resolution: int) -> dict[str, Any]:
-    u, v = textures.grid(resolution)
-    bands = textures.ramp(np.sin(6 * np.pi * u), -0.4, 0.4)[..., None]
-    copper, teal = np.array([0.85, 0.42, 0.2]), np.array([0.08, 0.25, 0.5])
-    return parts.twosided(
-        {
-            "type": "principled",
-            "base_color": textures.bitmap(teal + (copper - teal) * bands),
+    """Copper, or at more than one texel copper and blue enamel in bands, ever rougher along the ribbon's width."""
+    copper, blue = np.array([0.85, 0.42, 0.2]), np.array([0.08, 0.25, 0.5])
+    if resolution == 1:
+        unknown: dict[str, Any] = {"base_color": parts.colour(*copper), "metallic": 0.8, "roughness": 0.3}
+    else:
+        u, v = textures.grid(resolution)
+        bands = textures.ramp(np.sin(6 * np.pi * u), -0.4, 0.4)[..., None]
+        unknown = {
+            "base_color": textures.bitmap(blue + (copper - blue) * bands),
             "metallic": textures.bitmap(0.1 + 0.8 * textures.ramp(np.cos(4 * np.pi * u), -0.5, 0.5)),
             "roughness": textures.bitmap(0.2 + 0.45 * v),
         }
-    )
+    return parts.twosided({"type": "principled", **unknown})

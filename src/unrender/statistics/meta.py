@@ -107,10 +107,10 @@ def update(
         (M_i, Var M_i, α_i, the next state).
     """
     seen = observed or (proportional, difference)
-    state, var_f, var_d, var_m = _observe(
+    state, var_f, var_d, var_m, started = _observe(
         state, *seen, step_norm, beta_proportional, beta_difference, centred, decouple
     )
-    alpha = _held(state, optimal_alpha(var_f, var_m, var_d), var_f, clip)
+    alpha = _held(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip)
     gradient = advance(state.gradient, proportional, proportional - difference, alpha)
     return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha)
 
@@ -138,11 +138,11 @@ def update_coupled(
     The others, and what is returned, are those of `update`.
     """
     F, H = observed or (current, previous)
-    state, var_f, var_d, var_m = _observe(
+    state, var_f, var_d, var_m, started = _observe(
         state, F, F - H, step_norm, beta_proportional, beta_difference, centred, decouple
     )
     cov = arrays.maximum(var_f - 0.5 * var_d, 0.0)
-    alpha = _held(state, control_weight(cov, var_f, var_m), var_f, clip)
+    alpha = _held(state, control_weight(cov, var_f, var_m), var_f, started, clip)
     gradient = advance(state.gradient, current, previous, alpha)
     return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha)
 
@@ -173,46 +173,51 @@ def _observe(
     beta_difference: float,
     centred: bool,
     decouple: bool,
-) -> tuple[State, Array, Array, Array]:
-    """The state that has seen F and ΔF, Var F, Var ΔF, and Var M of the step before."""
+) -> tuple[State, Array, Array, Array, Array]:
+    """The state that has seen F and ΔF, Var F, Var ΔF, Var M of the step before, and 1 where there was one, else 0."""
     if isinstance(step_norm, (int, float)):
         step_norm = arrays.scalar(float(step_norm), F)
-    unseen, first = state.proportional.square == 0.0, state.steps == 0.0
-    proportional = _average(state.proportional, F, beta_proportional, 1.0)
-    var_f = _variance(proportional, centred)
+    unseen = state.proportional.square == 0.0
     # Two masks: the first step has no difference, and a step of length 0 tells nothing of it.
-    told = arrays.where(first, 0.0, 1.0) * arrays.where(step_norm > 0.0, 1.0, 0.0)
+    started = arrays.where(state.steps > 0.0, 1.0, 0.0)
+    told = started * arrays.where(step_norm > 0.0, 1.0, 0.0)
     unit = arrays.where(step_norm > 0.0, step_norm, 1.0) if decouple else step_norm * 0.0 + 1.0
-    changes = _average(state.difference, difference / unit, beta_difference, told)
-    var_d = _variance(changes, centred) * (step_norm * step_norm if decouple else told)
-    var_m = arrays.where(unseen, var_f / arrays.maximum(state.steps, 1.0), state.variance)
-    return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m
+    past = arrays.maximum(state.steps, 1.0)
+    gain_f, gain_d = told * 0.0 + (1.0 - beta_proportional), told * (1.0 - beta_difference)
+    weight_f = (1.0 - gain_f) * state.proportional.weight + gain_f
+    weight_d = (1.0 - gain_d) * state.difference.weight + gain_d
+    scale_f = 1.0 / weight_f
+    scale_d = arrays.where(weight_d > 0.0, 1.0, 0.0) / arrays.where(weight_d > 0.0, weight_d, 1.0)
+    length = step_norm * step_norm if decouple else told * 1.0
+    # Numbers must be in memory before they meet arrays: Dr.Jit stretches an unevaluated number in place to the array's size.
+    arrays.evaluate(started, unit, past, gain_f, gain_d, weight_f, weight_d, scale_f, scale_d, length)
+    proportional = _average(state.proportional, F, gain_f, weight_f)
+    changes = _average(state.difference, difference / unit, gain_d, weight_d)
+    var_f = _variance(proportional, scale_f, centred)
+    var_d = _variance(changes, scale_d, centred) * length
+    var_m = arrays.where(unseen, var_f / past, state.variance)
+    return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m, started
 
 
-def _average(moments: Moments, sample: Array, beta: float, told: Array) -> Moments:
-    """The moments with one more sample, where `told` is 1; as they were where it is 0."""
-    gain = (1.0 - beta) * told
-    keep = 1.0 - gain
+def _average(moments: Moments, sample: Array, gain: Array, weight: Array) -> Moments:
+    """The moments with one more sample; as they were where `gain` is 0."""
     return Moments(
-        keep * moments.mean + gain * sample,
-        keep * moments.square + gain * (sample * sample),
-        keep * moments.weight + gain,
+        moments.mean + gain * (sample - moments.mean),
+        moments.square + gain * (sample * sample - moments.square),
+        weight,
     )
 
 
-def _variance(moments: Moments, centred: bool) -> Array:
-    known = moments.weight > 0.0
-    scale = arrays.where(known, 1.0, 0.0) / arrays.where(known, moments.weight, 1.0)
+def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     square, mean = moments.square * scale, moments.mean * scale
     return arrays.maximum(square - mean * mean, 0.0) if centred else square
 
 
-def _held(state: State, alpha: Array, var_f: Array, clip: bool) -> Array:
+def _held(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) -> Array:
     """α of this step: 0 at the first; within Eq. 17 where nothing but zeros was seen, and everywhere with `clip`."""
     bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
     alpha = arrays.where(var_f > 0.0, alpha, bound)
-    alpha = arrays.minimum(alpha, bound) if clip else alpha
-    return alpha * arrays.where(state.steps > 0.0, 1.0, 0.0)
+    return (arrays.minimum(alpha, bound) if clip else alpha) * started
 
 
 def _next(state: State, gradient: Array, variance: Array, alpha: Array) -> tuple[Array, Array, Array, State]:
