@@ -56,7 +56,7 @@ def descend(
 
 
 def tune(problem: ur.Problem, entrant: Entrant, **budget: Any) -> tuple[float, list[dict[str, float]]]:
-    """The rate whose final error is least, and all that were tried. A best rate at an end of the grid extends it once."""
+    """The rate whose final error is least, and all that were tried. A best rate at an end of the grid extends it, thrice at most."""
     tried: dict[float, float] = {}
 
     def attempt(rate: float) -> None:
@@ -66,11 +66,13 @@ def tune(problem: ur.Problem, entrant: Entrant, **budget: Any) -> tuple[float, l
 
     for rate in entrant.rates:
         attempt(rate)
-    best = min(tried, key=tried.__getitem__)
-    if best in (min(tried), max(tried)) and len(tried) > 1:
-        factor = sorted(tried)[1] / sorted(tried)[0]
-        attempt(best / factor if best == min(tried) else best * factor)
+    factor = sorted(tried)[1] / sorted(tried)[0] if len(tried) > 1 else 1.0
+    for _ in range(3):
         best = min(tried, key=tried.__getitem__)
+        if factor == 1.0 or best not in (min(tried), max(tried)):
+            break
+        attempt(best / factor if best == min(tried) else best * factor)
+    best = min(tried, key=tried.__getitem__)
     return best, [{"rate": rate, "error": error} for rate, error in sorted(tried.items())]
 
 

@@ -180,3 +180,29 @@ def test_both_images_of_render_pair() -> None:
     assert a.mean() > b.mean()
     same = ur.render_pair(asked, now, now, 16, 0)
     assert np.array_equal(*same)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_replayed_kernels_follow_every_value_that_numpy_hands_over(channels: int) -> None:
+    """Borrowed memory would show stale texels in some of them, where the texture is stored as it is given."""
+    key = "ball.bsdf.reflectance.data"
+    rng = np.random.default_rng(3)
+
+    def description() -> dict[str, Any]:
+        texels = mi.Bitmap(np.full((8, 8, channels), 0.5, np.float32))
+        texture = {"type": "bitmap", "raw": True, "bitmap": texels}
+        return {
+            "type": "scene",
+            "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+            "ball": {"type": "sphere", "center": [0, 0, 4], "bsdf": {"type": "diffuse", "reflectance": texture}},
+            "sky": {"type": "constant"},
+        }
+
+    renderer = MitsubaRenderer(description, 3)
+    renderer.select([key], None)
+    values = [rng.uniform(0.1, 0.9, (8, 8, channels)).astype(np.float32) for _ in range(12)]
+    replayed = [np.array(renderer.image({key: renderer.array(v)}, Shot(0, 4, 5)).images) for v in values]
+    for value, image in zip(values, replayed, strict=True):
+        renderer._frozen.clear()
+        fresh = np.array(renderer.image({key: renderer.array(value)}, Shot(0, 4, 5)).images)
+        np.testing.assert_array_equal(image, fresh)

@@ -1,6 +1,6 @@
 """What each part of meta-estimation is for (Balint et al. 2023, Fig. 5): `ajar`, one part left out at a time, each tuned.
 
-    python benchmarks/meta/fig5_ablations/run.py [--seconds 10] [--seeds 3] [--resolution 48]
+    python benchmarks/meta/fig5_ablations/run.py [--seconds 6] [--seeds 3] [--resolution 48]
 
 Left out: the zero-centred moments (variances about the mean instead), the bound of alpha, the shared samples (statistics from
 independent ones, at twice the cost), the decoupling of the difference's variance from the step. Both forms.
@@ -57,7 +57,7 @@ def plot(results: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--resolution", type=int, default=48)
     parser.add_argument("--plot-only", action="store_true")

@@ -37,7 +37,7 @@ class Ajar:
         grey, white = parts.diffuse(0.5), parts.twosided(parts.diffuse(0.7))
         size = self.texture_resolution
         wall = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("coffee", size))}
-        clay = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("brick", size))}
+        clay = {"type": "diffuse", "reflectance": textures.bitmap(_glaze(size))}
         return {
             "type": "scene",
             "camera": parts.camera((0.25, 0.95, 1.95), (0.1, 0.8, -1), 58.0, self.resolution),
@@ -103,6 +103,15 @@ def _pot_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
     return 0.2 + 0.1 * t + 0.035 * textures.ramp(t, 0.78, 0.82), 0.42 * t
 
 
+def _glaze(resolution: int) -> np.ndarray:
+    """Terracotta with a cream zigzag and a blue rim."""
+    u, v = textures.grid(resolution)
+    clay, cream, blue = np.array([0.6, 0.24, 0.12]), np.array([0.85, 0.78, 0.6]), np.array([0.1, 0.2, 0.5])
+    zigzag = np.abs(v - 0.55 - 0.15 * np.abs(((8 * u) % 1) - 0.5) * 2)
+    painted = clay + (cream - clay) * (1 - textures.ramp(zigzag, 0.06, 0.12))[..., None]
+    return painted + (blue - painted) * (1 - textures.ramp(v, 0.1, 0.16))[..., None]
+
+
 def _rosette(rows: int, columns: int) -> np.ndarray:
     """Leaves around one stem, as one sheet: its radius falls between the leaves, its tips bend down. (rows, columns + 1, 3)."""
     angle = np.linspace(-np.pi, np.pi, columns + 1)[None, :]
@@ -117,5 +126,5 @@ def _rosette(rows: int, columns: int) -> np.ndarray:
 def _leaf(resolution: int) -> dict[str, Any]:
     u, v = textures.grid(resolution)
     veins = np.abs(np.sin(np.pi * (_LEAVES * u + 3 * v)))[..., None] ** 0.5
-    young, old = np.array([0.45, 0.6, 0.1]), np.array([0.05, 0.25, 0.06])
+    young, old = np.array([0.5, 0.65, 0.35]), np.array([0.05, 0.22, 0.06])
     return parts.twosided({"type": "diffuse", "reflectance": textures.bitmap(young + (old - young) * veins)})

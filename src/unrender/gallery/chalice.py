@@ -48,7 +48,7 @@ class Chalice:
 
     def parameters(self) -> tuple[Parameter, ...]:
         """The roughness, even at first."""
-        return (Parameter("chalice.bsdf.brdf_0.roughness.data", initial=0.4, preconditioner=LargeSteps(2.0)),)
+        return (Parameter("chalice.bsdf.brdf_0.roughness.data", initial=0.65, preconditioner=LargeSteps(2.0)),)
 
 
 def _lamp(place: np.ndarray) -> dict[str, Any]:

@@ -87,8 +87,15 @@ class MitsubaRenderer:
         return [(int(s[1]), int(s[0])) for s in sizes]
 
     def array(self, values: np.ndarray) -> Any:
-        """`mi.TensorXf` with these values."""
-        return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+        """`mi.TensorXf` with these values, in memory of its own.
+
+        Dr.Jit would borrow NumPy's memory, and frozen kernels then read stale texels or abort (Dr.Jit 1.5, where a texture has 1 or 4
+        channels and so is stored as it is given).
+        """
+        borrowed = mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+        owned = mi.TensorXf(borrowed.array * dr.opaque(mi.Float, 1), tuple(borrowed.shape))
+        dr.eval(owned)
+        return owned
 
     def select(self, keys: list[str], space: Space | None) -> None:
         """Announce the parameters to recover. See `Renderer.select`."""
