@@ -137,9 +137,166 @@ def weights(found: dict[str, Any]) -> str:
     )
 
 
-def lines(found: dict[str, Any], keys: tuple[str, ...]) -> str:
-    """The parts of a result that speak for themselves, as JSON."""
-    return "\n\n".join(f"```json\n{json.dumps(found[key], indent=None)}\n```" for key in keys)
+def order(found: dict[str, Any]) -> str:
+    """Fig. 4."""
+    names = {"plain": "plain render", "before": "updated before use (biased)", "after": "updated after use"}
+    rows = []
+    for path, entry in found["paths"].items():
+        for method, name in names.items():
+            f = entry["methods"][method]
+            converged, paired = f["converged"][-1], f["paired"][-1] if "paired" in f else None
+            bias = f"{paired['signed']:+.3%} ± {paired['signed_error']:.3%}, {paired['rms']:.2%}" if paired else ""
+            absolute = f"{converged['signed']:+.2%} ± {converged['signed_error']:.2%}"
+            rows.append([path, name, absolute, bias, f"{f['equivalent_spp']:.0f}"])
+    head = [
+        "parameters",
+        "statistics",
+        "bias against a converged image",
+        "bias, paired: mean, RMS over pixels",
+        "worth plain spp",
+    ]
+    sizes = (
+        f"{found['resolution']}², {found['spp']} spp, {found['steps']} steps, {found['runs']} runs, `indirect-room`."
+    )
+    return f"{sizes}\n\n{table(head, rows)}"
+
+
+def spaces(found: dict[str, Any]) -> str:
+    """Fig. 8."""
+    rows = []
+    for scene, entry in found["scenes"].items():
+        for space, f in entry["summary"].items():
+            ratios = (f["weight"], f["variance_ratio"], f["error_ratio_at_last"], f["image_cost"], f["step_cost"])
+            rows.append([scene, space, *(f"{x:.2f}" for x in ratios)])
+    head = [
+        "scene",
+        "space",
+        "mean weight",
+        "variance ÷",
+        "error ÷ at the last step",
+        "cost of an image",
+        "cost of a step",
+    ]
+    sizes = f"{found['resolution']}², {found['spp']} spp, {found['steps']} steps, {found['runs']} runs; relative to a plain render."
+    return f"{sizes}\n\n{table(head, rows)}"
+
+
+def loss_bias(found: dict[str, Any]) -> str:
+    """Fig. 7."""
+    rows = []
+    for loss, entry in found["fig7"]["losses"].items():
+        for method in ("plain", "rcv"):
+            f = entry[method]
+            rows.append(
+                [
+                    loss,
+                    method,
+                    f"{f['signed']:+.1%} ± {f['signed_error']:.1%}",
+                    f"{f['rms']:.2f}",
+                    f"{f['variance']:.2f}",
+                ]
+            )
+    head = ["loss", "image", "bias of the derivative", "RMS over pixels", "variance"]
+    ratio = f"The image's variance is {found['fig7']['image_variance_ratio']:.1f} × lower with the control variate."
+    sizes = f"{found['resolution']}², {found['spp']} spp, {found['runs']} runs, step {found['step']}; relative to the derivative's mean."
+    return f"{sizes}\n\n{table(head, rows)}\n\n{ratio}"
+
+
+def toy(found: dict[str, Any]) -> str:
+    """Meta, Fig. 2."""
+    rows = []
+    for method, entry in found["methods"].items():
+        row: list[Any] = [method]
+        for horizon in ("200", "400"):
+            f = entry[horizon]
+            row += [f"{f['rmse']:.5f}", f"{f['of_adam']:.2f}", f"{f['rate']:g}"]
+        rows.append(row)
+    head = ["method", "RMSE after 200 steps", "of Adam's", "rate", "RMSE after 400 steps", "of Adam's", "rate"]
+    return f"{found['seeds']} runs; each method tuned for each horizon on other seeds.\n\n{table(head, rows)}"
+
+
+def differences(found: dict[str, Any]) -> str:
+    """Meta: variance and cost of differences."""
+    rows = []
+    for name, entry in found["variance"].items():
+        for space in ("path", "primary"):
+            f = entry[space]
+            ratios = [f"{v / f['gradient']:.1e}" for v in f["difference"]]
+            rows.append([name, space, f"{f['slope']:.2f}", *ratios])
+    steps = next(iter(found["variance"].values()))["steps"]
+    sizes = f"{found['resolution']}², {found['spp']} spp, {found['runs']} runs. Var ΔF / Var F by step, a share of the way to the truth:"
+    first = table(["problem", "space", "slope, log-log", *(f"{s:g}" for s in steps)], rows)
+    cost = found["cost"]
+    keys = list(next(iter(cost.values())))
+    second = table(["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys])
+    return f"{sizes}\n\n{first}\n\nWhole steps at 1 to 3 views, and their parts for one view, at the gallery's film sizes:\n\n{second}"
+
+
+def races(found: dict[str, Any]) -> str:
+    """Meta, Figs 1, 6 and 9."""
+    blocks = []
+    for name, entry in found["entries"].items():
+        methods, summary = entry["methods"], entry["summary"]
+        rows = []
+        for method, f in methods.items():
+            end = f["runs"][0][-1]
+            row = [
+                method,
+                f"{f['rate']:g}",
+                f"{f['final'][0]:.3f} ({f['final'][1]:.3f} to {f['final'][2]:.3f})",
+                f"{end[0]:.1f}",
+            ]
+            row.append(f"{end[1] / 1e6:.2f}")
+            rows.append(row)
+        budget = ", ".join(f"{value:g} {unit}" for unit, value in entry["budget"].items())
+        head = ["method", "rate", "final error: median (range)", "seconds", "million paths"]
+        lines = [
+            f"**`{name}`**, {entry['options']['resolution']}², {budget}, {entry['seeds']} seeds.",
+            table(head, rows),
+        ]
+        adam = [m for m, f in methods.items() if f["group"] == "adam"]
+        reach = []
+        for pair, f in summary.items():
+            ours, theirs = pair.split(" / ")
+            if theirs in adam[-2:] and ours in ("meta", "coupled 3 spp", "coupled 3 spp, rcv"):
+                ratios = [f"{f[u]:.1f}×" if f[u] else "never" for u in ("samples_ratio", "seconds_ratio")]
+                reach.append([ours, theirs, *ratios])
+        lines += [
+            "How many times fewer paths, and less time, until the final error of the other is reached (median run):"
+        ]
+        lines += [table(["method", "reaches the end of", "fewer paths", "less time"], reach)]
+        blocks += lines
+    return "\n\n".join(blocks)
+
+
+def ablations(found: dict[str, Any]) -> str:
+    """Meta, Fig. 5."""
+    rows = [
+        [name, f"{f['rate']:g}", f"{f['final'][0]:.3f} ({f['final'][1]:.3f} to {f['final'][2]:.3f})"]
+        for name, f in found["methods"].items()
+    ]
+    sizes = f"`ajar`, {found['resolution']}², {found['seconds']:g} s, {found['seeds']} seeds, each tuned."
+    return f"{sizes}\n\n{table(['form, and what is left out', 'rate', 'final error: median (range)'], rows)}"
+
+
+def estimates(found: dict[str, Any]) -> str:
+    """Meta, Figs 3 and 4."""
+    rows = []
+    for path, entry in found["paths"].items():
+        for method, f in entry["methods"].items():
+            q = f["predicted_over_actual"]
+            error = [f"{f['error'][n] / entry['methods']['plain']['error'][n]:.2f}" for n in (len(f["error"]) // 2, -1)]
+            rows.append([path, method, *error, f"{q[2]:.2f}", f"{q[0]:.2f} to {q[4]:.2f}"])
+    head = [
+        "parameters",
+        "estimate",
+        "RMSE / plain's, half way",
+        "at the end",
+        "predicted / actual deviation",
+        "5 % to 95 % of texels and steps",
+    ]
+    sizes = f"`indirect-room`, {found['resolution']}², 4 paths per pixel and step, {found['steps']} steps, {found['runs']} runs."
+    return f"{sizes}\n\n{table(head, rows)}"
 
 
 INDIRECT_ROOM = """What decides `indirect-room` with L1, from trials on single seeds (error after 12 to 15 s of 128² films):
@@ -161,6 +318,13 @@ the memory each time, so its relative variance settles near δ instead of 1/n. W
 method that minimises the loss recovers the reference's noise too."""
 
 
+META_TOY = ""
+META_DIFFERENCES = ""
+META_ESTIMATES = ""
+META_ABLATIONS = ""
+META_RACES = ""
+
+
 SECTIONS: list[tuple[str, str, Any, str]] = [
     (
         "Cost of a pair, a step, the loop",
@@ -179,12 +343,14 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ),
     ("The main job on scenes made by others", "real_input", real_input, ""),
     ("Steady state of the weights (paper Fig. 3)", "rcv/fig3_weights", weights, ""),
-    (
-        "Bias of the loss and of its derivative (paper Figs 6 and 7)",
-        "rcv/fig6_7_loss_bias",
-        lambda found: lines(found, ("fig7",)) if len(json.dumps(found["fig7"])) < 4000 else "Figures in results.json.",
-        "",
-    ),
+    ("Update before or after use (paper Fig. 4)", "rcv/fig4_order", order, ""),
+    ("Bias of the loss's derivative (paper Fig. 7; Fig. 6 in the picture)", "rcv/fig6_7_loss_bias", loss_bias, ""),
+    ("Path space and primary sample space (paper Fig. 8)", "rcv/fig8_spaces", spaces, ""),
+    ("Meta-estimation: the toy problem (Balint et al., Fig. 2)", "meta/fig2_exponential", toy, META_TOY),
+    ("Meta-estimation: what differences cost, and their variance", "meta/differences", differences, META_DIFFERENCES),
+    ("Meta-estimation: estimates on a fixed path (Figs 3 and 4)", "meta/fig3_4_estimates", estimates, META_ESTIMATES),
+    ("Meta-estimation: ablations (Fig. 5)", "meta/fig5_ablations", ablations, META_ABLATIONS),
+    ("Meta-estimation against Adam (Figs 1, 6 and 9)", "meta/equal_time", races, META_RACES),
 ]
 
 

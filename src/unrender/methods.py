@@ -35,6 +35,7 @@ SCHEDULES: dict[str, type] = {
     "steps": schedules.Steps,
     "warmup": schedules.Warmup,
 }
+SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 _CALL = re.compile(r"\s*([A-Za-z_]+)\s*(?:\(([^()]*)\))?\s*")
 
 
@@ -50,9 +51,7 @@ class AdamOptions(Options):
     learning_rate: PositiveFloat = Field(0.01, description="step size of the parameters that have none of their own")
     beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="Adam's decay of the mean gradient")
     beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="Adam's decay of the mean squared gradient")
-    schedule: str | None = Field(
-        None, description="learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
-    )
+    schedule: str | None = Field(None, description=SCHEDULE_HELP)
 
     def optimizer(self) -> Optimizer:
         """Adam with these options."""
@@ -91,7 +90,7 @@ class MetaCommonOptions(Options):
         description="what takes the steps; adam, which takes the gradients for independent, is for comparison",
     )
     learning_rate: PositiveFloat = Field(0.002, description="step size of the parameters that have none of their own")
-    schedule: str | None = AdamOptions.model_fields["schedule"]
+    schedule: str | None = Field(None, description=SCHEDULE_HELP)
     space: Literal["auto", "path", "primary"] = Field(
         "auto", description="what two steps share: paths, random numbers, or paths where all parameters allow it"
     )

@@ -87,7 +87,7 @@ def _known_to_apt(packages: Sequence[str]) -> str | None:
             ["apt-cache", "policy", *packages],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=15,
             check=False,
             env={**os.environ, "LC_ALL": "C"},
         )

@@ -136,14 +136,32 @@ def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(coupled: bool) -> 
     assert (rows[:, -1].std(0) < 0.7 * rows[:, 0].std(0)).all(), "it should be quieter than its samples"
 
 
+def test_the_noise_that_history_tells_is_the_share_that_the_variance_has() -> None:
+    """Though gradients that remember look alike from step to step."""
+    asked = problem(noise=0.9)
+    told: list[float] = []
+
+    class Listener(ur.Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            variance = sum(v.sum() for v in run.estimate.variance.values())
+            energy = sum((g * g).sum() for g in run.estimate.gradient.values())
+            told.append(min(variance / energy, 1.0))
+
+    found = ur.optimize(asked, ur.MetaEstimator(), ur.optimizers.MetaAdam(1e-4), steps=12, callbacks=[Listener()])
+    assert [record["gradient_noise"] for record in found.history] == pytest.approx(told)
+    assert told[0] == 1.0  # a first sample's variance is its square
+    assert told[-1] < 0.5
+
+
 def test_meta_refuses_what_makes_no_sense() -> None:
-    for bad in (
+    refused: list[dict[str, Any]] = [
         {"proportional_spp": 0},
         {"difference_spp": 1.5},
         {"spp": True},
         {"beta_difference": 1.0},
         {"space": "pixel"},
-    ):
+    ]
+    for bad in refused:
         with pytest.raises(ur.InputError, match=next(iter(bad))):
             ur.MetaEstimator(**bad)
     with pytest.raises(ur.InputError, match="coupled=True"):

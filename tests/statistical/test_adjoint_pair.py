@@ -40,7 +40,9 @@ def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shar
         sides = []
         for side in (1 + STEP, 1 - STEP):
             moved = {**previous, key: previous[key] * side}
-            sides.append(total(renderer.image_pair(current, moved, shot, "path").previous[0], weight_previous))
+            image = renderer.image_pair(current, moved, shot, "path").previous
+            assert image is not None
+            sides.append(total(image[0], weight_previous))
         expected = (sides[0] - sides[1]) / (2 * STEP)
         found = float((np.array(gradient_previous[key]).astype(np.float64) * np.array(previous[key])).sum())
         assert expected != 0

@@ -283,6 +283,7 @@ def test_the_exponential_has_the_mean_that_it_shows():
 def test_the_room_of_ajar_is_lit_through_the_gap_alone():
     """No emitter can be sampled from most of what the camera sees, and yet it is not dark."""
     problem = ur.gallery.problem("ajar", resolution=32, texture_resolution=8, reference_spp=256)
+    assert isinstance(problem.renderer, MitsubaRenderer)
     renderer = MitsubaRenderer(problem.renderer.pair.description, max_depth=2)  # direct light alone
     truth = {key: renderer.array(value) for key, value in problem.truth.items()}
     renderer.select(list(truth), None)

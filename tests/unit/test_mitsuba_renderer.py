@@ -150,6 +150,32 @@ def test_moving_geometry_runs_in_primary_space() -> None:
     assert np.abs(np.array(gradient[key])).max() > 0
 
 
+def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
+    """In primary space: the previous scene's adjoint on the same random numbers, to the rounding of sums."""
+    key = "small-box.vertex_positions"
+    renderer = MitsubaRenderer(box(), 3)
+    renderer.select([key], "primary")
+    current = renderer.values([key])
+    previous = {key: current[key] + 0.02}
+    weights = renderer.array(np.random.default_rng(0).random((2, 16, 16, 3)))
+    pair = renderer.image_pair(current, previous, Shot(0, 64, 1, groups=2), "primary")
+    both = renderer.adjoint_pair(current, previous, pair.paths, weights, weights)
+    for state, found in zip((current, previous), both, strict=True):
+        alone = renderer.adjoint(state, renderer.image(state, Shot(0, 64, 1, groups=2)).paths, weights)
+        a, b = np.array(found[key]), np.array(alone[key])
+        assert np.abs(a - b).max() < 1e-4 * np.abs(b).max()
+    assert np.abs(np.array(both[0][key]) - np.array(both[1][key])).max() > 0
+
+
+def test_meta_estimation_of_moving_geometry_says_that_it_is_in_primary_space() -> None:
+    asked = problem(box(), "small-box.vertex_positions")
+    found = ur.optimize(asked, ur.MetaEstimator(), ur.optimizers.MetaAdam(1e-3), steps=3)
+    assert found.info["space"] == {"small-box.vertex_positions": "primary"}
+    assert found.skipped == 0
+    with pytest.raises(ur.InputError, match=r'use .*space="primary"'):
+        ur.optimize(asked, ur.MetaEstimator(space="path"), ur.optimizers.MetaAdam(1e-3), steps=1)
+
+
 def test_chosen_pixels_are_the_pixels_of_the_film() -> None:
     renderer = MitsubaRenderer(box(), 3)
     renderer.select([WALL], None)

@@ -99,6 +99,7 @@ class PathPair:
             mis = mis_weight(pdf_last, scene.pdf_emitter_direction(si_last, ds, ~delta_last))
             with dr.resume_grad(when=not primal):
                 Le = β * mis * ds.emitter.eval(si, active)
+            Leₚ = Ldₚ = mi.Spectrum(0)
             if dr.hint(pair, mode="scalar"):
                 siₚ = mi.SurfaceInteraction3f(si)
                 siₚ.shape = remap(mi.ShapePtr, tables["shape"], si.shape)

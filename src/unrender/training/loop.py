@@ -137,7 +137,7 @@ def optimize(
                 "seconds": run.clock,
                 "loss": estimate.loss,
                 "samples": samples,
-                "gradient_noise": noise.update(estimate.gradient) if finite else None,
+                "gradient_noise": noise.update(estimate.gradient, estimate.variance) if finite else None,
             }
             if problem.truth and (run.stopped or run.clock >= next_error):
                 record["parameter_error"] = problem.parameter_error(run.parameters)

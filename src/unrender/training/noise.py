@@ -1,4 +1,4 @@
-"""How much of the gradient is noise, seen from the stream of gradients alone."""
+"""How much of the gradient is noise: as its estimator says, or seen from the stream of gradients alone."""
 
 from __future__ import annotations
 
@@ -22,8 +22,19 @@ class GradientNoise:
     energy: float = 0.0
     weight: float = 0.0
 
-    def update(self, gradient: Tree) -> float | None:
-        """Take one gradient in. Returns the share in [0, 1], None until there are ten."""
+    def update(self, gradient: Tree, variance: Tree | None = None) -> float | None:
+        """Take one gradient in. Returns the share in [0, 1], None until there are ten.
+
+        With the variance that an estimator gives, it is the variance's share of ‖g‖², at once: those that remember resemble one another,
+        and their stream would look free of noise.
+        """
+        if variance is not None:
+            sums = [
+                sum(arrays.total(x) for x in tree.values()) for tree in (variance, trees.map(lambda g: g * g, gradient))
+            ]
+            arrays.evaluate(sums)
+            noise, energy = (arrays.number(x) for x in sums)
+            return min(noise / energy, 1.0) if energy > 0 else None
         if self.mean is None or trees.shapes(self.mean) != trees.shapes(gradient):
             self.mean, self.energy, self.weight = trees.zeros_like(gradient), 0.0, 0.0
         self.mean = trees.map(lambda m, g: m * _DECAY + g * (1 - _DECAY), self.mean, gradient)
