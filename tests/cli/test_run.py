@@ -48,6 +48,24 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     assert f"{KEY} error 0.3109 before, 0.0" in " ".join(answer.out.split())
 
 
+@pytest.mark.parametrize("method", ["meta", "coupled"])
+def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsuba_variant: str, method: str):
+    words = ["run", "problem.toml", "--method", method, "--steps", 120, "--out", "result", "--variant", mitsuba_variant]
+    answer = unrender(*words, *QUICK, "--set", "learning_rate=0.004")
+    assert answer.status == 0, answer.error
+    with np.load(problem.parent / "result" / "parameters.npz") as found:
+        np.testing.assert_allclose(found[KEY], [0.6, 0.5, 0.4], atol=0.02)
+    assert unrender("report", "result").status == 0
+
+
+def test_run_of_the_gallery_s_problem_without_a_renderer(unrender, problem: Path, mitsuba_variant: str):
+    del problem
+    words = ["run", "exponential", "--method", "coupled", "--set", "spp=32", "--steps", 150, "--out", "toy"]
+    answer = unrender(*words, "--variant", mitsuba_variant, *QUICK)
+    assert answer.status == 0, answer.error
+    assert "rate error 1 before, 0.0" in " ".join(answer.out.split())
+
+
 def test_run_names_a_new_folder_each_time(unrender, problem: Path, mitsuba_variant: str):
     for _ in range(2):
         words = ["run", "problem.toml", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant, *QUICK]

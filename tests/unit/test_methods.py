@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from unrender.errors import InputError
+from unrender.gradients.meta import MetaEstimator
 from unrender.gradients.path import PathGradient
 from unrender.images import Plain, RecursiveControlVariate
 from unrender.methods import METHODS, method, parse_schedule
-from unrender.optimizers import Adam, schedules
+from unrender.optimizers import Adam, MetaAdam, schedules
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -36,6 +37,19 @@ def test_rcv_takes_its_options():
     estimator, optimizer = method("rcv").start(options)
     assert estimator == PathGradient(RecursiveControlVariate("primary", 0.5, 0.75), spp=3, adjoint_spp=1)
     assert optimizer == Adam(beta_1=0.8)
+
+
+def test_meta_and_coupled_take_their_options():
+    estimator, optimizer = method("meta").start(
+        {"proportional_spp": "4", "difference_spp": 2, "beta_difference": "0.5", "schedule": "cosine(10)"}
+    )
+    assert estimator == MetaEstimator(4, 2, beta_difference=0.5)
+    assert optimizer == MetaAdam(0.002, schedule=schedules.Cosine(10))
+    estimator, optimizer = method("coupled").start(
+        {"spp": 6, "image": "rcv", "space": "primary", "optimizer": "adam", "learning_rate": 0.1}
+    )
+    assert estimator == MetaEstimator(coupled=True, spp=6, image=RecursiveControlVariate("primary"), space="primary")
+    assert optimizer == Adam(0.1)
 
 
 def test_none_is_none():

@@ -11,7 +11,7 @@ import pytest
 from unrender import arrays
 from unrender.errors import InputError
 from unrender.gradients.estimate import Estimate
-from unrender.optimizers import SGD, Adam
+from unrender.optimizers import SGD, Adam, MetaAdam
 from unrender.optimizers.schedules import Constant, Cosine, Exponential, Steps, Warmup
 
 OPTIMIZERS = [SGD(0.1), SGD(0.1, momentum=0.9), Adam(0.1), Adam(0.1, beta_1=0.5, beta_2=0.9, epsilon=0.01)]
@@ -177,3 +177,61 @@ def test_bad_arguments_are_named(make, message):
     with pytest.raises(InputError) as caught:
         make()
     assert str(caught.value) == message
+
+
+# ---------------------------------------------------------------------------------------------------- MetaAdam
+
+
+def meta_take(optimizer, gradients, variances, learning_rates=None):
+    state, steps = optimizer.init(gradients[0], learning_rates), []
+    for gradient, variance in zip(gradients, variances, strict=True):
+        step, state = optimizer.update(Estimate(0.0, gradient, variance), state, gradient)
+        steps.append(step)
+    return steps
+
+
+def test_meta_adam_divides_by_the_deviation_it_is_given(gradients):
+    variances = [{key: np.square(g) / (n + 1) for key, g in tree.items()} for n, tree in enumerate(gradients)]
+    optimizer = MetaAdam(0.1, epsilon=1e-12, schedule=Steps(10, 0.5))
+    for n, step in enumerate(meta_take(optimizer, gradients, variances, {"b": 0.3})):
+        for key, rate in (("a", 0.1), ("b", 0.3)):
+            expected = -rate * 0.5 ** (n // 10) * gradients[n][key] / np.sqrt(variances[n][key] + 1e-12)
+            np.testing.assert_allclose(step[key], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_meta_adams_first_step_is_the_learning_rate_whatever_the_scale(scale):
+    """A first meta-estimate's variance is its square; an element that knows nothing stays where it is."""
+    gradient = {"a": scale * np.array([3.0, -0.1, 0.0])}
+    (step,) = meta_take(MetaAdam(0.25, epsilon=1e-30), [gradient], [{"a": gradient["a"] ** 2}])
+    np.testing.assert_allclose(step["a"], [-0.25, 0.25, 0.0], rtol=1e-9)
+
+
+def test_meta_adams_longest_step():
+    gradient, variance = {"a": np.array([3.0, -2.0, 0.1])}, {"a": np.array([1e-4, 1.0, 1.0])}
+    (step,) = meta_take(MetaAdam(0.1, longest=5.0), [gradient], [variance])
+    np.testing.assert_allclose(step["a"], [-0.5, 0.2, -0.01])
+
+
+def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
+    variances = [{key: np.square(g) + 0.1 for key, g in tree.items()} for tree in gradients]
+    optimizer = MetaAdam(0.1, schedule=Exponential(7))
+    expected = meta_take(optimizer, gradients, variances)
+    device = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in gradients]
+    spread = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in variances]
+    state = optimizer.init(device[0])
+    for n, (gradient, variance) in enumerate(zip(device, spread, strict=True)):
+        with kernels.recorded() as new:
+            step, state = optimizer.update(Estimate(0.0, gradient, variance), state, gradient)
+            dr.eval(step)
+        assert n < 2 or not any(new)
+        np.testing.assert_allclose(np.array(step["a"]), expected[n]["a"], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [({"learning_rate": 0}, "learning_rate"), ({"epsilon": 0.0}, "epsilon"), ({"longest": -1}, "longest")],
+)
+def test_meta_adam_refuses(options, field):
+    with pytest.raises(InputError, match=f"MetaAdam: {field}"):
+        MetaAdam(**options)

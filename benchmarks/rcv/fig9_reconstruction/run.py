@@ -116,7 +116,7 @@ def plot(results: dict[str, Any]) -> None:
     for axis, entry in zip(axes.flat, entries, strict=False):
         for method, found in entry["methods"].items():
             grid = np.linspace(0, entry["seconds"], 100)
-            curves = np.stack([np.interp(grid, *np.array(run).T) for run in found["runs"]])
+            curves = np.stack([np.interp(grid, *np.array([(0.0, 1.0), *run]).T) for run in found["runs"]])
             label = f"{method}, {found['spp']} spp, rate {found['rate']:g}"
             axis.plot(grid, np.median(curves, 0), color=colours[method], label=label)
             axis.fill_between(grid, curves.min(0), curves.max(0), color=colours[method], alpha=0.2, lw=0)
