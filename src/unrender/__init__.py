@@ -19,7 +19,7 @@ from unrender.errors import InputError, UnrenderError, VariantError
 from unrender.variant import use
 
 if TYPE_CHECKING:
-    from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, statistics
+    from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, smoothed, statistics
     from unrender.gradients.estimate import Estimate
     from unrender.gradients.meta import MetaEstimator
     from unrender.gradients.path import PathGradient
@@ -32,7 +32,17 @@ if TYPE_CHECKING:
     from unrender.training.loop import estimate, optimize
     from unrender.training.result import Result
 
-_MODULES = ("gallery", "images", "losses", "optimizers", "pixels", "preconditioners", "report", "statistics")
+_MODULES = (
+    "gallery",
+    "images",
+    "losses",
+    "optimizers",
+    "pixels",
+    "preconditioners",
+    "report",
+    "smoothed",
+    "statistics",
+)
 _HOMES = {
     "Callback": "training.callbacks",
     "Estimate": "gradients.estimate",
@@ -76,6 +86,7 @@ __all__ = [
     "render",
     "render_pair",
     "report",
+    "smoothed",
     "statistics",
     "use",
 ]

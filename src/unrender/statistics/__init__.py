@@ -1,6 +1,6 @@
 """Formulas on arrays by operators alone: the same code runs on NumPy and on Dr.Jit."""
 
-from unrender.statistics import meta, recursion, welford
+from unrender.statistics import gaussian, meta, recursion, welford
 from unrender.statistics.control_weight import control_variate_variance, control_weight
 
-__all__ = ["control_variate_variance", "control_weight", "meta", "recursion", "welford"]
+__all__ = ["control_variate_variance", "control_weight", "gaussian", "meta", "recursion", "welford"]

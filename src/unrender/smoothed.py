@@ -1,0 +1,257 @@
+"""Derivatives of any function that can be evaluated, smoothed by a Gaussian: gradients, Hessians, Hessian-vector products.
+
+    value, error = ur.smoothed.gradient(f, theta, sigma=0.1, samples=256)
+
+`f` takes a batch of points (B, n) to values (B,) and is never differentiated: it may have plateaus, jumps, noise. What is returned is a
+derivative of its convolution S f with a Gaussian of standard deviation σ (a number, or one per dimension), estimated without bias,
+and its standard error. See `statistics/gaussian.py` for the kernels and how they are sampled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy import special
+from scipy.stats import qmc
+
+from unrender import checks
+from unrender.errors import InputError
+from unrender.statistics import gaussian
+
+Function = Callable[[np.ndarray], np.ndarray]
+"""(B, n) to (B,)."""
+
+_REPLICATES = 8
+"""Independent scramblings of a low-discrepancy sequence: what its standard error is measured from."""
+
+
+def gradient(
+    f: Function,
+    theta: Any,
+    sigma: Any,
+    samples: int,
+    seed: int = 0,
+    aggregate: bool = True,
+    antithetic: bool = True,
+    baseline: bool = True,
+    low_discrepancy: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """∇ S f(θ) and its standard error, (n,) each.
+
+    Args:
+        f: (B, n) to (B,).
+        theta: (n,).
+        sigma: standard deviation of the smoothing, > 0: a number, or (n,).
+        samples: how often f is evaluated, for all elements together with `aggregate`, for each of them without; at least 4, and at least
+            16 with `low_discrepancy`.
+        seed: of the draws.
+        aggregate: draw from the mixture over all elements, each draw serving all; otherwise from each element's own kernel.
+        antithetic: draw in pairs z, −z: exact for functions that are even or linear where they should be.
+        baseline: subtract f(θ), at the cost of one evaluation, where the draws are not antithetic (there it cancels).
+        low_discrepancy: draw from scrambled Sobol sequences; the standard error then is that of 8 scramblings.
+
+    Raises:
+        InputError: σ not positive, shapes that do not fit, values that are not finite.
+    """
+    job = _Job("gradient", f, theta, sigma, samples, seed, antithetic, low_discrepancy)
+    offset = job.value_at_theta() if baseline and not antithetic else 0.0
+    if aggregate:
+        z = job.draw(gaussian.gradient_mixture)
+        weight = gaussian.gradient_kernel(z, job.sigma) / gaussian.gradient_ratio(z)[:, None]
+        return job.summarise(job.odd(z, offset)[:, None] * weight)
+    values, errors = np.empty(job.n), np.empty(job.n)
+    for i in range(job.n):
+        z = job.draw(lambda _, u, normal, i=i: _with(normal, i, gaussian.gradient_sample(u[:, i])), stream=i)
+        weight = -np.sign(z[:, i]) * gaussian.GRADIENT_MASS / job.sigma[i]
+        values[i], errors[i] = job.summarise(job.odd(z, offset) * weight)
+    return values, errors
+
+
+def hessian(
+    f: Function,
+    theta: Any,
+    sigma: Any,
+    samples: int,
+    seed: int = 0,
+    aggregate: bool = True,
+    antithetic: bool = True,
+    baseline: bool = True,
+    low_discrepancy: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """∇² S f(θ) and its standard error, (n, n) each, symmetric.
+
+    The arguments are those of `gradient`. The kernels are even, so `baseline` helps antithetic draws as well: without it the value of f
+    itself is noise.
+    """
+    job = _Job("hessian", f, theta, sigma, samples, seed, antithetic, low_discrepancy)
+    offset = job.value_at_theta() if baseline else 0.0
+    if aggregate:
+        z = job.draw(gaussian.hessian_mixture)
+        weight = gaussian.hessian_kernel(z, job.sigma) / gaussian.hessian_ratio(z)[:, None, None]
+        return job.summarise(job.even(z, offset)[:, None, None] * weight)
+    values, errors = np.empty((job.n, job.n)), np.empty((job.n, job.n))
+    for i in range(job.n):
+        for j in range(i, job.n):
+            if i == j:
+                z = job.draw(
+                    lambda _, u, normal, i=i: _with(normal, i, gaussian.curvature_sample(u[:, i])), stream=i * job.n + j
+                )
+                weight = np.sign(z[:, i] ** 2 - 1) * gaussian.CURVATURE_MASS / job.sigma[i] ** 2
+            else:
+                z = job.draw(
+                    lambda _, u, normal, i=i, j=j: _with(
+                        _with(normal, i, gaussian.gradient_sample(u[:, i])), j, gaussian.gradient_sample(u[:, j])
+                    ),
+                    stream=i * job.n + j,
+                )
+                weight = np.sign(z[:, i] * z[:, j]) * gaussian.GRADIENT_MASS**2 / (job.sigma[i] * job.sigma[j])
+            values[i, j], errors[i, j] = job.summarise(job.even(z, offset) * weight)
+            values[j, i], errors[j, i] = values[i, j], errors[i, j]
+    return values, errors
+
+
+def hvp(
+    f: Function,
+    theta: Any,
+    v: Any,
+    sigma: Any,
+    samples: int,
+    seed: int = 0,
+    aggregate: bool = True,
+    antithetic: bool = True,
+    low_discrepancy: bool = False,
+    epsilon: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """∇² S f(θ) v and its standard error, (n,) each, without a Hessian: the central difference of two gradients (Eq. 23).
+
+    Both gradients take the same draws (common random numbers), so that what f has in common at θ ± ε v cancels. Biased by the
+    difference: its error is ε² / 6 times the fourth derivative of S f, of the order of (ε |v| / σ)² of the value.
+
+    Args:
+        v: (n,), the direction; its length matters.
+        epsilon: ε; None for the step that moves θ by a tenth of σ along v.
+
+    The other arguments are those of `gradient`; `samples` counts evaluations of both gradients.
+    """
+    job = _Job("hvp", f, theta, sigma, samples, seed, antithetic, low_discrepancy, sides=2)
+    direction = job.vector("v", v)
+    length = float(np.sqrt(np.sum((direction / job.sigma) ** 2)))
+    if length == 0.0:
+        return np.zeros(job.n), np.zeros(job.n)
+    step = 0.1 / length if epsilon is None else checks.number("smoothed.hvp", "epsilon", epsilon, above=0.0)
+
+    def difference(z: np.ndarray) -> np.ndarray:
+        ahead, behind = (job.odd(z, 0.0, job.theta + side * step * direction) for side in (1, -1))
+        return (ahead - behind) / (2 * step)
+
+    if aggregate:
+        z = job.draw(gaussian.gradient_mixture)
+        weight = gaussian.gradient_kernel(z, job.sigma) / gaussian.gradient_ratio(z)[:, None]
+        return job.summarise(difference(z)[:, None] * weight)
+    values, errors = np.empty(job.n), np.empty(job.n)
+    for i in range(job.n):
+        z = job.draw(lambda _, u, normal, i=i: _with(normal, i, gaussian.gradient_sample(u[:, i])), stream=i)
+        weight = -np.sign(z[:, i]) * gaussian.GRADIENT_MASS / job.sigma[i]
+        values[i], errors[i] = job.summarise(difference(z) * weight)
+    return values, errors
+
+
+def _with(normal: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
+    z = normal.copy()
+    z[:, column] = values
+    return z
+
+
+class _Job:
+    """One call: its checked arguments, its draws, its evaluations of f, its statistics."""
+
+    def __init__(
+        self,
+        name: str,
+        f: Function,
+        theta: Any,
+        sigma: Any,
+        samples: int,
+        seed: int,
+        antithetic: bool,
+        low_discrepancy: bool,
+        sides: int = 1,
+    ):
+        self.owner, self.f, self.seed = f"smoothed.{name}", f, seed
+        self.theta = np.array(theta, np.float64)
+        if self.theta.ndim != 1 or self.theta.size == 0 or not np.isfinite(self.theta).all():
+            raise InputError(f"{self.owner}: theta must be a finite vector (n,), got shape {self.theta.shape}")
+        self.n = self.theta.size
+        self.sigma = self.vector("sigma", sigma)
+        if not (self.sigma > 0).all():
+            raise InputError(f"{self.owner}: sigma must be above 0, got {sigma!r}")
+        self.antithetic, self.low_discrepancy = antithetic, low_discrepancy
+        least = 16 if low_discrepancy else 4
+        per_draw = (2 if antithetic else 1) * sides
+        self.draws = checks.whole(self.owner, "samples", samples, at_least=least * sides) // per_draw
+
+    def vector(self, name: str, given: Any) -> np.ndarray:
+        """A finite vector (n,) from a number or a vector."""
+        found = np.array(given, np.float64)
+        if found.shape not in ((), (self.n,)) or not np.isfinite(found).all():
+            raise InputError(f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {given!r}")
+        return np.broadcast_to(found, (self.n,)).copy()
+
+    def draw(self, sampler: Callable[..., np.ndarray], stream: int = 0) -> np.ndarray:
+        """(draws, n): `sampler` of uniform choices (B,), uniform numbers (B, n) and standard normals (B, n)."""
+        if not self.low_discrepancy:
+            rng = np.random.default_rng([self.seed, stream])
+            count = self.draws
+            return sampler(
+                rng.random(count), _inside(rng.random((count, self.n))), rng.standard_normal((count, self.n))
+            )
+        parts = []
+        for replicate in range(_REPLICATES):
+            rng = np.random.default_rng([self.seed, stream, replicate])
+            points = qmc.Sobol(self.n + 1, scramble=True, rng=rng).random(max(self.draws // _REPLICATES, 1))
+            u = _inside(points[:, 1:])
+            parts.append(sampler(points[:, 0], u, special.ndtri(u)))
+        return np.concatenate(parts)
+
+    def odd(self, z: np.ndarray, offset: float, theta: np.ndarray | None = None) -> np.ndarray:
+        """f(θ − σ z), or with antithetic draws half its difference to f(θ + σ z): what an odd kernel weighs."""
+        centre = self.theta if theta is None else theta
+        if not self.antithetic:
+            return self.evaluate(centre - self.sigma * z) - offset
+        both = self.evaluate(np.concatenate([centre - self.sigma * z, centre + self.sigma * z]))
+        return 0.5 * (both[: len(z)] - both[len(z) :])
+
+    def even(self, z: np.ndarray, offset: float) -> np.ndarray:
+        """f(θ − σ z), or with antithetic draws its mean with f(θ + σ z): what an even kernel weighs."""
+        if not self.antithetic:
+            return self.evaluate(self.theta - self.sigma * z) - offset
+        both = self.evaluate(np.concatenate([self.theta - self.sigma * z, self.theta + self.sigma * z]))
+        return 0.5 * (both[: len(z)] + both[len(z) :]) - offset
+
+    def value_at_theta(self) -> float:
+        return float(self.evaluate(self.theta[None])[0])
+
+    def evaluate(self, points: np.ndarray) -> np.ndarray:
+        """f at points (B, n), checked."""
+        values = np.asarray(self.f(points), np.float64)
+        if values.shape != (len(points),):
+            raise InputError(
+                f"{self.owner}: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
+            )
+        if not np.isfinite(values).all():
+            worst = points[~np.isfinite(values)][0]
+            raise InputError(f"{self.owner}: f is not finite at {np.array2string(worst, threshold=8, precision=4)}")
+        return values
+
+    def summarise(self, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean over draws and its standard error; with low discrepancy, from the means of the scramblings."""
+        if self.low_discrepancy:
+            draws = draws.reshape(_REPLICATES, -1, *draws.shape[1:]).mean(axis=1)
+        return draws.mean(axis=0), draws.std(axis=0, ddof=1) / np.sqrt(len(draws))
+
+
+def _inside(u: np.ndarray) -> np.ndarray:
+    """Uniform numbers kept off 0 and 1."""
+    return np.clip(u, 2.0**-53, 1 - 2.0**-53)
