@@ -1,4 +1,4 @@
-"""Equal-time races between methods: each tuned over a grid on a seed of its own, its best run on several seeds."""
+"""Races between methods at equal time or steps: each tuned over a grid on seeds of its own, its best run on several others."""
 
 from __future__ import annotations
 
@@ -55,12 +55,15 @@ def descend(
     ]
 
 
-def tune(problem: ur.Problem, entrant: Entrant, **budget: Any) -> tuple[float, list[dict[str, float]]]:
-    """The rate whose final error is least, and all that were tried. A best rate at an end of the grid extends it, thrice at most."""
+def tune(
+    problem: ur.Problem, entrant: Entrant, tuning_seeds: int, **budget: Any
+) -> tuple[float, list[dict[str, float]]]:
+    """The rate whose median final error is least, and all that were tried. A best rate at an end of the grid extends it, thrice at most."""
     tried: dict[float, float] = {}
 
     def attempt(rate: float) -> None:
-        error = descend(problem, entrant, rate, TUNING_SEED, **budget)[-1][2]
+        seeds = range(TUNING_SEED, TUNING_SEED + tuning_seeds)
+        error = float(np.median([descend(problem, entrant, rate, seed, **budget)[-1][2] for seed in seeds]))
         tried[rate] = error if math.isfinite(error) else float("inf")
         print(f"{problem.name} {entrant.name} rate {rate:g}: {error:.4f}", flush=True)
 
@@ -76,11 +79,13 @@ def tune(problem: ur.Problem, entrant: Entrant, **budget: Any) -> tuple[float, l
     return best, [{"rate": rate, "error": error} for rate, error in sorted(tried.items())]
 
 
-def race(problem: ur.Problem, entrants: list[Entrant], seeds: int, **budget: Any) -> dict[str, Any]:
+def race(
+    problem: ur.Problem, entrants: list[Entrant], seeds: int, tuning_seeds: int = 1, **budget: Any
+) -> dict[str, Any]:
     """Every entrant, tuned, over seeds 0, 1, ...: {name: {"group", "rate", "tried", "runs", "final"}}."""
     found: dict[str, Any] = {}
     for entrant in entrants:
-        rate, tried = tune(problem, entrant, **budget)
+        rate, tried = tune(problem, entrant, tuning_seeds, **budget)
         runs = [descend(problem, entrant, rate, seed, **budget) for seed in range(seeds)]
         final = [run[-1][2] for run in runs]
         found[entrant.name] = {
