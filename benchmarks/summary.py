@@ -229,7 +229,8 @@ def differences(found: dict[str, Any]) -> str:
     cost = found["cost"]
     keys = list(next(iter(cost.values())))
     second = table(["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys])
-    return f"{sizes}\n\n{first}\n\nWhole steps at 1 to 3 views, and their parts for one view, at the gallery's film sizes:\n\n{second}"
+    parts = f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {found['cost_resolution']}²:"
+    return f"{sizes}\n\n{first}\n\n{parts}\n\n{second}"
 
 
 def races(found: dict[str, Any]) -> str:

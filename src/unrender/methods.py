@@ -122,7 +122,9 @@ class CoupledOptions(MetaCommonOptions):
     """Options of `coupled`."""
 
     spp: PositiveInt = Field(3, description="samples per pixel, each for the gradient and for its change")
-    image: Literal["plain", "rcv"] = Field("plain", description="what the loss sees: a fresh rendering, or rcv's")
+    image: Literal["plain", "rcv"] = Field(
+        "plain", description="what the loss sees: a fresh rendering, or rcv's (in path space, unless space is primary)"
+    )
 
 
 @dataclass(frozen=True)

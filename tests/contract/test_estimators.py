@@ -120,7 +120,7 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
 def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(coupled: bool) -> None:
     """400 runs, alpha bounded, statistics from independent samples: the mean gradient is the true one at each of ten steps."""
     asked = problem(noise=0.9)
-    estimator = ur.MetaEstimator(coupled=coupled, spp=2, statistics="independent")
+    estimator = ur.MetaEstimator(coupled=coupled, spp=2 if coupled else None, statistics="independent")
     path = [{k: v - 0.02 * step for k, v in asked.initial().items()} for step in range(10)]
     exact = [np.concatenate([g.ravel() for g in exact_gradient(asked, p).values()]) for p in path]
     rows = np.zeros((400, len(path), exact[0].size))
@@ -166,6 +166,12 @@ def test_meta_refuses_what_makes_no_sense() -> None:
             ur.MetaEstimator(**bad)
     with pytest.raises(ur.InputError, match="coupled=True"):
         ur.MetaEstimator(image=CV())
+    with pytest.raises(ur.InputError, match="spp is for the coupled form"):
+        ur.MetaEstimator(spp=8)
+    with pytest.raises(ur.InputError, match="difference_spp is for the independent form"):
+        ur.MetaEstimator(coupled=True, difference_spp=1)
+    with pytest.raises(ur.InputError, match="plain images"):
+        ur.MetaEstimator(coupled=True, image=CV(), statistics="independent")
     with pytest.raises(ur.InputError, match="space"):
         ur.MetaEstimator(coupled=True, image=CV(space="primary"), space="path")
     with pytest.raises(ur.InputError, match=r'"variance".*does not provide'):
@@ -255,6 +261,26 @@ def test_a_gradient_that_is_not_finite_is_neither_applied_nor_remembered() -> No
     found = ur.optimize(asked, Faulty(), OPTIMIZERS["Adam"](), steps=40)
     assert found.skipped == 10
     assert all(np.isfinite(value).all() for value in found.parameters.values())
+
+
+def test_a_difference_that_is_not_finite_is_neither_applied_nor_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One element of one previous state's gradient: the next gradient is finite, its variance would not be."""
+    asked = problem()
+    sound = AnalyticRenderer.adjoint_pair
+    calls = itertools.count()
+
+    def faulty(self: Any, *arguments: Any) -> Any:
+        current, previous = sound(self, *arguments)
+        if next(calls) % 7 == 5:
+            previous["colour"][0] = np.nan
+        return current, previous
+
+    monkeypatch.setattr(AnalyticRenderer, "adjoint_pair", faulty)
+    for estimator in (ur.MetaEstimator(), ur.MetaEstimator(coupled=True)):
+        found = ur.optimize(asked, estimator, ur.optimizers.MetaAdam(0.004), steps=60)
+        assert 5 < found.skipped < 12
+        assert all(np.isfinite(value).all() for value in found.parameters.values())
+        assert max(found.history[-1]["parameter_error"].values()) < 0.3
 
 
 def test_a_run_without_a_finite_gradient_is_given_up() -> None:

@@ -266,6 +266,18 @@ def recovered():
     return recover
 
 
+def test_the_spiral_is_five_numbers_by_default():
+    problem = ur.gallery.problem("spiral", resolution=8, reference_spp=1)
+    assert {key: value.shape for key, value in problem.truth.items()} == {
+        "spiral.bsdf.brdf_0.base_color.value": (3,),
+        "spiral.bsdf.brdf_0.metallic.value": (),
+        "spiral.bsdf.brdf_0.roughness.value": (),
+    }
+    found = ur.optimize(problem, ur.MetaEstimator(coupled=True), ur.optimizers.MetaAdam(), steps=3)
+    assert not found.warnings
+    assert all(np.any(value != found.initial[key]) for key, value in found.parameters.items())
+
+
 def test_the_exponential_has_the_mean_that_it_shows():
     problem = ur.gallery.problem("exponential")
     renderer = problem.renderer

@@ -80,6 +80,23 @@ def test_an_element_that_was_only_zero_counts_its_zeros(form: str) -> None:
     assert variance == pytest.approx(mean_square / 10)
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_an_element_that_only_others_saw_is_not_thought_exact(form: str) -> None:
+    """Summed samples that are not zero while the observed ones are; and a difference that comes before any sample."""
+    zero, state = np.zeros(1), meta.init(np.zeros(1))
+    for i in range(20):
+        F = np.array([2.0 if i >= 10 else 0.0])
+        gradient, variance, _, state = FORMS[form](state, F, zero, 1.0, observed=(zero, zero))
+        assert variance >= gradient**2 / (i + 1) * (1 - 1e-12)
+    state = meta.init(np.zeros(1))
+    for i in range(60):
+        late = np.array([1.0 if i == 20 else 0.0])
+        second = late if form == "independent" else -late
+        gradient, variance, _, state = FORMS[form](state, zero, second, 0.1)
+        assert variance >= gradient**2 / (i + 1) * (1 - 1e-12)
+    assert gradient != 0 or form == "coupled"
+
+
 def test_a_noisy_difference_forgets_the_past() -> None:
     quiet, noisy = meta.init(np.zeros(1)), meta.init(np.zeros(1))
     rng = np.random.default_rng(2)
@@ -112,7 +129,7 @@ def test_longer_steps_are_foreseen_by_decoupling() -> None:
         for i in range(40):
             step = 0.1 if i < 39 else 1.0
             F = rng.normal(size=1000)
-            *_, alpha, state = meta.update(state, F, rng.normal(size=1000) * step * 0 + step, step, decouple=decouple)
+            *_, alpha, state = meta.update(state, F, np.full(1000, step), step, decouple=decouple)
         alphas[decouple] = alpha.mean()
     assert alphas[True] < alphas[False] - 0.1
 

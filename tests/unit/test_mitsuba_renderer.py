@@ -93,8 +93,22 @@ def test_a_ready_made_object_cannot_be_in_two_states() -> None:
     assert ur.optimize(problem(scene, key), estimator, ur.optimizers.Adam(), steps=2).steps == 2
 
 
-@pytest.mark.parametrize("image", [ur.images.Plain(), ur.images.RecursiveControlVariate()], ids=["plain", "rcv"])
-def test_no_kernel_is_compiled_after_warm_up(image: Any) -> None:
+CV = ur.images.RecursiveControlVariate
+STEADY: dict[str, tuple[Any, int]] = {
+    # estimator, kernels that the steps after the tenth may still add: Dr.Jit orders the inputs of some in several ways
+    "plain": (ur.PathGradient(ur.images.Plain(), spp=2), 0),
+    "rcv": (ur.PathGradient(CV(), spp=2), 0),
+    "meta": (ur.MetaEstimator(), 4),
+    "meta, primary space": (ur.MetaEstimator(space="primary"), 4),
+    "coupled": (ur.MetaEstimator(coupled=True), 4),
+    "coupled, rcv": (ur.MetaEstimator(coupled=True, image=CV()), 4),
+}
+
+
+@pytest.mark.parametrize("name", STEADY)
+def test_no_kernel_is_compiled_after_warm_up(name: str) -> None:
+    estimator, spare = STEADY[name]
+    optimizer = ur.optimizers.MetaAdam() if isinstance(estimator, ur.MetaEstimator) else ur.optimizers.Adam()
     asked = problem(box(), initial=0.5)
     launched: list[int] = []
     new: list[int] = []
@@ -116,9 +130,9 @@ def test_no_kernel_is_compiled_after_warm_up(image: Any) -> None:
         def on_end(self, run: Any, result: ur.Result) -> None:
             self.recording.__exit__(None, None, None)
 
-    ur.optimize(asked, ur.PathGradient(image, spp=2), ur.optimizers.Adam(), steps=16, callbacks=[Count()])
+    ur.optimize(asked, estimator, optimizer, steps=40 if spare else 16, callbacks=[Count()])
     assert min(launched) > 0
-    assert sum(new[6:]) == 0, new
+    assert sum(new[6 if not spare else 10 :]) <= spare, new
 
 
 def test_a_kernel_that_is_compiled_each_step_is_noticed() -> None:

@@ -4,7 +4,7 @@
 
 Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose length is
 varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with its log-log slope.
-Cost: a step of plain Adam at 4 spp, of the paper's meta-estimation and of the coupled form, and the parts of the meta step.
+Cost: an estimate by plain gradients at 4 spp, of the paper's meta-estimation and of the coupled form, and the parts of the meta step.
 """
 
 from __future__ import annotations
@@ -140,7 +140,14 @@ def main() -> None:
         cost = {n: costs(ur.gallery.problem(n, loss=loss, **large)) for n in PROBLEMS}
         write(
             HERE,
-            {"resolution": asked.resolution, "spp": asked.spp, "runs": asked.runs, "variance": variance, "cost": cost},
+            {
+                "resolution": asked.resolution,
+                "cost_resolution": asked.cost_resolution,
+                "spp": asked.spp,
+                "runs": asked.runs,
+                "variance": variance,
+                "cost": cost,
+            },
         )
     plot(read(HERE))
 

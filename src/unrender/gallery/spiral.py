@@ -1,7 +1,7 @@
 """`spiral`: a glossy ribbon wound into a spiral, its colour, metalness and roughness unknown all at once.
 
 After Balint et al. 2023, Fig. 1. The three trade against one another: a darker metal and a rougher dielectric look alike from one
-side. The ribbon is lit by a lamp that shines at the ceiling only and by its own windings, so that every sample is noisy.
+side. The ribbon is lit by two lamps in shades, off the ceiling and the upper walls, and by its own windings: every sample is noisy.
 """
 
 from __future__ import annotations

@@ -27,9 +27,9 @@ class Estimate:
         variance: of `gradient`, per element; None where the estimator provides none.
         hessian: (n, n) over all parameters flattened in key order, or None.
         hvp: the product of the Hessian with a tree, or None.
+        info: for people: samples traced, control weights, images. Never read back.
         preconditioned: whether `gradient` and `variance` are already those of u, where a parameter with a preconditioner S is
             x = S u: estimators that remember per element must do so in the coordinates of the descent.
-        info: for people: samples traced, control weights, images. Never read back.
     """
 
     loss: float
@@ -37,8 +37,8 @@ class Estimate:
     variance: Tree | None = None
     hessian: Array | None = None
     hvp: Callable[[Tree], Tree] | None = None
-    preconditioned: bool = False
     info: Mapping[str, Any] = field(default_factory=dict)
+    preconditioned: bool = False
 
 
 class Estimator(Protocol):

@@ -58,16 +58,18 @@ class MetaEstimator:
     Gradient and variance are those of u where a parameter with a preconditioner S is x = S u (`Estimate.preconditioned`): a
     variance per element does not pass through S.
 
-    Bias: none with `statistics="independent"` and a loss whose derivative is linear. With "shared" statistics, the paper's
-    choice, α knows the samples that it weighs, which pulls the gradient toward zero at first and fades. The variance is that
-    of the recurrence (15): zero-centred, so too large where the gradient stands out of the noise of one step. The memory
-    starts anew when a parameter changes its shape.
+    Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does not
+    depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α knows the
+    samples that it weighs, which pulls the gradient toward zero, most at the start. The variance is that of the recurrence (15):
+    zero-centred, so too large where the gradient stands out of the noise of one step. On a control variate's images, successive
+    steps share the image's memory besides, which the recurrence does not know of: biased as that image is, and somewhat noisier
+    than its variance says. The memory starts anew when a parameter changes its shape.
 
     Args:
-        proportional_spp: samples per pixel and view of F in the independent form, >= 1.
-        difference_spp: of ΔF in the independent form, >= 1.
+        proportional_spp: samples per pixel and view of F in the independent form, >= 1; 2 where none is given.
+        difference_spp: of ΔF in the independent form, >= 1; 1 where none is given.
         coupled: take the coupled form.
-        spp: samples per pixel and view in the coupled form, >= 1; at 1 the loss derivative comes from a second pair of images.
+        spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
         image: what the loss sees, in the coupled form; the independent one sees plain renderings.
         space: "path", "primary", or "auto": path space where it carries all parameters.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
@@ -78,10 +80,10 @@ class MetaEstimator:
         statistics: "shared" learns variances from the samples that it sums; "independent" from as many more, at twice the cost.
     """
 
-    proportional_spp: int = 2
-    difference_spp: int = 1
+    proportional_spp: int | None = None
+    difference_spp: int | None = None
     coupled: bool = False
-    spp: int = 3
+    spp: int | None = None
     image: ImageEstimator = field(default_factory=Plain)
     space: Space | Literal["auto"] = "auto"
     beta_proportional: float = meta.BETA_PROPORTIONAL
@@ -92,8 +94,19 @@ class MetaEstimator:
     statistics: Literal["shared", "independent"] = "shared"
 
     def __post_init__(self):
-        for name in ("proportional_spp", "difference_spp", "spp"):
-            checks.whole("MetaEstimator", name, getattr(self, name), at_least=1)
+        for name, coupled, default in (
+            ("proportional_spp", False, 2),
+            ("difference_spp", False, 1),
+            ("spp", True, 3),
+        ):
+            given = getattr(self, name)
+            if given is not None:
+                checks.whole("MetaEstimator", name, given, at_least=1)
+                if coupled != self.coupled:
+                    form = "coupled" if coupled else "independent"
+                    raise InputError(f"MetaEstimator: {name} is for the {form} form; give coupled={coupled} with it")
+            elif coupled == self.coupled:
+                object.__setattr__(self, name, default)
         for name in ("beta_proportional", "beta_difference"):
             checks.number("MetaEstimator", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         for name, choices in (("space", ("auto", "path", "primary")), ("statistics", ("shared", "independent"))):
@@ -103,6 +116,10 @@ class MetaEstimator:
                 )
         if not self.coupled and not isinstance(self.image, Plain):
             raise InputError("MetaEstimator: image is for the coupled form; give coupled=True with it")
+        if self.statistics == "independent" and not isinstance(self.image, Plain):
+            raise InputError(
+                'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
+            )
         if self.image.space is not None and self.space not in ("auto", self.image.space):
             raise InputError(
                 f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'
@@ -179,6 +196,8 @@ class MetaEstimator:
         self, problem: Problem, parameters: Tree, image: Any, beside: Beside, fresh: bool, key: Key
     ) -> tuple[Tree, Tree, PairGradient]:
         """F, ΔF from other samples, and what else the step brought."""
+        assert self.proportional_spp is not None
+        assert self.difference_spp is not None
         plain = PathGradient(Plain(), spp=self.proportional_spp)
         found, _ = plain.estimate(problem, parameters, PathGradientState(image), key.fold(_PROPORTIONAL))
         F, told = found.gradient, found.info
@@ -195,5 +214,6 @@ class MetaEstimator:
     ) -> tuple[Tree, Tree, PairGradient]:
         """F, H of the previous state from the same samples, and what else the step brought."""
         del fresh
+        assert self.spp is not None
         step = pair_gradient(problem, parameters, self.image, image, beside, self.spp, key)
         return problem.precondition(step.current), problem.precondition(step.previous), step

@@ -109,10 +109,11 @@ class RecursiveControlVariate:
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
         one as far as the two can share it: they differ by F − H.
         """
-        del beside
         shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
         fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
         previous = parameters if fresh or state.parameters is None else state.parameters
+        # Two memories that are carried together must be of the same step.
+        assert beside is None or all(previous[key] is value for key, value in beside.previous.items())
         rendering = problem.renderer.image_pair(parameters, previous, shot, self.space)
         assert rendering.previous is not None
         if fresh:

@@ -45,7 +45,7 @@ class MetaAdam:
         longest: the longest step of an element in units of η, > 0; None for no limit.
     """
 
-    learning_rate: float = 0.01
+    learning_rate: float = 0.002
     epsilon: float = 1e-24
     schedule: Schedule | None = None
     longest: float | None = None

@@ -107,8 +107,7 @@ class MitsubaRenderer:
                 raise InputError(f"parameter {key}: it cannot be recovered by gradients, since {info.reason}")
             if space == "path" and not info.carried:
                 raise InputError(
-                    f'parameter {key}: {info.reason}, which space="path" cannot carry; use '
-                    'RecursiveControlVariate(space="primary")'
+                    f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"'
                 )
         if space is not None:
             self.pair.check_separate(keys)
@@ -124,12 +123,19 @@ class MitsubaRenderer:
             self._frozen.clear()
 
     def _delta_kinds(self, changing: list[Carriage]) -> Any:
-        pointers = self.pair.current.shapes_dr().bsdf()
-        table = np.zeros(int(dr.reinterpret_array(mi.UInt32, pointers).numpy().max(initial=0)) + 1, np.uint32)
-        for ride in changing:
-            number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(ride.bsdf)).numpy()[0])
-            if number < len(table):
-                table[number] = ride.delta
+        """How perfectly specular lobes follow their parameters, by the registry ids of the current scene's BSDFs and, through
+        the pointer tables, of the previous scene's."""
+        kinds = {
+            int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(ride.bsdf)).numpy()[0]): ride.delta for ride in changing
+        }
+        pointers = dr.reinterpret_array(mi.UInt32, self.pair.current.shapes_dr().bsdf()).numpy()
+        kinds = {number: kind for number, kind in kinds.items() if number in pointers}
+        if kinds:  # only then is the second load worth its while
+            previous = self.pair.tables()["bsdf"].numpy()
+            kinds |= {int(previous[number]): kind for number, kind in kinds.items()}
+        table = np.zeros(max(int(pointers.max(initial=0)), *kinds, 0) + 1, np.uint32)
+        for number, kind in kinds.items():
+            table[number] = kind
         return mi.UInt32(table)
 
     # ------------------------------------------------------------------ rendering

@@ -12,15 +12,18 @@ below 1 / (2 − α_{i-1}) (Eq. 17, which from α_0 = 0 on is the bound i / (i +
 
 The *coupled* form, which the paper does not have, takes F_i and the previous state's H_i from the same samples, so that ΔF_i = F_i − H_i
 is not independent of F_i. Its recursion M_i = F_i + w_i (M_{i-1} − H_i) is the same one (put F − ΔF for H in Eq. 7), its weight and
-variance are those of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2.
+variance are those of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2, taking Var H for Var F.
 
-Where this departs from the paper's text: the running means are divided by the sum of their weights, as Adam does, since Eqs 9 and 13 say
-nothing of their start; and an element whose samples have all been zero so far, such as a texel that no path has met, counts its zeros: α
-follows its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight of 0 it would
-start anew from that sample, and be i times too large.
+Where this departs from the paper's text: the running means are divided by the sum of their weights, as Adam does, since Eqs 9 and
+13 say nothing of their start; and an element whose samples have all been zero so far, such as a texel that no path has met, counts
+its zeros: α follows its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight
+of 0 it would start anew from that sample, and be i times too large. Where M is not zero though no sample of F was seen to be (a
+difference met the element first, or the summed samples before the observed ones), Var M is at least M² / n after n steps: it
+would be thought exact otherwise.
 
-Bias. α knows F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero that fades as the means settle
-(section 6 of the paper, "sample reuse"). With statistics from other samples (`observed`) every M_i is unbiased.
+Bias. α knows F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero, strongest at the start and
+never quite gone, since the present sample keeps its share 1 − β_F of Var F (section 6 of the paper, "sample reuse"). With statistics from
+other samples (`observed`), on parameters that do not depend on the samples, every M_i is unbiased.
 """
 
 from __future__ import annotations
@@ -50,7 +53,8 @@ class Moments:
 
 @dataclass(frozen=True)
 class State:
-    """What is carried from step to step. Every array has the shape given to `init`, but for the two counts.
+    """What is carried from step to step. Every array has the shape given to `init`, but for the count of steps
+    and the moments' weights, which are numbers.
 
     Attributes:
         gradient: M.
@@ -112,7 +116,7 @@ def update(
     )
     alpha = _held(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip)
     gradient = advance(state.gradient, proportional, proportional - difference, alpha)
-    return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha)
+    return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha, var_f)
 
 
 def update_coupled(
@@ -144,7 +148,7 @@ def update_coupled(
     cov = arrays.maximum(var_f - 0.5 * var_d, 0.0)
     alpha = _held(state, control_weight(cov, var_f, var_m), var_f, started, clip)
     gradient = advance(state.gradient, current, previous, alpha)
-    return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha)
+    return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha, var_f)
 
 
 def optimal_alpha(var_proportional: Array, var_memory: Array, var_difference: Array) -> Array:
@@ -180,22 +184,22 @@ def _observe(
     unseen = state.proportional.square == 0.0
     # Two masks: the first step has no difference, and a step of length 0 tells nothing of it.
     started = arrays.where(state.steps > 0.0, 1.0, 0.0)
-    told = started * arrays.where(step_norm > 0.0, 1.0, 0.0)
+    changed = started * arrays.where(step_norm > 0.0, 1.0, 0.0)
     unit = arrays.where(step_norm > 0.0, step_norm, 1.0) if decouple else step_norm * 0.0 + 1.0
     past = arrays.maximum(state.steps, 1.0)
-    gain_f, gain_d = told * 0.0 + (1.0 - beta_proportional), told * (1.0 - beta_difference)
+    gain_f, gain_d = changed * 0.0 + (1.0 - beta_proportional), changed * (1.0 - beta_difference)
     weight_f = (1.0 - gain_f) * state.proportional.weight + gain_f
     weight_d = (1.0 - gain_d) * state.difference.weight + gain_d
     scale_f = 1.0 / weight_f
     scale_d = arrays.where(weight_d > 0.0, 1.0, 0.0) / arrays.where(weight_d > 0.0, weight_d, 1.0)
-    length = step_norm * step_norm if decouple else told * 1.0
+    length = step_norm * step_norm if decouple else changed * 1.0
     # Numbers must be in memory before they meet arrays: Dr.Jit stretches an unevaluated number in place to the array's size.
     arrays.evaluate(started, unit, past, gain_f, gain_d, weight_f, weight_d, scale_f, scale_d, length)
     proportional = _average(state.proportional, F, gain_f, weight_f)
     changes = _average(state.difference, difference / unit, gain_d, weight_d)
     var_f = _variance(proportional, scale_f, centred)
     var_d = _variance(changes, scale_d, centred) * length
-    var_m = arrays.where(unseen, var_f / past, state.variance)
+    var_m = arrays.where(unseen, arrays.maximum(var_f / past, state.variance), state.variance)
     return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m, started
 
 
@@ -220,6 +224,12 @@ def _held(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) 
     return (arrays.minimum(alpha, bound) if clip else alpha) * started
 
 
-def _next(state: State, gradient: Array, variance: Array, alpha: Array) -> tuple[Array, Array, Array, State]:
-    after = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=state.steps + 1.0)
+def _next(
+    state: State, gradient: Array, variance: Array, alpha: Array, var_f: Array
+) -> tuple[Array, Array, Array, State]:
+    steps = state.steps + 1.0
+    arrays.evaluate(steps)
+    least = gradient * gradient / steps
+    variance = arrays.where(var_f > 0.0, variance, arrays.maximum(variance, least))
+    after = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=steps)
     return gradient, variance, alpha, after

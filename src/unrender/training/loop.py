@@ -119,6 +119,7 @@ def optimize(
             key = Key(seed, run.step)
             estimate, next_state = estimator.estimate(problem, run.parameters, state, key)
             finite = np.isfinite(estimate.loss) and trees.all_finite(estimate.gradient)
+            finite = finite and (estimate.variance is None or trees.all_finite(estimate.variance))
             if finite:
                 run.parameters, memory = _apply(problem, estimate, memory, optimizer, run.parameters)
                 state = next_state
@@ -196,9 +197,11 @@ def estimate(
 
 
 def describe(estimator: Estimator) -> str:
-    """A short name: the class, and the class of its image where it has one."""
+    """A short name: the class, whether it is the coupled form, and the class of its image where it has one."""
     image = getattr(estimator, "image", None)
-    return type(estimator).__name__ + (f"({type(image).__name__})" if image is not None else "")
+    words = ["coupled"] if getattr(estimator, "coupled", False) else []
+    words += [type(image).__name__] if image is not None else []
+    return type(estimator).__name__ + (f"({', '.join(words)})" if words else "")
 
 
 def _check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:

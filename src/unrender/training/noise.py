@@ -23,7 +23,7 @@ class GradientNoise:
     weight: float = 0.0
 
     def update(self, gradient: Tree, variance: Tree | None = None) -> float | None:
-        """Take one gradient in. Returns the share in [0, 1], None until there are ten.
+        """Take one gradient in. Returns the share in [0, 1]; None until there are ten of them, unless the variance is given.
 
         With the variance that an estimator gives, it is the variance's share of ‖g‖², at once: those that remember resemble one another,
         and their stream would look free of noise.
