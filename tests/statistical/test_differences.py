@@ -45,4 +45,4 @@ def test_in_path_space_the_variance_falls_with_the_square_of_the_step(name: str)
 def test_in_primary_space_it_does_not_where_roughness_moves_the_paths() -> None:
     """So the test above can fail: equal random numbers lead apart in a share of the paths that grows with the step."""
     problem = ur.gallery.problem("spiral", resolution=24, texture_resolution=8, reference_spp=256)
-    assert slope(problem, "primary") < 1.6
+    assert slope(problem, "primary") < 1.75
