@@ -12,6 +12,7 @@ import functools
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
 VARIANTS = (CUDA, LLVM)
 """Three colour channels, with derivatives, unpolarised: what every formula here is written for."""
+
+_INITIALISATION = 0.5
+"""Seconds that Dr.Jit takes at most to find that a library will not do."""
 
 _GPU_TRIAL = """
 import sys
@@ -63,7 +67,9 @@ def prepare() -> None:
         # Dr.Jit will say so on standard error as it is imported, before our one line that also says what to do.
         # Whatever goes wrong here is told by the import that follows.
         with _silent_stderr(), contextlib.suppress(Exception):
-            llvm_version()  # waits for Dr.Jit's initialisation, which goes on in a thread after the import
+            import drjit  # noqa: F401
+
+            time.sleep(_INITIALISATION)  # goes on in a thread after the import
 
 
 def use(variant: str = "auto") -> str:
@@ -147,7 +153,16 @@ def has_cuda_driver() -> bool:
 
 
 def llvm_version() -> tuple[int, ...] | None:
-    """The version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None where it has none."""
+    """The version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None where it has none.
+
+    Where the library that it was told to load cannot work, or there is none that could, Dr.Jit is not asked: it would wait for its own
+    initialisation, whose thread waits in turn, to report the failure, for the interpreter that this call holds.
+    """
+    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    if given and not llvm.is_usable(major := llvm.identify(Path(given)).major):
+        return None if major is None else (major,)
+    if not given and llvm.choose() is None:
+        return None
     import drjit as dr
 
     version = tuple(dr.detail.llvm_version())

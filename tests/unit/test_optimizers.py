@@ -219,13 +219,14 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
     expected = meta_take(optimizer, gradients, variances)
     device = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in gradients]
     spread = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in variances]
-    state = optimizer.init(device[0])
+    state, made = optimizer.init(device[0]), 0
     for n, (gradient, variance) in enumerate(zip(device, spread, strict=True)):
         with kernels.recorded() as new:
             step, state = optimizer.update(Estimate(0.0, gradient, variance), state, gradient)
             dr.eval(step)
-        assert n < 2 or not any(new)
+        made += sum(new)
         np.testing.assert_allclose(np.array(step["a"]), expected[n]["a"], rtol=1e-4)
+    assert made <= 6, "a kernel for each size, in a few orders of its inputs; not one per step"
 
 
 @pytest.mark.parametrize(

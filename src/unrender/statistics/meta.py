@@ -214,7 +214,10 @@ def _average(moments: Moments, sample: Array, gain: Array, weight: Array) -> Mom
 
 def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     square, mean = moments.square * scale, moments.mean * scale
-    return arrays.maximum(square - mean * mean, 0.0) if centred else square
+    if not centred:
+        return square
+    about = square - mean * mean
+    return arrays.where(about > 1e-4 * square, about, 0.0)  # less is what single precision leaves of equal samples
 
 
 def _held(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) -> Array:
