@@ -332,15 +332,16 @@ more so for the coupled form, whose own deviation is the smallest."""
 META_ABLATIONS = """Few seeds and a short budget: differences of a few hundredths are noise."""
 
 META_RACES = """\
-The paper's form needs many steps for its memory to pay. With two crossed proportional samples per pixel its single-
-step noise is twice that of as many independent ones, and of four paths traced per pixel only two serve the gradient
-itself; `MetaAdam` moves an element whose gradient is lost in noise by about its learning rate at each step, and in
-one direction for as long as the memory lasts. On textures in `ajar`'s light that walk costs more than the lower noise
-gains within these budgets. The gradients themselves are as quiet as predicted there (on the path of a descent, after
-60 steps: deviation 0.47 of plain gradients' at 3 spp for the paper's form, 0.20 for the coupled one, 0.07 on a
-control variate's images). Tried against it on `ajar`: steps limited to the learning rate (`longest=1`: 0.86 at 0.001,
-1.3 at 0.003); dividing by the deviation of one step's gradient in place of the memory's (1.08 at 0.01 coupled, 0.61
-on a control variate's images); Adam in its place (the rows "naive")."""
+The paper's form needs many steps for its memory to pay. With two crossed proportional samples per pixel its
+single-step noise is twice that of as many independent ones, and of four paths traced per pixel only two serve the
+gradient itself; `MetaAdam` moves an element whose gradient is lost in noise by about its learning rate at each step,
+and in one direction for as long as the memory lasts. On textures in `ajar`'s light that walk costs more than the
+lower noise gains within these budgets. The gradients themselves are as quiet as predicted there (on the path of a
+descent, after 60 steps: deviation 0.47 of plain gradients' at 3 spp for the paper's form, 0.20 for the coupled one,
+0.07 on a control variate's images). Tried against it on `ajar`: steps limited to the learning rate (`longest=1`: 0.86
+at 0.001, 1.3 at 0.003); dividing by the deviation of one step's gradient in place of the memory's (1.08 at 0.01
+coupled, 0.61 on a control variate's images); Adam in its place (the rows "naive"). The machine was busy with other
+work during part of `spiral`'s race, which counts steps: its seconds are a hint only (`differences` has the costs)."""
 
 
 SECTIONS: list[tuple[str, str, Any, str]] = [
