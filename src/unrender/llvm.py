@@ -10,6 +10,7 @@ Only the standard library, and nothing of `unrender`: the set-up script runs thi
 from __future__ import annotations
 
 import ctypes.util
+import functools
 import os
 import platform
 import re
@@ -92,6 +93,7 @@ def version_by_name(path: Path) -> int | None:
     return None
 
 
+@functools.cache
 def version_by_asking(path: Path) -> int | None:
     """The major version as the library itself tells it, in a process of its own: two LLVMs in one process collide.
     None where it cannot be loaded or is older than 16, which cannot tell."""

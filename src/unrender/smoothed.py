@@ -57,16 +57,7 @@ def gradient(
     """
     job = _Job("gradient", f, theta, sigma, samples, seed, antithetic, low_discrepancy)
     offset = job.value_at_theta() if baseline and not antithetic else 0.0
-    if aggregate:
-        z = job.draw(gaussian.gradient_mixture)
-        weight = gaussian.gradient_kernel(z, job.sigma) / gaussian.gradient_ratio(z)[:, None]
-        return job.summarise(job.odd(z, offset)[:, None] * weight)
-    values, errors = np.empty(job.n), np.empty(job.n)
-    for i in range(job.n):
-        z = job.draw(lambda _, u, normal, i=i: _with(normal, i, gaussian.gradient_sample(u[:, i])), stream=i)
-        weight = -np.sign(z[:, i]) * gaussian.GRADIENT_MASS / job.sigma[i]
-        values[i], errors[i] = job.summarise(job.odd(z, offset) * weight)
-    return values, errors
+    return _first_order(job, aggregate, lambda z: job.odd(z, offset))
 
 
 def hessian(
@@ -146,15 +137,22 @@ def hvp(
         ahead, behind = (job.odd(z, 0.0, job.theta + side * step * direction) for side in (1, -1))
         return (ahead - behind) / (2 * step)
 
+    return _first_order(job, aggregate, difference)
+
+
+def _first_order(
+    job: _Job, aggregate: bool, values_at: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The gradient kernel's mean of `values_at(z)` over its draws, (n,), and its standard error."""
     if aggregate:
         z = job.draw(gaussian.gradient_mixture)
         weight = gaussian.gradient_kernel(z, job.sigma) / gaussian.gradient_ratio(z)[:, None]
-        return job.summarise(difference(z)[:, None] * weight)
+        return job.summarise(values_at(z)[:, None] * weight)
     values, errors = np.empty(job.n), np.empty(job.n)
     for i in range(job.n):
         z = job.draw(lambda _, u, normal, i=i: _with(normal, i, gaussian.gradient_sample(u[:, i])), stream=i)
         weight = -np.sign(z[:, i]) * gaussian.GRADIENT_MASS / job.sigma[i]
-        values[i], errors[i] = job.summarise(difference(z) * weight)
+        values[i], errors[i] = job.summarise(values_at(z) * weight)
     return values, errors
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import unrender as ur
 from unrender import arrays, trees
-from unrender.gradients.pair import pair_gradient
+from unrender.gradients.views import gather
 from unrender.images.base import Beside
 from unrender.images.plain import PlainState
 from unrender.keys import Key
@@ -27,10 +27,10 @@ def slope(problem: ur.Problem, space: Any, runs: int = 24) -> float:
         previous = {key: x + (truth[key] - x) * arrays.scalar(step, x) for key, x in start.items()}
         rows = []
         for run in range(runs):
-            both = pair_gradient(
-                problem, start, ur.images.Plain(), PlainState(), Beside(previous, space), 2, Key(1, run)
-            )
-            difference = trees.numpy(trees.subtract(both.current, both.previous))
+            beside = Beside(previous, space)
+            both = gather(problem, start, ur.images.Plain(), PlainState(), 2, Key(1, run), beside=beside)
+            assert both.previous is not None
+            difference = trees.numpy(trees.subtract(both.gradient, both.previous))
             rows.append(np.concatenate([x.ravel() for x in difference.values()]))
         variances.append(np.var(rows, axis=0, ddof=1).sum())
     return float(np.polyfit(np.log(STEPS), np.log(variances), 1)[0])

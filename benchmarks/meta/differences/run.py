@@ -22,7 +22,7 @@ from common import median_time, read, write
 
 import unrender as ur
 from unrender import arrays, trees
-from unrender.gradients.pair import pair_gradient
+from unrender.gradients.views import gather
 from unrender.images.base import Beside
 from unrender.images.plain import PlainState
 from unrender.keys import Key
@@ -37,8 +37,9 @@ STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 
 def difference(problem: ur.Problem, current: Tree, previous: Tree, space: Any, spp: int, key: Key) -> tuple[Tree, Tree]:
     """(F, ΔF) on `spp` coupled samples."""
-    found = pair_gradient(problem, current, ur.images.Plain(), PlainState(), Beside(previous, space), spp, key)
-    return found.current, trees.subtract(found.current, found.previous)
+    found = gather(problem, current, ur.images.Plain(), PlainState(), spp, key, beside=Beside(previous, space))
+    assert found.previous is not None
+    return found.gradient, trees.subtract(found.gradient, found.previous)
 
 
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:

@@ -9,8 +9,7 @@ from unrender import arrays, checks, trees
 from unrender.arrays import Array
 from unrender.errors import InputError
 from unrender.gradients.estimate import GRADIENT, VARIANCE, Estimate
-from unrender.gradients.pair import PairGradient, pair_gradient
-from unrender.gradients.path import PathGradient, PathGradientState
+from unrender.gradients.views import Gathered, gather
 from unrender.images.base import Beside, ImageEstimator
 from unrender.images.plain import Plain
 from unrender.keys import Key
@@ -28,7 +27,7 @@ class MetaState:
 
     Attributes:
         parameters: of the last step; None before the first.
-        elements: {key: what is known of each element of its gradient}.
+        elements: {key: what is known of each element of its gradient}; empty before the first step.
         image: the image estimator's, in the coupled form.
     """
 
@@ -133,8 +132,7 @@ class MetaEstimator:
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
         problem.renderer.select(list(parameters), self._space(problem, parameters))
-        elements = {key: meta.init(x) for key, x in parameters.items()}
-        return MetaState(None, elements, self.image.init(problem, parameters))
+        return MetaState(None, {}, self.image.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space" and
@@ -194,26 +192,25 @@ class MetaEstimator:
 
     def _independent(
         self, problem: Problem, parameters: Tree, image: Any, beside: Beside, fresh: bool, key: Key
-    ) -> tuple[Tree, Tree, PairGradient]:
+    ) -> tuple[Tree, Tree, Gathered]:
         """F, ΔF from other samples, and what else the step brought."""
         assert self.proportional_spp is not None
         assert self.difference_spp is not None
-        plain = PathGradient(Plain(), spp=self.proportional_spp)
-        found, _ = plain.estimate(problem, parameters, PathGradientState(image), key.fold(_PROPORTIONAL))
-        F, told = found.gradient, found.info
-        step = PairGradient(F, F, [found.loss], told["images"], told["samples"], {}, image)
-        if not fresh:  # else there is no change to be estimated
-            pair = pair_gradient(
-                problem, parameters, Plain(), image, beside, self.difference_spp, key.fold(_DIFFERENCE)
-            )
-            step = replace(pair, losses=step.losses, images=step.images, samples=step.samples + pair.samples)
-        return problem.precondition(F), problem.precondition(trees.subtract(step.current, step.previous)), step
+        step = gather(problem, parameters, self.image, image, self.proportional_spp, key.fold(_PROPORTIONAL))
+        F = problem.precondition(step.gradient)
+        if fresh:  # no change to be estimated
+            return F, trees.zeros_like(F), step
+        pair = gather(problem, parameters, self.image, image, self.difference_spp, key.fold(_DIFFERENCE), beside=beside)
+        assert pair.previous is not None
+        difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
+        return F, difference, replace(step, samples=step.samples + pair.samples)
 
     def _coupled(
         self, problem: Problem, parameters: Tree, image: Any, beside: Beside, fresh: bool, key: Key
-    ) -> tuple[Tree, Tree, PairGradient]:
+    ) -> tuple[Tree, Tree, Gathered]:
         """F, H of the previous state from the same samples, and what else the step brought."""
         del fresh
         assert self.spp is not None
-        step = pair_gradient(problem, parameters, self.image, image, beside, self.spp, key)
-        return problem.precondition(step.current), problem.precondition(step.previous), step
+        step = gather(problem, parameters, self.image, image, self.spp, key, beside=beside)
+        assert step.previous is not None
+        return problem.precondition(step.gradient), problem.precondition(step.previous), step

@@ -5,23 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from unrender import arrays, trees
+from unrender import arrays
 from unrender.errors import InputError
 from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.gradients.views import crossed_groups, gather
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.keys import Key
 from unrender.pixels.all import All
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Shot
 from unrender.trees import Tree
-
-_MOST_GROUPS = 16
-
-
-def crossed_groups(spp: int) -> int:
-    """How many groups `spp` samples are cut into; 1 where they cannot be."""
-    return max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
 
 
 @dataclass(frozen=True)
@@ -71,7 +64,7 @@ class PathGradient:
     @property
     def groups(self) -> int:
         """How many groups are crossed; 1 where the adjoint has paths of its own."""
-        return 1 if self.adjoint_spp is not None else crossed_groups(self.spp)
+        return crossed_groups(self.spp, self.adjoint_spp)
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
@@ -83,32 +76,9 @@ class PathGradient:
     ) -> tuple[Estimate, PathGradientState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, and what the
         image estimator tells, per view."""
-        groups = self.groups
-        gradient: Tree | None = None
-        losses, kept, pictures, samples = [], [], {}, 0
-        told: dict[str, dict[int, Any]] = {}
-        for view in range(len(problem.views)):
-            key_view = key.fold(view)
-            image, keep = self.image.estimate(
-                problem, parameters, state.image, view, self.spp, groups, key_view.fold(0)
-            )
-            kept.append(keep)
-            picture = image.mean()
-            losses.append(problem.loss_value(view, picture))
-            paths, traced = image.paths, 0
-            if groups == 1:
-                traced = self.adjoint_spp or self.spp
-                shot = Shot(problem.views[view].sensor, traced, key_view.fold(1).uint32())
-                paths = problem.renderer.image(parameters, shot).paths
-            part = problem.renderer.adjoint(parameters, paths, problem.loss_derivative(view, image.others()))
-            gradient = part if gradient is None else trees.add(gradient, part)
-            samples += (self.spp + traced) * int(picture.shape[0]) * int(picture.shape[1])
-            pictures[view] = picture
-            for name, value in image.info.items():
-                told.setdefault(name, {})[view] = value
-        assert gradient is not None
-        next_state = PathGradientState(self.image.advance(parameters, state.image, tuple(kept)))
-        arrays.evaluate(gradient, losses, next_state, told)
-        loss = sum(arrays.number(value) for value in losses)
-        info = {"samples": samples, "images": pictures, **told}
-        return Estimate(loss, gradient, info=info), next_state
+        step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp)
+        next_state = PathGradientState(step.image)
+        arrays.evaluate(step.gradient, step.losses, next_state, step.told)
+        loss = sum(arrays.number(value) for value in step.losses)
+        info = {"samples": step.samples, "images": step.images, **step.told}
+        return Estimate(loss, step.gradient, info=info), next_state
