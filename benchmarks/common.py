@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
+from unrender.problem.bounds import project
 from unrender.rendering.mitsuba_renderer import MitsubaRenderer
 from unrender.rendering.scene_pair import from_tensor
-from unrender.training.bounds import project
 from unrender.training.result import hardware, versions
 
 matplotlib.use("Agg")

@@ -28,8 +28,8 @@ from common import median_time, mitsuba_renderer, read, stock_loop, write
 
 import unrender as ur
 from unrender.keys import Key
+from unrender.problem.bounds import project
 from unrender.rendering.port import Shot
-from unrender.training.bounds import project
 
 HERE = Path(__file__).resolve().parent
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from unrender.gradients.estimate import Estimate
     from unrender.gradients.meta import MetaEstimator
     from unrender.gradients.path import PathGradient
+    from unrender.gradients.smoothed import SmoothedDerivatives
     from unrender.keys import Key
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
@@ -52,6 +53,7 @@ _HOMES = {
     "PathGradient": "gradients.path",
     "Problem": "problem.problem",
     "Result": "training.result",
+    "SmoothedDerivatives": "gradients.smoothed",
     "View": "problem.view",
     "estimate": "training.loop",
     "optimize": "training.loop",
@@ -72,6 +74,7 @@ __all__ = [
     "PathGradient",
     "Problem",
     "Result",
+    "SmoothedDerivatives",
     "UnrenderError",
     "VariantError",
     "View",

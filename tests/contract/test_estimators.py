@@ -15,8 +15,8 @@ from scipy import stats
 import unrender as ur
 from unrender.images.base import ImageEstimate
 from unrender.keys import Key
+from unrender.problem.bounds import MARGIN
 from unrender.rendering.analytic import AnalyticRenderer
-from unrender.training.bounds import MARGIN
 
 CV = ur.images.RecursiveControlVariate
 ESTIMATORS: dict[str, Callable[[], Any]] = {
@@ -31,6 +31,9 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "meta, several of each": lambda: ur.MetaEstimator(4, 3, space="primary"),
     "meta, other statistics": lambda: ur.MetaEstimator(statistics="independent"),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=3),
+    "smoothed gradient": lambda: ur.SmoothedDerivatives(0.1, samples=32),
+    "smoothed Hessian": lambda: ur.SmoothedDerivatives(0.1, samples=64, order="hessian"),
+    "smoothed products": lambda: ur.SmoothedDerivatives({"colour": 0.1, "map": 0.08}, samples=64, order="hvp"),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
@@ -42,6 +45,8 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
+    "Newton": lambda: ur.optimizers.Newton(learning_rate=0.1, trust_radius=0.1),
+    "NewtonCG": lambda: ur.optimizers.NewtonCG(learning_rate=0.1, trust_radius=0.3),
 }
 FITTING = [
     (estimator, optimizer)
@@ -74,8 +79,10 @@ def test_the_shape_of_an_estimate(name: str) -> None:
     if found.variance is not None:
         assert all(found.variance[k].shape == v.shape for k, v in asked.initial().items())
         assert all((v >= 0).all() for v in found.variance.values())
-    assert found.hessian is None
-    assert found.hvp is None
+    size = sum(value.size for value in asked.initial().values())
+    assert (found.hessian is not None) == ("hessian" in provides)
+    assert found.hessian is None or found.hessian.shape == (size, size)
+    assert (found.hvp is not None) == ("hvp" in provides)
 
 
 DRIFT = -0.06

@@ -18,9 +18,9 @@ from unrender.errors import InputError
 from unrender.gradients.estimate import Estimate, Estimator
 from unrender.keys import Key
 from unrender.optimizers.base import Optimizer
+from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
-from unrender.training.bounds import project
 from unrender.training.callbacks import Callback
 from unrender.training.noise import GradientNoise
 from unrender.training.pictures import pictures

@@ -1,0 +1,41 @@
+"""Trees as one vector on the host, for optimizers that look at all parameters at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import numpy as np
+
+from unrender import arrays
+from unrender.trees import Tree
+
+
+def ravel(tree: Tree) -> np.ndarray:
+    """All elements in key order, (n,), double precision."""
+    return np.concatenate([arrays.numpy(x).ravel().astype(np.float64) for x in tree.values()])
+
+
+def unravel(vector: np.ndarray, like: Tree) -> Tree:
+    """The tree of the shapes and kinds of `like` with these elements; the inverse of `ravel`."""
+    found, start = {}, 0
+    for key, x in like.items():
+        size = int(np.prod(arrays.shape(x)))
+        part = vector[start : start + size].reshape(arrays.shape(x))
+        start += size
+        if arrays.is_drjit(x):  # in memory of its own, see `MitsubaRenderer.array`
+            found[key] = type(x)(part.astype(np.float32)) + dr.opaque(type(x), 0, ())
+        else:
+            found[key] = part
+    return found
+
+
+def spread(numbers: Mapping[str, float], like: Tree) -> np.ndarray:
+    """One number per parameter, repeated for its elements, (n,)."""
+    return np.concatenate([np.full(int(np.prod(arrays.shape(x))), numbers[key]) for key, x in like.items()])
+
+
+def within(step: np.ndarray, radius: float | None) -> np.ndarray:
+    """`step`, shortened to `radius` where it is longer."""
+    length = float(np.linalg.norm(step))
+    return step if radius is None or length <= radius else step * (radius / length)
