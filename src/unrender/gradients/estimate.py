@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+
 from unrender.arrays import Array
 from unrender.keys import Key
 from unrender.problem.problem import Problem
@@ -15,6 +17,7 @@ GRADIENT = "gradient"
 VARIANCE = "variance"
 HESSIAN = "hessian"
 HVP = "hvp"
+LOSSES = "losses"
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Estimate:
         variance: of `gradient`, per element; None where the estimator provides none.
         hessian: (n, n) over all parameters flattened in key order, or None.
         hvp: the product of the Hessian with a tree, or None.
+        losses: the loss at many points at once, (B, n) to (B,) NumPy arrays over all parameters flattened in key order, every point
+            with this step's random numbers; or None.
         info: for people: samples traced, control weights, images. Never read back.
         preconditioned: whether `gradient` and `variance` are already those of u, where a parameter with a preconditioner S is
             x = S u: estimators that remember per element must do so in the coordinates of the descent.
@@ -37,6 +42,7 @@ class Estimate:
     variance: Tree | None = None
     hessian: Array | None = None
     hvp: Callable[[Tree], Tree] | None = None
+    losses: Callable[[np.ndarray], np.ndarray] | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     preconditioned: bool = False
 
@@ -46,7 +52,7 @@ class Estimator(Protocol):
 
     @property
     def provides(self) -> frozenset[str]:
-        """Subset of {"gradient", "variance", "hessian", "hvp"}."""
+        """Subset of {"gradient", "variance", "hessian", "hvp", "losses"}."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
