@@ -85,6 +85,17 @@ def mean_first(x: Array) -> Array:
     return dr.mean(x, axis=0) if is_drjit(x) else np.mean(x, axis=0)
 
 
+def mean_rest(x: Array) -> Array:
+    """The mean over all axes but the first, (n, ...) -> (n,), left lazy on Dr.Jit."""
+    axes = tuple(range(1, len(x.shape)))
+    return dr.mean(x, axis=axes) if is_drjit(x) else np.mean(x, axis=axes)
+
+
+def stacked(x: Array) -> Array:
+    """`x` with a first axis of length 1, (...) -> (1, ...)."""
+    return type(x)(x.array, (1, *x.shape)) if is_drjit(x) else x[None]
+
+
 def total(x: Array) -> Array:
     """The sum over all elements, left lazy on Dr.Jit."""
     return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)

@@ -114,7 +114,7 @@ SPOILT = [
         "problem.toml:6: parameters[0].bounds: low must",
     ),
     (_edit("problem.toml", '"L2"', '"L2'), "problem.toml:2: not valid TOML"),
-    (_edit("problem.toml", "wall.bsdf.reflectance.value", "wall.to_world"), "cannot be recovered by gradients"),
+    (_edit("problem.toml", "wall.bsdf.reflectance.value", "wall.to_world"), "cannot be recovered: its type"),
 ]
 
 

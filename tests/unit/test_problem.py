@@ -37,7 +37,7 @@ class Renderer(AnalyticRenderer):
         known = dict(super().parameters())
         known["wall.value"] = ParameterInfo((3,), lowest=0.0, highest=1.0)
         known["floor.data"] = ParameterInfo((2, 2, 3), lowest=0.0, highest=1.0)
-        known["lens.eta"] = ParameterInfo((), False, False, "it bends rays")
+        known["lens.eta"] = ParameterInfo((), False, False, "it bends rays", perturbable=False)
         return known
 
 
@@ -179,7 +179,7 @@ BAD_PARAMETERS: list[tuple[Parameter, str]] = [
     (Parameter("wall.valu"), r"parameters\[0\]\.key: the scene has no parameter wall.valu; did you mean wall.value\?"),
     (Parameter("paint.data"), r"the scene has no parameter paint.data; did you mean floor.data\?"),
     (Parameter("zzz"), r"the scene has no parameter zzz; it has wall.value, floor.data, lamp.scale"),
-    (Parameter("lens.eta"), r"lens.eta cannot be recovered by gradients: it bends rays"),
+    (Parameter("lens.eta"), r"lens.eta cannot be recovered: it bends rays"),
     (Parameter("wall.value", [1.0, 2.0]), r"parameter wall.value: initial: expected .* got an array of shape \(2,\)"),
     (
         Parameter("floor.data", np.zeros((3, 2, 3))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,67 +11,77 @@ import numpy as np
 
 from unrender import arrays, checks, flat, smoothed
 from unrender.errors import InputError
-from unrender.gradients.estimate import GRADIENT, HESSIAN, HVP, VARIANCE, Estimate
+from unrender.gradients.black_box import BlackBox
+from unrender.gradients.estimate import GRADIENT, HESSIAN, HVP, LOSSES, VARIANCE, Estimate
 from unrender.keys import Key
-from unrender.problem.bounds import project
+from unrender.optimizers.schedules import Schedule
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Shot
 from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
 class SmoothedState:
-    """Nothing is kept."""
+    """State between steps: how many there were."""
+
+    step: int = 0
 
 
 @dataclass(frozen=True)
 class SmoothedDerivatives:
     """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of deviation σ.
 
-    The renderer is a black box: no derivative of it is asked for, so plateaus, silhouettes and shadows count. All perturbations of a step
-    share the random numbers of their renders, so that differences are of the parameters and not of the noise. Perturbed parameters are
-    moved into their bounds before they are rendered.
+    The renderer is a black box: no derivative of it is asked for, so plateaus, silhouettes, shadows and poses (`rendering/poses.py`)
+    count. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not of
+    the noise. Perturbed parameters are moved into their bounds before they are rendered.
 
     Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss; the Hessian-vector
     product has the bias of its central difference (`smoothed.hvp`).
 
     Args:
         sigma: σ in units of the parameters, > 0: one number, or {key: number}.
-        samples: renders per view and derivative, >= 4.
+        samples: renders per view and derivative, >= 4; without `aggregate`, per element of the derivative too.
         order: "gradient", "hessian" (n × n, for few parameters), or "hvp".
-        aggregate, antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
+        aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
+        product: every dimension from its own gradient kernel at once, in place of `aggregate`: the gradient of Fischer and
+            Ritschel 2023, "FR22" in the paper, whose smoothing is not a Gaussian's; gradients only.
+        antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
+        schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.optimizers.schedules`.
     """
 
-    sigma: Any
+    sigma: float | Mapping[str, float]
     samples: int = 32
     order: Literal["gradient", "hessian", "hvp"] = "gradient"
     aggregate: bool = True
+    product: bool = False
     antithetic: bool = True
     baseline: bool = True
     low_discrepancy: bool = False
     spp: int = 4
+    schedule: Schedule | None = None
 
     def __post_init__(self):
         if self.order not in ("gradient", "hessian", "hvp"):
             raise InputError(f'SmoothedDerivatives: order must be "gradient", "hessian" or "hvp", got {self.order!r}')
-        for name, value in self.sigma.items() if isinstance(self.sigma, dict) else [("sigma", self.sigma)]:
+        if self.product and self.order != "gradient":
+            raise InputError(f'SmoothedDerivatives: product=True goes with order="gradient", got {self.order!r}')
+        for name, value in self.sigma.items() if isinstance(self.sigma, Mapping) else [("sigma", self.sigma)]:
             checks.number("SmoothedDerivatives", f"sigma of {name}" if name != "sigma" else name, value, above=0.0)
         checks.whole("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
         checks.whole("SmoothedDerivatives", "spp", self.spp, at_least=1)
 
     @property
     def provides(self) -> frozenset[str]:
-        """A gradient with its variance, and what `order` says."""
-        return frozenset({GRADIENT, VARIANCE, *{"hessian": [HESSIAN], "hvp": [HVP]}.get(self.order, [])})
+        """A gradient with its variance, the loss at any points, and what `order` says."""
+        return frozenset({GRADIENT, VARIANCE, LOSSES, *{"hessian": [HESSIAN], "hvp": [HVP]}.get(self.order, [])})
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
-        """See `Estimator.init`. Raises `InputError` where a parameter has a preconditioner, or none has a σ."""
+        """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed, has a preconditioner, or has no σ."""
         for key in problem.preconditioners:
             raise InputError(
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
-        problem.renderer.select(list(parameters), None)
+        problem.renderer.select(list(parameters), None, derivatives=False)
         self._sigma(parameters)
         return SmoothedState()
 
@@ -79,27 +89,33 @@ class SmoothedDerivatives:
         self, problem: Problem, parameters: Tree, state: SmoothedState, key: Key
     ) -> tuple[Estimate, SmoothedState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view at the parameters themselves."""
-        theta, sigma = flat.ravel(parameters), self._sigma(parameters)
-        counted = [0]
-        images: dict[int, Any] = {}
-
-        def losses(points: np.ndarray) -> np.ndarray:
-            return np.array([self._loss(problem, parameters, point, key, counted) for point in points])
-
-        loss = self._loss(problem, parameters, theta, key, counted, images)
+        box = BlackBox(problem, parameters, self.spp, key.fold(0))
+        theta = flat.ravel(parameters)
+        sigma = self._sigma(parameters) * (self.schedule(state.step) if self.schedule else 1.0)
+        loss, images = box.here()
         seed = key.fold(1).uint32()
-        options = {
-            "aggregate": self.aggregate,
-            "antithetic": self.antithetic,
-            "low_discrepancy": self.low_discrepancy,
-        }
-        gradient, error = smoothed.gradient(losses, theta, sigma, self.samples, seed, baseline=self.baseline, **options)
+        options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
+        gradient, error = smoothed.gradient(
+            box.losses,
+            theta,
+            sigma,
+            self.samples,
+            seed,
+            aggregate=self.aggregate,
+            product=self.product,
+            baseline=self.baseline,
+            **options,
+        )
         hessian = None
         if self.order == "hessian":
-            hessian, _ = smoothed.hessian(losses, theta, sigma, self.samples, seed, baseline=self.baseline, **options)
+            hessian, _ = smoothed.hessian(
+                box.losses, theta, sigma, self.samples, seed, self.aggregate, baseline=self.baseline, **options
+            )
 
         def product(v: Tree) -> Tree:
-            found, _ = smoothed.hvp(losses, theta, flat.ravel(v), sigma, 2 * self.samples, seed, **options)
+            found, _ = smoothed.hvp(
+                box.losses, theta, flat.ravel(v), sigma, 2 * self.samples, seed, self.aggregate, **options
+            )
             return flat.unravel(found, parameters)
 
         return Estimate(
@@ -108,38 +124,14 @@ class SmoothedDerivatives:
             flat.unravel(error**2, parameters),
             hessian,
             product if self.order == "hvp" else None,
-            info={"samples": counted[0], "images": images},
-        ), state
-
-    def _loss(
-        self,
-        problem: Problem,
-        parameters: Tree,
-        point: np.ndarray,
-        key: Key,
-        counted: list[int],
-        images: dict[int, Any] | None = None,
-    ) -> float:
-        tree = {k: project(x, *problem.bounds[k]) for k, x in flat.unravel(point, parameters).items()}
-        parts: list[Any] = []
-        for view in range(len(problem.views)):
-            shot = Shot(problem.views[view].sensor, self.spp, key.fold(0).fold(view).uint32())
-            image = arrays.mean_first(problem.renderer.image(tree, shot).images)
-            parts.append(problem.loss_value(view, image))
-            counted[0] += self.spp * math.prod(_size(image.shape))
-            if images is not None:
-                images[view] = image
-        arrays.evaluate(parts)
-        return sum(arrays.number(part) for part in parts)
+            box.losses,
+            info={"samples": box.samples, "images": images},
+        ), SmoothedState(state.step + 1)
 
     def _sigma(self, parameters: Tree) -> np.ndarray:
-        if not isinstance(self.sigma, dict):
-            return np.full(flat.ravel(parameters).size, float(self.sigma))
+        if not isinstance(self.sigma, Mapping):
+            return np.full(sum(math.prod(arrays.shape(x)) for x in parameters.values()), float(self.sigma))
         missing = [key for key in parameters if key not in self.sigma]
         if missing:
             raise InputError(f"SmoothedDerivatives: sigma has no entry for parameter {missing[0]}")
         return flat.spread(self.sigma, parameters)
-
-
-def _size(shape: Sequence[int]) -> tuple[int, int]:
-    return int(shape[0]), int(shape[1])

@@ -134,6 +134,12 @@ class Problem:
         values, mask = self.loss.value(image, self.reference(view)), self.mask(view)
         return arrays.mean(values if mask is None else values * mask) * self.views[view].weight
 
+    def loss_values(self, view: int, images: Array) -> Array:
+        """`loss_value` of each of many images (B, H, W, 3): (B,), lazy."""
+        reference, mask = self.reference(view), self.mask(view)
+        values = self.loss.value(images, arrays.stacked(reference))
+        return arrays.mean_rest(values if mask is None else values * arrays.stacked(mask)) * self.views[view].weight
+
     def loss_derivative(self, view: int, image: Array) -> Array:
         """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
         slope, mask = self.loss.derivative(image, self.reference(view)), self.mask(view)
@@ -166,8 +172,8 @@ class Problem:
         if key in self._initial:
             raise FieldError(place, f"{key} is given twice")
         info = known[key]
-        if not info.differentiable:
-            raise FieldError(place, f"{key} cannot be recovered by gradients: {info.reason}")
+        if not info.differentiable and not info.perturbable:
+            raise FieldError(place, f"{key} cannot be recovered: {info.reason}")
         try:
             low, high = self.bounds[key] = _bounds(parameter.bounds, info)
         except InputError as error:
@@ -309,7 +315,7 @@ def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> Non
 
 
 def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
-    able = [name for name, info in known.items() if info.differentiable]
+    able = [name for name, info in known.items() if info.differentiable or info.perturbable]
     # Mitsuba may call an owner by its shape where people think of its material: the rest of the key tells as much.
     alike = [name for name in able if name.endswith("." + key.partition(".")[2])] if "." in key else []
     if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, able) or did_you_mean(key, known):

@@ -41,7 +41,7 @@ def render(
     if not 0 <= view < len(problem.views):
         raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
     point = as_tree(problem, parameters)
-    problem.renderer.select(list(point), None)
+    problem.renderer.select(list(point), None, derivatives=False)
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
     per_pass = max(1, min(spp, _LANES // (height * width)))

@@ -11,7 +11,7 @@ does not (h) are shared or not between two states exactly as a path tracer's are
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,9 @@ class AnalyticRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None) -> None:
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
         """See `Renderer.select`."""
+        del derivatives
         for key in keys:
             if key not in self._values:
                 raise InputError(f"parameter {key}: the scene has none of that name")
@@ -96,6 +97,13 @@ class AnalyticRenderer:
         """See `Renderer.image`."""
         paths = self._paths(shot)
         return Rendering(self._images(parameters, paths), None, paths)
+
+    def image_batch(self, parameters: Tree, shot: Shot) -> np.ndarray:
+        """See `Renderer.image_batch`."""
+        paths = replace(self._paths(shot), groups=1)
+        count = len(next(iter(parameters.values())))
+        states = [{key: value[index] for key, value in parameters.items()} for index in range(count)]
+        return np.concatenate([self._images(state, paths) for state in states])
 
     def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
         """See `Renderer.image_pair`. Both spaces share the random numbers, which is all there is to share."""

@@ -1,5 +1,5 @@
 # Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportOperatorIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
+# pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
 
 """From pixels to camera rays, from path radiance back to pixels: one box filter, independent samples.
 
@@ -9,13 +9,44 @@ pixel is the plain mean over its square (a box filter of one pixel).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 
-def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int) -> tuple[Any, Any]:
+@dataclass
+class RepeatingSampler:
+    """Independent samples that are the same in every copy of an image: lane i shares its numbers with lane i + period.
+
+    Stands for a `mitsuba.Sampler`; mutable, as that is, since it is state of the path tracer's loop.
+
+    Attributes:
+        period: lanes of one image.
+        rng: `mitsuba.PCG32`, once seeded.
+    """
+
+    period: int
+    rng: Any = None
+
+    def seed(self, seed: Any, lanes: int) -> None:
+        """Start anew with `lanes` lanes."""
+        lane = dr.arange(mi.UInt32, lanes) % self.period
+        state, sequence = mi.sample_tea_32(seed, lane)
+        self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def next_1d(self) -> Any:
+        """A uniform number per lane."""
+        return self.rng.next_float32()
+
+    def next_2d(self) -> Any:
+        """Two of them."""
+        first = self.rng.next_float32()
+        return mi.Point2f(first, self.rng.next_float32())
+
+
+def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1) -> tuple[Any, Any]:
     """Camera rays, samples of a pixel side by side.
 
     Args:
@@ -25,14 +56,18 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
         spp: rays per pixel.
         pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
         count: how many pixels.
+        copies: of the whole image, one behind the other.
 
     Returns:
-        `mi.RayDifferential3f` and its weight per lane; count * spp lanes.
+        `mi.RayDifferential3f` and its weight per lane; copies * count * spp lanes.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
-    sampler.seed(seed, count * spp)
-    index = dr.arange(mi.UInt32, count * spp) // spp
+    lanes = copies * count * spp
+    sampler.seed(seed, lanes)
+    index = dr.arange(mi.UInt32, lanes) // spp
+    if copies > 1:
+        index %= count
     if pixels is not None:
         index = dr.gather(mi.UInt32, pixels, index)
     y = index // width

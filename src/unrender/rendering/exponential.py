@@ -7,7 +7,7 @@ are equal.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,9 +53,9 @@ class ExponentialRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None) -> None:
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
         """See `Renderer.select`."""
-        del space
+        del space, derivatives
         for key in keys:
             if key != RATE:
                 raise InputError(f"parameter {key}: the scene has none of that name; it has {RATE}")
@@ -65,6 +65,12 @@ class ExponentialRenderer:
         numbers = np.random.default_rng(shot.seed).random((shot.groups, shot.spp // shot.groups))
         paths = ExponentialPaths(-np.log1p(-numbers))
         return Rendering(self._images(parameters, paths), None, paths)
+
+    def image_batch(self, parameters: Tree, shot: Shot) -> np.ndarray:
+        """See `Renderer.image_batch`."""
+        rendering = self.image(parameters={RATE: 1.0}, shot=replace(shot, groups=1))
+        means = rendering.images[0, 0, 0] / np.reshape(parameters[RATE], (-1, 1))
+        return means[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
         """See `Renderer.image_pair`. Both spaces share the random numbers, which is all there is to share."""

@@ -17,13 +17,16 @@ import numpy as np
 
 from unrender.errors import InputError
 from unrender.names import did_you_mean
-from unrender.rendering import camera
+from unrender.rendering import camera, poses
 from unrender.rendering.path_pair import DELTA_EQUAL, PathPair
 from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
 from unrender.rendering.scene_pair import Carriage, SceneDescription, ScenePair, from_tensor, to_tensor
 from unrender.trees import Tree
 
 _log = logging.getLogger("unrender")
+
+_LANES = 1 << 22
+"""Paths per launch of a batch: what fits a small machine's memory."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ class MitsubaRenderer:
         max_depth: longest path in segments, >= 1.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
-    vertex positions (3 V,). Geometry moves only through Mitsuba's `prb` kernel, whose gradient leaves out visibility.
+    vertex positions (3 V,). Geometry moves only through Mitsuba's `prb` kernel, whose gradient leaves out visibility. Poses of
+    whole shapes and sensors, see `poses.py`, have no path gradient at all.
 
     Raises `InputError` where Mitsuba refuses the description.
     """
@@ -59,7 +63,11 @@ class MitsubaRenderer:
     def __init__(self, description: SceneDescription, max_depth: int = 6):
         self.max_depth = max_depth
         self.pair = ScenePair(description)
+        self._poses = poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = dict(self.pair.info())
+        self._info |= {key: poses.info(pose) for key, pose in self._poses.items()}
+        self._posed: poses.PosedScene | None = None
+        self._attached = True
         self._keys: list[str] = []
         self._native: dict[str, Any] = {}
         self._leaves: dict[str, Any] = {}
@@ -79,7 +87,12 @@ class MitsubaRenderer:
 
     def values(self, keys: list[str]) -> Tree:
         """The scene's own values, as loaded (or as last rendered, for a key that was selected)."""
-        return {key: to_tensor(self.pair.current_parameters[key]) for key in keys}
+        return {
+            key: self.array(self._poses[key].loaded())
+            if key in self._poses
+            else to_tensor(self.pair.current_parameters[key])
+            for key in keys
+        }
 
     def resolutions(self) -> list[tuple[int, int]]:
         """(height, width) of each sensor's film, after cropping."""
@@ -97,30 +110,46 @@ class MitsubaRenderer:
         dr.eval(owned)
         return owned
 
-    def select(self, keys: list[str], space: Space | None) -> None:
-        """Announce the parameters to recover. See `Renderer.select`."""
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
+        """Announce the parameters to recover. See `Renderer.select`.
+
+        Poses and other parameters that move geometry cannot be selected together: the scenes that posed shapes live in are not rebuilt.
+        """
         for key in keys:
-            if key not in self._info:
-                raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
-            info = self._info[key]
-            if not info.differentiable:
-                raise InputError(f"parameter {key}: it cannot be recovered by gradients, since {info.reason}")
-            if space == "path" and not info.carried:
-                raise InputError(
-                    f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"'
-                )
+            self._check(key, space, derivatives)
         if space is not None:
             self.pair.check_separate(keys)
-        if keys != self._keys:
-            self._keys = list(keys)
-            self._native = {key: self.pair.current_parameters[key] for key in keys}
-            rides = [self.pair.carriage(key) for key in keys]
-            self._geometric = any(ride.geometric for ride in rides)
-            changing = [ride for ride in rides if ride.delta != DELTA_EQUAL]
-            self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
-            self._delta_table = self._delta_kinds(changing)
-            self._leaves, self._leaves_previous, self._loaded, self._loaded_previous = {}, {}, {}, {}
-            self._frozen.clear()
+        if keys == self._keys and derivatives == self._attached:
+            return
+        own = [key for key in keys if key not in self._poses]
+        rides = [self.pair.carriage(key) for key in own]
+        geometric = any(ride.geometric for ride in rides)
+        chosen = {key: self._poses[key] for key in keys if key in self._poses}
+        if chosen and geometric:
+            moving = next(key for key, ride in zip(own, rides, strict=True) if ride.geometric)
+            raise InputError(
+                f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(chosen))}"
+            )
+        self._posed = poses.PosedScene(self.pair.current, chosen) if chosen else None
+        self._keys, self._attached = list(keys), derivatives
+        self._native = {key: self.pair.current_parameters[key] for key in own}
+        self._geometric = geometric and derivatives
+        changing = [ride for ride in rides if ride.delta != DELTA_EQUAL] if derivatives else []
+        self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
+        self._delta_table = self._delta_kinds(changing)
+        self._leaves, self._leaves_previous, self._loaded, self._loaded_previous = {}, {}, {}, {}
+        self._frozen.clear()
+
+    def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
+        if key not in self._info:
+            raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
+        info = self._info[key]
+        if derivatives and not info.differentiable:
+            raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
+        if not info.perturbable:
+            raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")
+        if space == "path" and not info.carried:
+            raise InputError(f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"')
 
     def _delta_kinds(self, changing: list[Carriage]) -> Any:
         """How perfectly specular lobes follow their parameters, by the registry ids of the current scene's BSDFs and, through
@@ -141,11 +170,41 @@ class MitsubaRenderer:
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, shot: Shot) -> Rendering:
-        """Render. Unbiased; box filter."""
+        """Render. Unbiased; box filter. Posed shapes are in one group only."""
+        if self._posed is not None:
+            stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
+            return Rendering(self.image_batch(stacked, shot), None, None)
         self._set_current(parameters)
         radiance = self._run("image", shot)
         dr.eval(radiance)
         return Rendering(self._develop(radiance, shot), None, Paths(shot, radiance))
+
+    def image_batch(self, parameters: Tree, shot: Shot) -> Any:
+        """Render many states with the same random numbers. See `Renderer.image_batch`.
+
+        Poses alone: one launch for as many as fit the memory. Otherwise one replay of the frozen kernel for each.
+        """
+        count = len(next(iter(parameters.values())))
+        shape = (*self.resolutions()[shot.sensor], 3)
+        size = max(1, _LANES // (self._count(shot) * shot.spp)) if not self._native else 1
+        images = []
+        for start in range(0, count, size):
+            part = {key: value[start : start + size] for key, value in parameters.items()}
+            images.append(self._launch(part, shot))
+        flat = images[0] if len(images) == 1 else dr.concat(images)
+        return mi.TensorXf(flat, (count, *shape))
+
+    def _launch(self, parameters: Tree, shot: Shot) -> Any:
+        """The pixels of states that share all but their poses, one behind the other."""
+        count = len(next(iter(parameters.values())))
+        self._set_current({key: self.array(parameters[key][0]) for key in self._native})
+        if self._posed is None:
+            radiance = self._run("image", shot)
+        else:
+            numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
+            radiance = self._run("poses", shot, self.array(numbers).array, copies=count)
+        dr.eval(radiance)
+        return camera.develop(radiance, shot.spp, 1, (count, self._count(shot), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
@@ -204,13 +263,17 @@ class MitsubaRenderer:
         shape = (self._count(shot), 3) if shot.pixels is not None else (*self.resolutions()[shot.sensor], 3)
         return camera.develop(radiance, shot.spp, shot.groups, shape)
 
-    def _run(self, what: str, shot: Shot, tables: Any = None, *more: Any) -> Any:
+    def _run(self, what: str, shot: Shot, tables: Any = None, *more: Any, copies: int = 1) -> Any:
         """Call the frozen kernel for shots of this form: traced once, replayed at each step."""
         count = self._count(shot)
-        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None)
+        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None, copies)
+        trace = self._trace_poses if what == "poses" else self._trace
         if key not in self._frozen:
-            self._frozen[key] = _uncollected(dr.freeze(self._trace(what, shot.sensor, shot.spp, count)))
+            self._frozen[key] = _uncollected(dr.freeze(trace(what, shot.sensor, shot.spp, count, copies)))
         scene = self.pair.previous if what.startswith("previous") else self.pair.current
+        if what == "poses":
+            assert self._posed is not None
+            scene = self._posed.scenes()
         arguments = (scene, [self.pair.current, *self.pair.others()], tables, mi.UInt32(shot.seed), shot.pixels, *more)
         try:
             self._clear_gradients()
@@ -222,7 +285,7 @@ class MitsubaRenderer:
             _log.warning(
                 "this process holds other Mitsuba objects, which keep kernels from being frozen: steps are slower"
             )
-            self._frozen[key] = self._trace(what, shot.sensor, shot.spp, count)
+            self._frozen[key] = trace(what, shot.sensor, shot.spp, count, copies)
             self._clear_gradients()
             return self._frozen[key](*arguments)
 
@@ -230,7 +293,28 @@ class MitsubaRenderer:
         for leaf in (*self._leaves.values(), *self._leaves_previous.values()):
             dr.clear_grad(leaf)
 
-    def _trace(self, what: str, sensor: int, spp: int, count: int) -> Callable[..., Any]:
+    def _trace_poses(self, what: str, sensor: int, spp: int, count: int, copies: int) -> Callable[..., Any]:
+        del what
+        posed, kernel = self._posed, self._kernel
+        assert posed is not None
+
+        def trace(scenes, living, numbers, seed, pixels):
+            del living
+            batch = dr.arange(mi.UInt32, copies * count * spp) // (count * spp)
+            assembly = posed.at(scenes, numbers, batch)
+            sampler = camera.RepeatingSampler(count * spp)
+            with dr.suspend_grad():
+                film = assembly.static.sensors()[sensor]
+                ray, ray_weight = camera.rays(film, sampler, seed, spp, pixels, count, copies)
+                if film.id() in assembly.poses:
+                    ray = assembly.poses[film.id()].ray_outside(ray)
+                L, _ = kernel.sample(dr.ADMode.Primal, assembly.static, None, sampler, ray, geometry=assembly)
+                return L * ray_weight
+
+        return trace
+
+    def _trace(self, what: str, sensor: int, spp: int, count: int, copies: int) -> Callable[..., Any]:
+        assert copies == 1
         kernel = self._geometric_kernel() if self._geometric else self._kernel
 
         pair = what.endswith("pair")
@@ -258,22 +342,27 @@ class MitsubaRenderer:
     # ------------------------------------------------------------------ the two states
 
     def _set_current(self, parameters: Tree) -> None:
-        _bring(self.pair.current_parameters, parameters, self._native, self._loaded, self._leaves)
+        _bring(self.pair.current_parameters, parameters, self._native, self._loaded, self._leaves, self._attached)
 
     def _set_previous(self, parameters: Tree) -> None:
-        _bring(self.pair.previous_parameters, parameters, self._native, self._loaded_previous, self._leaves_previous)
+        _bring(
+            self.pair.previous_parameters, parameters, self._native, self._loaded_previous, self._leaves_previous, True
+        )
 
 
-def _bring(scene: Any, parameters: Tree, native: dict[str, Any], loaded: Tree, leaves: dict[str, Any]) -> None:
-    """Bring a scene to `parameters`, as fresh leaves of the gradient: attached always, since frozen kernels would be traced
-    anew if that changed between the primal and the adjoint pass."""
+def _bring(
+    scene: Any, parameters: Tree, native: dict[str, Any], loaded: Tree, leaves: dict[str, Any], attached: bool
+) -> None:
+    """Bring a scene to `parameters`, as fresh leaves of the gradient: attached for all of a run or never, since frozen kernels would
+    be traced anew if that changed between the primal and the adjoint pass."""
     changed = False
     for key, value in parameters.items():
         if loaded.get(key) is not value:
             leaf = from_tensor(value, native[key])
-            dr.enable_grad(leaf)
+            if attached:
+                dr.enable_grad(leaf)
+                leaves[key] = leaf
             scene[key] = leaf
-            leaves[key] = leaf
             loaded[key] = value
             changed = True
     if changed:

@@ -51,6 +51,7 @@ class PathPair:
         pair: bool = False,
         δLₚ: Any = None,
         stateₚ_in: Any = None,
+        geometry: Any = None,
     ) -> tuple[Any, Any]:
         """Trace one path per lane.
 
@@ -66,11 +67,13 @@ class PathPair:
             state_in: radiance per lane that the primal pass returned, with `Backward`.
             pair: whether the previous state rides along.
             δLₚ, stateₚ_in: likewise for the previous state, with `Backward` and `pair`.
+            geometry: what rays meet in place of `scene` (`poses.Assembly`), or None.
 
         Returns:
             radiance of the current and of the previous state per lane. Both unbiased.
         """
         primal = mode == dr.ADMode.Primal
+        geometry = scene if geometry is None else geometry
         follow_delta = self.changing_delta and (pair or not primal)
         bsdf_ctx = mi.BSDFContext()
 
@@ -91,7 +94,7 @@ class PathPair:
         delta_last = mi.Bool(True)
 
         while dr.hint(active, max_iterations=self.max_depth, label=f"path pair ({mode.name})"):
-            si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
+            si = geometry.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
             bsdf = si.bsdf(ray)
 
             # ---------------------- Direct emission ----------------------
@@ -112,7 +115,7 @@ class PathPair:
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             ds, _ = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
             active_em &= ds.pdf != 0
-            active_em &= ~scene.ray_test(si.spawn_ray_to(ds.p), active_em)
+            active_em &= ~geometry.ray_test(si.spawn_ray_to(ds.p), active_em)
             inv_pdf = dr.select(active_em, dr.rcp(ds.pdf), 0)
             wo = si.to_local(ds.d)
             with dr.resume_grad(when=not primal):

@@ -30,6 +30,7 @@ class ParameterInfo:
         reason: one line; why it is not differentiable or not carried, else "".
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
+        perturbable: whether it can be rendered at other values, all that `image_batch` needs.
     """
 
     shape: tuple[int, ...]
@@ -38,6 +39,7 @@ class ParameterInfo:
     reason: str = ""
     lowest: float | None = None
     highest: float | None = None
+    perturbable: bool = True
 
 
 @dataclass(frozen=True)
@@ -93,15 +95,21 @@ class Renderer(Protocol):
         """This renderer's array with these values."""
         ...
 
-    def select(self, keys: list[str], space: Space | None) -> None:
-        """Announce which parameters will be optimised, before the first render.
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
+        """Announce which parameters will change, before the first render, and whether `adjoint` will be called.
 
-        Raises `InputError` for one that is unknown or not differentiable; with `space="path"` for one that is not carried.
+        Raises `InputError` for one that is unknown, not differentiable where `derivatives` are asked for, or not perturbable; with
+        `space="path"` for one that is not carried.
         """
         ...
 
     def image(self, parameters: Tree, shot: Shot) -> Rendering:
         """Render. Unbiased."""
+        ...
+
+    def image_batch(self, parameters: Tree, shot: Shot) -> Array:
+        """Render many states with the same random numbers: {key: (B, *shape)}, NumPy, to images (B, H, W, 3), all pixels
+        in one group. Unbiased each."""
         ...
 
     def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:

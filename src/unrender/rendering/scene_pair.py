@@ -168,22 +168,24 @@ class ScenePair:
         try:
             shape = native_shape(value)
         except TypeError:
-            return ParameterInfo((), False, False, f"its type {type(value).__name__} has no derivatives")
+            why = f"its type {type(value).__name__} has no derivatives"
+            return ParameterInfo((), False, False, why, perturbable=False)
         if re.match(r"object_\d{9,}\.", key):
-            return ParameterInfo(
-                shape, False, False, "its object has no id in the XML, so its name changes; give it one"
-            )
+            why = "its object has no id in the XML, so its name changes; give it one"
+            return ParameterInfo(shape, False, False, why, perturbable=False)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             why = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
-            return ParameterInfo(shape, False, False, why)
+            able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
+            return ParameterInfo(shape, False, False, why, perturbable=able)
         if not dr.is_float_v(value):
-            return ParameterInfo(shape, False, False, "it holds integers")
+            return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         ride = self.carriage(key)
-        if ride.blind:
-            return ParameterInfo(shape, False, False, ride.reason)
         low, high = _physical_range(self.current_parameters, key)
+        if ride.blind:
+            able = "medium" not in ride.reason
+            return ParameterInfo(shape, False, False, ride.reason, low, high, perturbable=able)
         return ParameterInfo(shape, True, not ride.reason, ride.reason, low, high)
 
 

@@ -1,0 +1,130 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false
+
+"""Posed shapes and sensors against scenes in which they were moved for good."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from zscores import agree
+
+import unrender as ur
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+
+RUNS, SPP, DEPTH = 24, 32, 5
+TURN = np.array([0.3, 0.5, -0.2])
+"""A rotation vector."""
+
+
+def motion(centre: list[float], shift: list[float], scale: float = 1.0) -> Any:
+    """The matrix of TURN about `centre`, with `scale` and `shift`."""
+    angle = float(np.linalg.norm(TURN))
+    there = mi.ScalarTransform4f().translate([c + s for c, s in zip(centre, shift, strict=True)])
+    turned = there.rotate((TURN / angle).tolist(), np.degrees(angle)).scale(scale)
+    return turned.translate([-c for c in centre])
+
+
+def scene(block: Any = None, ball: tuple[float, float, float] = (-0.45, 0.3, 0.2), camera: Any = None) -> dict:
+    """A box lit by a lamp and a sky, a glossy block, a glass ball and a textured one; optionally moved."""
+    described = mi.cornell_box()
+    del described["small-box"], described["large-box"]
+    described["sensor"]["film"] = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    if camera is not None:
+        described["sensor"]["to_world"] = camera @ described["sensor"]["to_world"]
+    described["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}}
+    place = mi.ScalarTransform4f().translate([0.2, 0.1, 0.3]).scale([0.2, 0.35, 0.15])
+    described["block"] = {
+        "type": "cube",
+        "to_world": place if block is None else block @ place,
+        "bsdf": {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4},
+    }
+    described["ball"] = {"type": "sphere", "center": list(ball), "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    return described
+
+
+def theirs(described: dict) -> np.ndarray:
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    loaded = mi.load_dict(described)
+    return np.stack([mi.render(loaded, integrator=path, spp=SPP, seed=100 + run).numpy() for run in range(RUNS)])
+
+
+def ours(parameters: dict[str, Any], keys: list[str] | None = None) -> np.ndarray:
+    renderer = MitsubaRenderer(scene, DEPTH)
+    renderer.select(keys or list(parameters), None, derivatives=False)
+    stacked = {key: np.asarray(value, np.float64)[None] for key, value in parameters.items()}
+    return np.stack([renderer.image_batch(stacked, Shot(0, SPP, run)).numpy()[0] for run in range(RUNS)])
+
+
+def test_posed_shapes_look_as_if_they_had_been_moved() -> None:
+    shift, scale = [-0.2, 0.25, 0.1], 1.3
+    found = ours(
+        {
+            "block.translation": shift,
+            "block.rotation": TURN,
+            "block.scale": scale,
+            "ball.translation.x": 0.1,
+            "ball.translation.y": -0.6,
+        }
+    )
+    moved = theirs(scene(motion([0.2, 0.1, 0.3], shift, scale), (-0.35, -0.3, 0.2)))
+    verdict, figures = agree(found, moved)
+    assert verdict, figures
+    assert not agree(found, theirs(scene(motion([0.2, 0.1, 0.3], shift, 1.0), (-0.35, -0.3, 0.2))))[0], "unscaled"
+
+
+def test_a_posed_sensor_sees_as_if_it_had_been_moved() -> None:
+    shift = [0.2, -0.1, 0.15]
+    found = ours({"sensor.translation": shift, "sensor.rotation": 0.2 * TURN, "ball.translation.y": -0.5})
+    angle = 0.2 * float(np.linalg.norm(TURN))
+    stands = np.array([0, 0, 3.9])
+    there = mi.ScalarTransform4f().translate((stands + shift).tolist())
+    camera = there.rotate((TURN / np.linalg.norm(TURN)).tolist(), np.degrees(angle)).translate((-stands).tolist())
+    verdict, figures = agree(found, theirs(scene(ball=(-0.45, -0.2, 0.2), camera=camera)))
+    assert verdict, figures
+
+
+def test_a_pose_beside_other_parameters() -> None:
+    """Those are the scene's: one launch for each state."""
+    key = "block.bsdf.alpha_u.value"
+    renderer = MitsubaRenderer(scene, DEPTH)
+    renderer.select(["ball.translation", key], None, derivatives=False)
+    states = {"ball.translation": np.array([[0, 0, 0], [0, -0.5, 0.0]]), key: np.array([0.1, 0.5])}
+    both = [renderer.image_batch(states, Shot(0, SPP, run)).numpy() for run in range(RUNS)]
+    for index, (place, alpha) in enumerate((((-0.45, 0.3, 0.2), 0.1), ((-0.45, -0.2, 0.2), 0.5))):
+        described = scene(ball=place)
+        described["block"]["bsdf"]["alpha_u"] = alpha
+        verdict, figures = agree(np.stack([pair[index] for pair in both]), theirs(described))
+        assert verdict, figures
+
+
+def test_all_states_of_a_batch_share_their_random_numbers() -> None:
+    renderer = MitsubaRenderer(scene, DEPTH)
+    renderer.select(["block.rotation.y"], None, derivatives=False)
+    turns = np.array([0.0, 0.7, 0.0, 0.7, 0.0])
+    batch = renderer.image_batch({"block.rotation.y": turns}, Shot(0, 2, 5)).numpy()
+    assert np.array_equal(batch[0], batch[2])
+    assert np.array_equal(batch[1], batch[3])
+    assert not np.array_equal(batch[0], batch[1])
+    alone = renderer.image_batch({"block.rotation.y": turns[1:2]}, Shot(0, 2, 5)).numpy()
+    assert np.array_equal(batch[1], alone[0])
+    assert np.array_equal(batch[1], renderer.image({"block.rotation.y": mi.TensorXf(0.7)}, Shot(0, 2, 5)).images[0])
+    assert not np.array_equal(batch, renderer.image_batch({"block.rotation.y": turns}, Shot(0, 2, 6)).numpy())
+
+
+def test_what_poses_refuse() -> None:
+    renderer = MitsubaRenderer(scene, DEPTH)
+    known = renderer.parameters()
+    assert "light.translation" not in known  # an emitter
+    assert known["block.translation"].shape == (3,)
+    assert known["block.scale"].shape == ()
+    with pytest.raises(ur.InputError, match=r"block\.rotation stands for the same coordinate"):
+        renderer.select(["block.rotation", "block.rotation.y"], None, derivatives=False)
+    with pytest.raises(ur.InputError, match=r"cannot be recovered by path gradients.*SmoothedDerivatives"):
+        renderer.select(["block.rotation"], None)
+    with pytest.raises(ur.InputError, match="cannot go with the pose"):
+        renderer.select(["block.rotation", "sensor.x_fov"], None, derivatives=False)
