@@ -20,6 +20,7 @@ from unrender.variant import use
 
 if TYPE_CHECKING:
     from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, smoothed, statistics
+    from unrender import grey_box as grey_box
     from unrender.gradients.estimate import Estimate
     from unrender.gradients.meta import MetaEstimator
     from unrender.gradients.path import PathGradient
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 _MODULES = (
     "gallery",
+    "grey_box",
     "images",
     "losses",
     "optimizers",
@@ -64,6 +66,7 @@ _HOMES = {
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
     _variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
 
+# Without grey_box, which needs PyTorch: `from unrender import *` and `help(unrender)` must work where that is missing.
 __all__ = [
     "Callback",
     "Estimate",

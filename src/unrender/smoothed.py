@@ -9,6 +9,7 @@ and its standard error. See `statistics/gaussian.py` for the kernels and how the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -121,25 +122,27 @@ def hvp(
     aggregate: bool = True,
     antithetic: bool = True,
     low_discrepancy: bool = False,
-    epsilon: float | None = None,
+    epsilon: float = 0.1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """∇² S f(θ) v and its standard error, (n,) each, without a Hessian: the central difference of two gradients (Eq. 23).
 
-    Both gradients take the same draws (common random numbers), so that what f has in common at θ ± ε v cancels. Biased by the
-    difference: its error is ε² / 6 times the fourth derivative of S f, of the order of (ε |v| / σ)² of the value.
+    Both gradients take the same draws (common random numbers), so that what f has in common at θ ± ε u cancels, where u is v scaled to
+    one σ. Biased by the difference: its error is ε² / 6 times the fourth derivative of S f in units of σ. Where f jumps, the variance
+    falls with 1 / ε, and 0.3 or more serves better than the default.
 
     Args:
-        v: (n,), the direction; its length matters.
-        epsilon: ε; None for the step that moves θ by a tenth of σ along v.
+        v: (n,), the direction; its length scales the product.
+        epsilon: ε, how far θ moves to either side along v, in units of σ, > 0.
 
     The other arguments are those of `gradient`; `samples` counts evaluations of both gradients.
     """
     job = _Job("hvp", f, theta, sigma, samples, seed, antithetic, low_discrepancy, sides=2)
     direction = job.vector("v", v)
     length = float(np.sqrt(np.sum((direction / job.sigma) ** 2)))
+    step = checks.number("smoothed.hvp", "epsilon", epsilon, above=0.0)
     if length == 0.0:
         return np.zeros(job.n), np.zeros(job.n)
-    step = 0.1 / length if epsilon is None else checks.number("smoothed.hvp", "epsilon", epsilon, above=0.0)
+    step /= length
 
     def difference(z: np.ndarray) -> np.ndarray:
         ahead, behind = (job.odd(z, 0.0, job.theta + side * step * direction) for side in (1, -1))
@@ -216,7 +219,11 @@ class _Job:
         parts = []
         for replicate in range(_REPLICATES):
             rng = np.random.default_rng([self.seed, stream, replicate])
-            points = qmc.Sobol(self.n + 1, scramble=True, rng=rng).random(max(self.draws // _REPLICATES, 1))
+            with (
+                warnings.catch_warnings()
+            ):  # of counts that are no power of 2, whose balance is less good and good enough
+                warnings.simplefilter("ignore", UserWarning)
+                points = qmc.Sobol(self.n + 1, scramble=True, rng=rng).random(max(self.draws // _REPLICATES, 1))
             u = _inside(points[:, 1:])
             parts.append(sampler(points[:, 0], u, special.ndtri(u)))
         return np.concatenate(parts)

@@ -46,6 +46,8 @@ class SmoothedDerivatives:
             Ritschel 2023, "FR22" in the paper, whose smoothing is not a Gaussian's; gradients only.
         antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
+        epsilon: of Hessian-vector products, in units of σ, > 0 (see `unrender.smoothed.hvp`): pictures of edges jump, so more than the
+            default there.
         schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.optimizers.schedules`.
     """
 
@@ -58,6 +60,7 @@ class SmoothedDerivatives:
     baseline: bool = True
     low_discrepancy: bool = False
     spp: int = 4
+    epsilon: float = 0.3
     schedule: Schedule | None = None
 
     def __post_init__(self):
@@ -69,6 +72,7 @@ class SmoothedDerivatives:
             checks.number("SmoothedDerivatives", f"sigma of {name}" if name != "sigma" else name, value, above=0.0)
         checks.whole("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
         checks.whole("SmoothedDerivatives", "spp", self.spp, at_least=1)
+        checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
 
     @property
     def provides(self) -> frozenset[str]:
@@ -113,8 +117,9 @@ class SmoothedDerivatives:
             )
 
         def product(v: Tree) -> Tree:
+            direction, samples = flat.ravel(v), 2 * self.samples
             found, _ = smoothed.hvp(
-                box.losses, theta, flat.ravel(v), sigma, 2 * self.samples, seed, self.aggregate, **options
+                box.losses, theta, direction, sigma, samples, seed, self.aggregate, epsilon=self.epsilon, **options
             )
             return flat.unravel(found, parameters)
 
