@@ -11,15 +11,15 @@ import pytest
 from scipy import stats
 
 import unrender as ur
-from unrender.gallery import meshes, textures
+from unrender.gallery import boxes, mesh_files, meshes, textures
 from unrender.rendering.mitsuba_renderer import MitsubaRenderer
 from unrender.rendering.port import Shot
+from unrender.rendering.quadratic import QuadraticRenderer
 
 NAMES = ur.gallery.names()
-RENDERED = [name for name in NAMES if name != "exponential"]
 SMALL = {"resolution": 16, "texture_resolution": 8, "reference_spp": 2048}
 
-# What each problem promises to leave unknown.
+# What each problem of unknown materials and lights promises to leave unknown.
 UNKNOWN = {
     "indirect-room": {"back.bsdf.reflectance.data": (8, 8, 3)},
     "glossy-room": {
@@ -41,7 +41,20 @@ UNKNOWN = {
         "leaves.bsdf.brdf_0.reflectance.data": (8, 8, 3),
     },
     "chalice": {"chalice.bsdf.brdf_0.roughness.data": (8, 8, 1)},
+    "poster": {"poster.bsdf.reflectance.data": (8, 8, 1)},
 }
+RENDERED = list(UNKNOWN)
+
+# What is unknown where poses are, and whether the loss is flat at the start.
+POSES = {
+    "box2": ["box_0.translation.x", "box_0.translation.y"],
+    "box10": [f"box_{number}.translation.{axis}" for number in range(5) for axis in "xy"],
+    "mug": ["mug.rotation.y"],
+    "shadow": ["ball.translation.x", "ball.translation.z"],
+    "bunny": ["bunny.translation.x", "bunny.translation.z", "bunny.rotation.y"],
+}
+PLATEAUS = ["box2", "box10", "mug", "shadow"]
+WITHOUT_RENDERER = ["exponential", "quad"]
 
 
 @pytest.fixture(scope="module", params=RENDERED)
@@ -58,9 +71,12 @@ def renders(
     )
 
 
-def scores(pictures: np.ndarray, reference: np.ndarray, samples: int, reference_samples: int) -> np.ndarray:
+def scores(
+    pictures: np.ndarray, reference: np.ndarray, samples: int, reference_samples: int, rounding: float = 1e-10
+) -> np.ndarray:
     """z scores of mean(pictures) - reference: of each channel of blocks of 4 x 4 pixels, and last of the whole picture but
-    its brightest things. The reference's noise is inferred from the pictures' by the number of samples."""
+    its brightest things. The reference's noise is inferred from the pictures' by the number of
+    samples; `rounding` is a standard error that is there without any noise."""
 
     def parts(x: np.ndarray) -> np.ndarray:
         *lead, height, width, channels = x.shape
@@ -70,7 +86,7 @@ def scores(pictures: np.ndarray, reference: np.ndarray, samples: int, reference_
 
     runs = len(pictures)
     variance = parts(pictures).var(axis=0, ddof=1) * (1 / runs + samples / reference_samples)
-    t = (parts(pictures).mean(axis=0) - parts(reference)) / np.sqrt(variance + 1e-20)
+    t = (parts(pictures).mean(axis=0) - parts(reference)) / np.sqrt(variance + rounding**2)
     return np.abs(stats.norm.isf(stats.t.sf(np.abs(t), runs - 1).clip(1e-300)))
 
 
@@ -84,7 +100,7 @@ def limit(count: int, level: float = 1e-4) -> float:
 
 def test_the_first_problem_is_the_one_to_begin_with():
     assert NAMES[0] == "indirect-room"
-    assert set(RENDERED) == set(UNKNOWN)
+    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, "sphere-to-mesh"} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,8 +114,9 @@ def test_a_summary_is_one_line(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_options_say_kind_and_default(name):
     options = {option.name: option for option in ur.gallery.options(name)}
-    rendered = {"resolution", "texture_resolution", "reference_spp", "max_depth"} if name in RENDERED else set()
-    assert {"loss", *rendered} <= set(options)
+    rendered = {"resolution", "reference_spp", "max_depth"} if name not in WITHOUT_RENDERER else set()
+    textured = {"texture_resolution"} if name in RENDERED else set()
+    assert {"loss", *rendered, *textured} <= set(options)
     assert all(isinstance(option.default, int) for option in options.values() if option.kind is int)
     assert all(option.about for option in options.values())
 
@@ -221,6 +238,8 @@ def test_pictures_are_well_exposed_and_noisy(small):
     for view, given in enumerate(small.views):
         reference = np.asarray(given.reference, float)
         assert 0.02 < np.median(reference) < 0.6
+        if small.name == "poster":
+            continue  # one lamp, direct light: hardly any noise
         noise = np.abs(ur.render(small, small.truth, view, spp=1, seed=5) - reference)
         assert np.median(noise) > 0.1 * np.median(reference)
 
@@ -322,6 +341,281 @@ def test_nothing_but_the_ceiling_sees_the_lamp_of_the_indirect_room():
     assert lit == dict.fromkeys(lit, 0.0)
 
 
+# ---------------------------------------------------------------------------------------------------- poses
+
+
+@pytest.fixture(scope="module", params=POSES)
+def posed(request) -> ur.Problem:
+    return ur.gallery.problem(request.param, reference_spp=256)
+
+
+def losses(problem: ur.Problem, points: np.ndarray, spp: int = 256, seed: int = 7) -> np.ndarray:
+    """The loss in view 0 at points (B, n) of the scalar parameters, with the same random numbers at each."""
+    return np.array(problem.loss_values(0, pictures(problem, points, spp, seed)))
+
+
+def pictures(problem: ur.Problem, points: np.ndarray, spp: int = 256, seed: int = 7):
+    keys = [parameter.key for parameter in problem.parameters]
+    problem.renderer.select(keys, None, derivatives=False)
+    columns = np.asarray(points, np.float32).T
+    return problem.renderer.image_batch(dict(zip(keys, columns, strict=True)), Shot(0, spp, seed))
+
+
+def start_of(problem: ur.Problem) -> np.ndarray:
+    return np.array([float(np.asarray(value).item()) for value in problem.initial().values()])
+
+
+def test_poses_are_counted_from_the_truth(posed):
+    assert [parameter.key for parameter in posed.parameters] == POSES[posed.name]
+    assert {key: value.tolist() for key, value in posed.truth.items()} == dict.fromkeys(POSES[posed.name], 0.0)
+    for key, (low, high) in posed.bounds.items():
+        for value in (0.0, float(np.asarray(posed.initial()[key]).item())):
+            assert low is None or low < value
+            assert high is None or value < high
+    # The smallest is how far one square moves along its longer side.
+    assert all(error > 0.04 for error in posed.parameter_error(posed.initial()).values())
+    assert posed.notices == []
+
+
+def test_the_true_poses_render_to_the_reference_and_the_starts_do_not(posed):
+    reference, truth = np.asarray(posed.views[0].reference, float), 0 * start_of(posed)
+    seen = np.concatenate([np.array(pictures(posed, truth[None], spp=32, seed=100 + run)) for run in range(24)])
+    true = scores(seen.astype(float), reference, 32, 256, rounding=1e-4)
+    assert true.max() < limit(true.size)
+    false, least = losses(posed, np.stack([start_of(posed), truth]))
+    assert false > 100 * least
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_a_plateau_is_flat_and_there_is_none_for_the_bunny(name):
+    problem = ur.gallery.problem(name, reference_spp=256)
+    start = start_of(problem)
+    moves = np.concatenate([np.zeros((1, start.size)), 0.03 * np.eye(start.size), -0.03 * np.eye(start.size)])
+    here, *there = losses(problem, start + moves)
+    change = np.abs(np.array(there) / here - 1)
+    if name in PLATEAUS:
+        assert change.max() < 0.01  # that of pixels which an edge divides
+    else:
+        assert change[[0, 1, 3, 4]].min() > 0.02
+
+
+def test_a_cup_with_its_handle_hidden_looks_the_same_whichever_way_it_is_turned():
+    problem = ur.gallery.problem("mug", reference_spp=64)
+    start = start_of(problem)
+    turns = np.radians([[0.0], [-10.0], [10.0], [-60.0]])
+    seen = np.array(pictures(problem, start + turns, spp=1024))
+    difference = np.abs(seen - seen[0]).max(axis=-1)
+    # What is left lies at outlines, which are polygons'.
+    assert [np.mean(picture > 0.01) < 0.005 for picture in difference] == [True, True, True, False]
+    assert difference[3].mean() > 50 * difference[1:3].mean()
+
+
+def test_the_pose_of_the_cup_turns_it_about_its_axis():
+    shapes = ur.gallery.problem("mug", resolution=4, reference_spp=1).renderer.pair.current.shapes()  # pyright: ignore[reportAttributeAccessIssue]
+    box = next(shape for shape in shapes if shape.id() == "mug").bbox()
+    np.testing.assert_allclose(np.array(box.center()).reshape(3)[[0, 2]], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["box2", "shadow"])
+def test_what_moves_stays_in_the_picture_within_its_bounds(name):
+    problem = ur.gallery.problem(name, reference_spp=1)
+    corners = np.array(list(problem.bounds.values()), float)
+    points = np.array([(0, 0)] + [(corners[0, a], corners[1, b]) for a in (0, 1) for b in (0, 1)])
+    brightness = np.array(pictures(problem, points)).mean(axis=(1, 2))
+    np.testing.assert_allclose(brightness[1:], brightness[[0] * 4], rtol=2e-3)
+
+
+def test_no_square_is_drawn_to_the_place_of_another():
+    contrasts = np.array([square.colour for square in boxes._FIVE]) - boxes._GREY
+    products = contrasts @ contrasts.T
+    assert np.all(products[~np.eye(5, dtype=bool)] <= 1e-12)
+    assert np.all(np.abs(contrasts).max(axis=1) >= 0.4 - 1e-12)
+
+
+def test_the_ball_itself_is_never_in_the_picture():
+    problem = ur.gallery.problem("shadow", resolution=16, reference_spp=1)
+    sensor = problem.renderer.pair.current.sensors()[0]  # pyright: ignore[reportAttributeAccessIssue]
+    u = (np.arange(64) + 0.5) / 64
+    grid = mi.Point2f(*(axis.ravel().astype(np.float32) for axis in np.meshgrid(u, u)))
+    ray, _ = sensor.sample_ray(0, 0.5, grid, 0.5)
+    origin, direction = np.array(ray.o), np.array(ray.d)
+    assert origin[1].max() < 4 - 0.32  # below the ball
+    assert direction[1].max() < 0  # and looking down
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma", "rate", "steps"),
+    [("box2", 0.35, 0.05, 90), ("mug", 0.6, 0.05, 100), ("shadow", 0.35, 0.05, 90), ("bunny", 0.15, 0.03, 90)],
+)
+def test_smoothed_derivatives_find_the_pose(name, sigma, rate, steps):
+    problem = ur.gallery.problem(name, resolution=24, reference_spp=256)
+    schedule = ur.optimizers.schedules.Exponential(steps / 2)
+    estimator = ur.SmoothedDerivatives(sigma=sigma, samples=32, schedule=schedule)
+    result = ur.optimize(problem, estimator, ur.optimizers.Adam(rate), steps=steps, seed=3)
+    errors = problem.parameter_error(result.parameters)
+    assert max(errors.values()) < 0.08, errors
+
+
+# ---------------------------------------------------------------------------------------------------- meshes
+
+
+SPHERE = {"resolution": 16, "reference_spp": 64, "subdivisions": 1, "views": 3}
+
+
+def test_the_sphere_has_the_vertices_that_were_asked_for_and_no_truth():
+    for subdivisions, count in ((1, 42), (3, 642)):
+        problem = ur.gallery.problem("sphere-to-mesh", **SPHERE | {"subdivisions": subdivisions, "reference_spp": 1})
+        points = np.array(problem.initial()["sphere.vertex_positions"]).reshape(-1, 3)
+        assert points.shape == (count, 3)
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.7, rtol=1e-5)
+        assert problem.truth == {}
+        assert [view.sensor for view in problem.views] == [0, 1, 2]
+
+
+def test_every_view_tells_the_sphere_from_the_body():
+    problem = ur.gallery.problem("sphere-to-mesh", **SPHERE)
+    ball = {key: np.array(value) for key, value in problem.initial().items()}
+    for view in range(3):
+        reference = np.asarray(problem.views[view].reference, float)
+        assert np.isfinite(reference).all()
+        false = scores(renders(problem, ball, view, runs=8), reference, 32, 64, rounding=1e-4)
+        assert false.max() > 1.3 * limit(false.size)
+
+
+def test_smoothed_derivatives_bring_the_sphere_nearer_to_the_body():
+    problem = ur.gallery.problem("sphere-to-mesh", **SPHERE)
+    estimator = ur.SmoothedDerivatives(sigma=0.05, samples=32, spp=2)
+    result = ur.optimize(problem, estimator, ur.optimizers.Adam(0.02), steps=12, seed=1)
+    first, last = (sum(step["loss"] for step in part) for part in (result.history[:2], result.history[-2:]))
+    assert last < 0.8 * first
+
+
+TETRAHEDRON = """v 0 0 0
+v 3 0 0
+v 0 3 0
+v 0 0 3
+f 1 3 2
+f 1 4 3
+f 1 2 4
+f 2 3 4
+"""
+
+
+@pytest.mark.parametrize(("name", "scale"), [("bunny", 1.0), ("sphere-to-mesh", 2.0)])
+def test_a_mesh_from_a_file_is_brought_to_size_and_place(name, scale, tmp_path):
+    path = tmp_path / "body.obj"
+    path.write_text(TETRAHEDRON)
+    problem = ur.gallery.problem(name, mesh=path, resolution=8, reference_spp=1)
+    assert [parameter.key for parameter in problem.parameters] == POSES.get(name, ["sphere.vertex_positions"])
+    made = mesh_files.standing if name == "bunny" else mesh_files.centred
+    box = mi.load_dict(made(str(path), {"type": "diffuse"})).bbox()
+    low, high = np.array(box.min).reshape(3), np.array(box.max).reshape(3)
+    np.testing.assert_allclose(high - low, scale, rtol=1e-6)
+    np.testing.assert_allclose((low + high) / 2, [0, 0.5 if name == "bunny" else 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["bunny", "sphere-to-mesh"])
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("body.obj", None, "no such file"),
+        ("body.stl", "solid", "must be the path of a .ply or .obj file"),
+        ("body.obj", "nonsense", "Mitsuba could not read it"),
+        ("body.ply", "nonsense", "Mitsuba could not read it"),
+        ("body.obj", "v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "expected vertices with some extent"),
+        ("body.obj", "v 0 0 0\nv 0 0 1\nv 0 1 0\nf 1 2 9\n", "Mitsuba could not read it"),
+    ],
+)
+def test_a_mesh_that_cannot_be_read_is_one_clear_line(name, file, text, message, tmp_path):
+    path = tmp_path / file
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ur.InputError) as caught:
+        ur.gallery.problem(name, mesh=str(path), resolution=8, reference_spp=1)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("given", [7, None, ["body.obj"]])
+def test_a_mesh_is_given_by_its_path(given):
+    with pytest.raises(ur.InputError, match=r"mesh must be the path of a \.ply or \.obj file, got"):
+        ur.gallery.problem("bunny", mesh=given)
+
+
+@pytest.mark.parametrize("name", [*POSES, "poster", "sphere-to-mesh"])
+def test_equal_calls_give_equal_problems(name):
+    first, second = (ur.gallery.problem(name, resolution=8, reference_spp=4) for _ in range(2))
+    for a, b in zip(first.views, second.views, strict=True):
+        np.testing.assert_array_equal(a.reference, b.reference)
+    for key, value in first.initial().items():
+        np.testing.assert_array_equal(np.array(value), np.array(second.initial()[key]))
+
+
+def test_the_poster_is_a_thousand_numbers_by_default():
+    problem = ur.gallery.problem("poster", reference_spp=1)
+    assert {key: value.shape for key, value in problem.truth.items()} == {"poster.bsdf.reflectance.data": (32, 32, 1)}
+
+
+# ---------------------------------------------------------------------------------------------------- the quadratic
+
+
+def test_the_loss_of_the_quadratic_is_the_polynomial():
+    problem = ur.gallery.problem("quad")
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(20, 2))
+    batch = problem.renderer.image_batch({"x": points}, Shot(0, 1, 0))
+    polynomial = 5 * points[:, 0] ** 2 + 5 * points[:, 1] ** 2 + 7.5 * points[:, 0] * points[:, 1]
+    np.testing.assert_allclose(problem.loss_values(0, batch), polynomial, rtol=1e-12)
+    for point, image in zip(points, batch, strict=True):
+        np.testing.assert_allclose(problem.renderer.image({"x": point}, Shot(0, 4, 1, groups=2)).images, [image] * 2)
+    assert np.asarray(problem.initial()["x"]).tolist() == [1.5, 1.0]
+    assert problem.loss_value(0, np.zeros((1, 1, 3))) == 0
+
+
+def test_the_gradient_of_the_quadratic_is_exact():
+    problem = ur.gallery.problem("quad")
+    point = np.array([0.3, -1.1])
+    renderer = problem.renderer
+    for shot in (Shot(0, 2, 1, groups=2), Shot(0, 2, 1, groups=2, pixels=np.array([0]))):
+        rendering = renderer.image_pair({"x": point}, {"x": 2 * point}, shot, "path")
+        assert rendering.images.shape == ((2, 1, 1, 3) if shot.pixels is None else (2, 1, 3))
+        weights, weights_before = (np.asarray(images) * 2 / 3 for images in (rendering.images, rendering.previous))
+        now, before = renderer.adjoint_pair({"x": point}, {"x": 2 * point}, rendering.paths, weights, weights_before)
+        np.testing.assert_allclose(now["x"], [10 * 0.3 - 7.5 * 1.1, -10 * 1.1 + 7.5 * 0.3], rtol=1e-12)
+        np.testing.assert_allclose(before["x"], 2 * now["x"], rtol=1e-12)
+
+
+def test_newton_solves_the_quadratic_in_a_few_steps_and_path_gradients_descend_it():
+    problem = ur.gallery.problem("quad")
+    estimator = ur.SmoothedDerivatives(sigma=0.3, samples=4096, order="hessian")
+    found = ur.optimize(problem, estimator, ur.optimizers.Newton(trust_radius=None), steps=4, seed=0)
+    assert max(problem.parameter_error(found.parameters).values()) < 0.1
+    found = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.1), steps=200)
+    assert max(problem.parameter_error(found.parameters).values()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("matrix", "point", "message"),
+    [
+        (np.eye(4), np.zeros(4), "n from 1 to 3"),
+        (np.eye(2), np.zeros(3), "n from 1 to 3"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), np.zeros(2), "symmetric"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), np.zeros(2), "no eigenvalue below 0"),
+    ],
+)
+def test_a_form_that_no_picture_has_is_refused(matrix, point, message):
+    with pytest.raises(ur.InputError, match=message):
+        QuadraticRenderer(matrix, point)
+
+
+def test_the_quadratic_knows_its_one_parameter():
+    renderer = QuadraticRenderer(np.eye(3), np.ones(3))
+    renderer.select(["x"], "path")
+    np.testing.assert_array_equal(renderer.values(["x"])["x"], 1)
+    with pytest.raises(ur.InputError, match="parameter y: the scene has none of that name; it has x"):
+        renderer.select(["y"], None)
+
+
 # ---------------------------------------------------------------------------------------------------- pieces
 
 
@@ -378,6 +672,66 @@ def test_a_lathed_cylinder_has_its_area_its_normals_and_its_texture_coordinates(
     cosine = -np.array(si.sh_frame.n.x * d.x + si.sh_frame.n.y * d.y + si.sh_frame.n.z * d.z)
     np.testing.assert_allclose(cosine, 1, atol=1e-4)
     assert np.all(np.array(si.n.x * d.x + si.n.z * d.z) < 0)  # the front is outside
+
+
+@pytest.mark.parametrize("subdivisions", [0, 1, 3])
+def test_an_icosphere_is_a_closed_sphere_that_faces_outward(subdivisions):
+    points, faces = meshes.icosphere(subdivisions)
+    assert points.shape == (10 * 4**subdivisions + 2, 3)
+    assert faces.shape == (20 * 4**subdivisions, 3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, rtol=1e-12)
+    a, b, c = points[faces.T]
+    volume = np.einsum("ij,ij->i", np.cross(a, b), c) / 6
+    assert np.all(volume > 0)
+    assert volume.sum() < 4 / 3 * np.pi
+    if subdivisions == 3:
+        assert volume.sum() > 0.98 * 4 / 3 * np.pi
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = {(int(i), int(j)) for i, j in sides}
+    assert len(there) == len(sides)
+    assert all((j, i) in there for i, j in there)
+
+
+def test_a_swept_circle_is_a_torus_that_faces_outward():
+    angle = np.linspace(0, np.pi, 65)
+    path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    mesh = meshes.sheets("handle", [meshes.Sheet(meshes.sweep(path, 0.2, 48))], {"type": "diffuse"})
+    assert float(np.array(mesh.surface_area()).item()) == pytest.approx(np.pi * 2 * np.pi * 0.2, rel=2e-3)
+    si = mi.load_dict({"type": "scene", "mesh": mesh}).ray_intersect(
+        mi.Ray3f(mi.Point3f(0, 3, 0.01), mi.Vector3f(0, -1, 0))
+    )
+    assert float(np.array(si.t).item()) == pytest.approx(1.8, abs=2e-3)
+    assert float(np.array(si.n.y).item()) > 0.9
+    assert float(np.array(si.sh_frame.n.y).item()) > 0.99
+
+
+def test_sheets_make_one_mesh_whose_fronts_are_outside():
+    axes = np.diag([0.5, 1.0, 0.5])
+    pieces = [meshes.Sheet(meshes.ellipsoid(axes, np.array(centre), 24, 32)) for centre in ((-1, 0, 0), (1, 0.5, 0))]
+    mesh = meshes.sheets("pair", pieces, {"type": "diffuse"})
+    assert mesh.vertex_count() == 2 * 24 * 33
+    box = mesh.bbox()
+    np.testing.assert_allclose(np.array(box.min).reshape(3), [-1.5, -1, -0.5], atol=6e-3)
+    np.testing.assert_allclose(np.array(box.max).reshape(3), [1.5, 1.5, 0.5], atol=6e-3)
+    scene = mi.load_dict({"type": "scene", "mesh": mesh})
+    si = scene.ray_intersect(
+        mi.Ray3f(mi.Point3f([-1, 1, -1, 1], [0, 0.5, 0, 0.5], [3, 3, -3, -3]), mi.Vector3f(0, 0, [-1, -1, 1, 1]))
+    )
+    np.testing.assert_allclose(np.array(si.t), 2.5, atol=1e-2)
+    np.testing.assert_allclose(np.abs(np.array(si.sh_frame.n.z)), 1, atol=1e-2)
+    assert np.all(np.array(si.n.z) * [1, 1, -1, -1] > 0.9)
+
+
+def test_the_normals_of_triangles_follow_their_vertices():
+    points, faces = meshes.icosphere(2)
+    mesh = meshes.triangles("ball", points, faces, {"type": "diffuse"})
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float((points * [1, 0.5, 1]).ravel().astype(np.float32))
+    parameters.update()
+    normals = np.array(parameters["vertex_normals"]).reshape(-1, 3)
+    expected = points / [1, 0.5, 1]
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    assert np.min(np.einsum("ij,ij->i", normals, expected)) > 0.97
 
 
 def test_the_sun_of_the_vase_casts_the_light_that_its_direction_says():

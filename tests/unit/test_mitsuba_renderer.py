@@ -246,3 +246,12 @@ def test_replayed_kernels_follow_every_value_that_numpy_hands_over(channels: int
         renderer._frozen.clear()
         fresh = np.array(renderer.image({key: renderer.array(value)}, Shot(0, 4, 5)).images)
         np.testing.assert_array_equal(image, fresh)
+
+
+def test_a_number_stays_a_number() -> None:
+    """Of shape (), in and out."""
+    problem = ur.gallery.problem("mug", resolution=8, reference_spp=1)
+    key = "mug.rotation.y"
+    assert problem.renderer.array(np.array(0.25)).shape == ()
+    assert problem.initial()[key].shape == ()
+    assert ur.render(problem, problem.truth, spp=1).shape == (8, 8, 3)

@@ -1,7 +1,9 @@
-"""Meshes made in code: a sheet of quadrilaterals over a grid, flat, bulged or turned on a lathe."""
+"""Meshes made in code: sheets of quadrilaterals over grids, flat, bulged, turned on a lathe or swept along a path; spheres of triangles."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -21,21 +23,79 @@ def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool =
     Returns:
         `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
     """
-    rows, columns = positions.shape[:2]
-    v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
-    number = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return sheets(name, [Sheet(positions, closed)], bsdf)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One of several that make a mesh.
+
+    Attributes:
+        positions: (rows, columns, 3), as for `sheet`.
+        closed: whether the last column lies on the first one.
+    """
+
+    positions: np.ndarray
+    closed: bool = True
+
+
+def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
+    """Several sheets as one smooth mesh, so that they move as one shape; where they pass through one another, nothing is cut.
+
+    Args:
+        name: the mesh's id.
+        pieces: at least one; texture coordinates run from 0 to 1 on each.
+        bsdf: its material.
+
+    Returns:
+        `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
+    """
+    positions, coordinates, normals, faces, count = [], [], [], [], 0
+    for piece in pieces:
+        rows, columns = piece.positions.shape[:2]
+        v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+        number = count + np.arange(rows * columns).reshape(rows, columns)
+        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+        faces += [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
+        positions.append(piece.positions.reshape(-1, 3))
+        coordinates.append(np.stack([u, v], -1).reshape(-1, 2))
+        normals.append(_normals(piece.positions, piece.closed).reshape(-1, 3))
+        count += rows * columns
+    mesh = _mesh(name, np.concatenate(positions), np.concatenate(faces), bsdf, np.concatenate(coordinates))
+    # In a second update: Mitsuba replaces the normals, with a crease at the seam, whenever positions change.
+    parameters = mi.traverse(mesh)
+    parameters["vertex_normals"] = mi.Float(np.concatenate(normals).ravel().astype(np.float32))
+    parameters.update()
+    return mesh
+
+
+def triangles(name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any]) -> Any:
+    """A smooth mesh of triangles without texture coordinates, whose normals follow its vertices when these move.
+
+    Args:
+        name: the mesh's id.
+        positions: (V, 3).
+        faces: (F, 3), vertex numbers, counter-clockwise seen from outside.
+        bsdf: its material.
+
+    Returns:
+        `mitsuba.Mesh` with normals; an entry of a scene dictionary.
+    """
+    return _mesh(name, positions, faces, bsdf)
+
+
+def _mesh(
+    name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
+) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(name, rows * columns, len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=True)
+    textured = coordinates is not None
+    mesh = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=textured)
     parameters = mi.traverse(mesh)
     parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
     parameters["vertex_positions"] = mi.Float(positions.ravel().astype(np.float32))
-    parameters["vertex_texcoords"] = mi.Float(np.stack([u, v], -1).ravel().astype(np.float32))
-    parameters.update()
-    # In a second update: Mitsuba replaces the normals, with a crease at the seam, whenever positions change.
-    parameters["vertex_normals"] = mi.Float(_normals(positions, closed).ravel().astype(np.float32))
+    if coordinates is not None:
+        parameters["vertex_texcoords"] = mi.Float(coordinates.ravel().astype(np.float32))
     parameters.update()
     return mesh
 
@@ -56,6 +116,64 @@ def lathe(radius: np.ndarray, height: np.ndarray, columns: int) -> np.ndarray:
         ],
         axis=-1,
     )
+
+
+def sweep(path: np.ndarray, radius: float | np.ndarray, columns: int) -> np.ndarray:
+    """The points of a circle swept along a path in a plane z = constant: (rows, columns + 1, 3), closed, open at its ends.
+
+    Args:
+        path: (rows, 3), all z alike; no two consecutive points the same.
+        radius: of the circle, one or (rows,); less than the path's radius of curvature.
+        columns: how many steps around.
+    """
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    binormal = np.array([0.0, 0.0, 1.0])
+    normal = np.cross(binormal, tangent)
+    angle = np.linspace(-np.pi, np.pi, columns + 1)[None, :, None]
+    around = np.cos(angle) * normal[:, None] + np.sin(angle) * binormal
+    return path[:, None] + np.broadcast_to(radius, len(path))[:, None, None] * around
+
+
+def ellipsoid(axes: np.ndarray, centre: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """The points of a sphere under a linear map: (rows, columns + 1, 3), closed, facing outward.
+
+    Args:
+        axes: (3, 3), its columns the half-axes that x, y and z go to, right-handed; the poles lie along the second.
+        centre: (3,).
+        rows, columns: of the grid, from pole to pole and around.
+    """
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, rows)
+    # Not quite to the poles, where a sheet has no normal.
+    return lathe(np.maximum(np.cos(latitude), 1e-3), np.sin(latitude), columns) @ np.asarray(axes, float).T + centre
+
+
+def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """The unit sphere as triangles of nearly equal size: positions (10 · 4ˢ + 2, 3) and faces (20 · 4ˢ, 3), facing outward.
+
+    Args:
+        subdivisions: s, how often each triangle of the icosahedron is cut into four.
+    """
+    from scipy.spatial import ConvexHull
+
+    golden = (1 + 5**0.5) / 2
+    corners = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
+    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices
+    a, b, c = points[faces.T]
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    for _ in range(subdivisions):
+        # Every edge belongs to two triangles, which share its midpoint.
+        sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        edges, which = np.unique(sides, axis=0, return_inverse=True)
+        ab, bc, ca = which.reshape(3, -1) + len(points)
+        middles = points[edges].sum(axis=1)
+        points = np.concatenate([points, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+        a, b, c = faces.T
+        faces = np.concatenate([np.stack(t, -1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
+    return points, faces
 
 
 def _normals(positions: np.ndarray, closed: bool) -> np.ndarray:

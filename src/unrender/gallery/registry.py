@@ -7,13 +7,20 @@ from typing import Any
 from unrender.errors import InputError
 from unrender.gallery import fields
 from unrender.gallery.ajar import Ajar
+from unrender.gallery.boxes import Box2, Box10
+from unrender.gallery.bunny import Bunny
 from unrender.gallery.chalice import Chalice
 from unrender.gallery.exponential import Exponential
 from unrender.gallery.fields import Option
 from unrender.gallery.glossy_room import GlossyRoom
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.lamp import Lamp
+from unrender.gallery.mug import Mug
+from unrender.gallery.poster import Poster
+from unrender.gallery.quad import Quad
 from unrender.gallery.recipe import cook
+from unrender.gallery.shadow import Shadow
+from unrender.gallery.sphere_to_mesh import SphereToMesh
 from unrender.gallery.spiral import Spiral
 from unrender.gallery.sunlit_vase import SunlitVase
 from unrender.names import did_you_mean
@@ -28,7 +35,18 @@ _RECIPES: dict[str, type] = {
     "ajar": Ajar,
     "chalice": Chalice,
     "exponential": Exponential,
+    "quad": Quad,
+    "box2": Box2,
+    "box10": Box10,
+    "mug": Mug,
+    "shadow": Shadow,
+    "bunny": Bunny,
+    "poster": Poster,
+    "sphere-to-mesh": SphereToMesh,
 }
+
+_OWN = (Exponential, Quad, SphereToMesh)
+"""Those that make their problem themselves: no renderer, or references of another scene."""
 
 
 def names() -> list[str]:
@@ -47,14 +65,15 @@ def options(name: str) -> list[Option]:
 
 
 def problem(name: str, **options: Any) -> Problem:
-    """A problem made by code, with its truth known: its scene, its references (rendered now), where the descent starts.
+    """A problem made by code, its truth known wherever there is one: its scene, its references (rendered now), where the descent starts.
 
         problem("indirect-room", resolution=64, texture_resolution=64)
 
     Args:
         name: one of `names()`.
-        options: see `options(name)`. All have loss, and those that are rendered resolution (pixels along a side),
-            texture_resolution, reference_spp and max_depth; the defaults take seconds on two CPU cores, a GPU wants larger ones.
+        options: see `options(name)`. All have loss, those that are rendered resolution (pixels along a side),
+            reference_spp and max_depth, and those of unknown textures texture_resolution; the defaults take seconds on two CPU
+            cores, a GPU wants larger ones.
 
     Returns:
         the problem. Its references hold noise of their own, which `reference_spp` lowers.
@@ -64,7 +83,7 @@ def problem(name: str, **options: Any) -> Problem:
         VariantError: Mitsuba cannot run on this machine.
     """
     recipe = fields.fill(name, _recipe(name), options)
-    return recipe.problem(name) if isinstance(recipe, Exponential) else cook(name, recipe)
+    return recipe.problem(name) if isinstance(recipe, _OWN) else cook(name, recipe)
 
 
 def _recipe(name: str) -> type:

@@ -105,8 +105,9 @@ class MitsubaRenderer:
         Dr.Jit would borrow NumPy's memory, and frozen kernels then read stale texels or abort (Dr.Jit 1.5, where a texture has 1 or 4
         channels and so is stored as it is given).
         """
-        borrowed = mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
-        owned = mi.TensorXf(borrowed.array * dr.opaque(mi.Float, 1), tuple(borrowed.shape))
+        shape = np.shape(values)
+        borrowed = mi.Float(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
+        owned = mi.TensorXf(borrowed * dr.opaque(mi.Float, 1), shape)
         dr.eval(owned)
         return owned
 

@@ -1,0 +1,77 @@
+"""`bunny`: where an animal stands and which way it looks.
+
+After Wang et al., section 4: the task without a plateau, where a descent on the picture as it is can succeed as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, mesh_files, meshes, parts, staging
+from unrender.losses import L2, Loss
+from unrender.problem.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class Bunny:
+    """Where an animal stands and which way it looks: three numbers, from a start that overlaps the reference.
+
+    One view; the unknowns are x and z of its translation and its rotation about the vertical. No plateau: it starts a fraction of its
+    size away and turned by a third of a right angle. What makes it hard is that the three trade against one another in the
+    silhouette. The animal is made by code, or comes from a file.
+    """
+
+    resolution: int = fields.resolution(48)
+    mesh: str = mesh_files.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
+    reference_spp: int = fields.reference_spp(1024)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The animal: 1 along its longest side, on the floor y = 0 at the origin, the sun at the camera's left."""
+        fur = parts.twosided(parts.diffuse(0.75, 0.6, 0.45))
+        made = mesh_files.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(), fur)
+        return {
+            "type": "scene",
+            "camera": parts.camera((0.1, 2.0, 3.0), (0.1, 0.33, 0), 30.0, self.resolution),
+            "sun": staging.sun((-0.6, 1.0, 0.7), 1.2),
+            "floor": parts.rectangle((0, 0, 0), (6, 0, 0), (0, 0, -6), parts.diffuse(0.25, 0.4, 0.25)),
+            "bunny": made,
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Place and direction, from the truth."""
+        return (
+            *staging.unknown("bunny", "translation", {"x": -0.22, "z": 0.25}, bounds=(-0.6, 0.6)),
+            *staging.unknown("bunny", "rotation", {"y": np.radians(30.0)}),
+        )
+
+
+def _animal() -> list[meshes.Sheet]:
+    """A sitting hare that looks along +x and a little to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
+
+    def ball(centre: tuple[float, ...], radii: tuple[float, ...], tilt: float = 0.0) -> meshes.Sheet:
+        c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+        turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(radii)
+        return meshes.Sheet(_turned(meshes.ellipsoid(turned, np.array(centre), 16, 24)))
+
+    return [
+        ball((-0.05, 0.27, 0), (0.36, 0.25, 0.23), 12),
+        ball((-0.2, 0.2, 0.12), (0.2, 0.2, 0.13)),
+        ball((-0.2, 0.2, -0.12), (0.2, 0.2, 0.13)),
+        ball((0.2, 0.2, 0), (0.12, 0.2, 0.14)),
+        ball((0.3, 0.53, 0), (0.17, 0.15, 0.14), -15),
+        ball((0.43, 0.49, 0), (0.08, 0.07, 0.08)),
+        ball((0.2, 0.8, 0.08), (0.06, 0.22, 0.04), 18),
+        ball((0.2, 0.8, -0.08), (0.06, 0.22, 0.04), 18),
+        ball((-0.42, 0.28, 0), (0.08, 0.08, 0.08)),
+    ]
+
+
+def _turned(points: np.ndarray) -> np.ndarray:
+    """Points turned about y, +x towards the camera, by 35 degrees."""
+    c, s = np.cos(np.radians(35)), np.sin(np.radians(35))
+    return points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]).T

@@ -1,0 +1,91 @@
+"""`sphere-to-mesh`: the shape of a body, from pictures all around it, by moving the vertices of a sphere.
+
+After Wang et al., Fig. 5. Where a vertex belongs is not defined, only what surface all of them make: many arrangements give the same
+pictures, and none is the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, mesh_files, meshes, parts, staging, textures
+from unrender.gallery.recipe import reference
+from unrender.losses import L2, Loss
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.scene_pair import load
+
+_RADIUS = 0.7
+"""Of the sphere; the body fits into a ball of radius 1 or so."""
+
+
+@dataclass(frozen=True)
+class SphereToMesh:
+    """The shape of a body seen from all around, by moving every vertex of a sphere.
+
+    Several views; the unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, from a sphere at the body's
+    middle. Their truth is unknown: vertices may slide along the surface. What is hard is their number, that most of what pictures tell
+    of a shape is in its silhouette, which path gradients do not see, and that nothing keeps the mesh smooth.
+    """
+
+    resolution: int = fields.resolution(48)
+    views: int = fields.whole(6, "cameras, around the body, by turns lower and higher", at_least=1, at_most=32)
+    subdivisions: int = fields.whole(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
+    mesh: str = mesh_files.option("PLY or OBJ file of the body, in place of the one made by code")
+    reference_spp: int = fields.reference_spp(512)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The sphere floating over a floor, under a sun, the cameras looking down: on its dark side too, the floor shows its outline."""
+        points, faces = meshes.icosphere(self.subdivisions)
+        return self._stage() | {"sphere": meshes.triangles("sphere", _RADIUS * points, faces, _clay())}
+
+    def target(self) -> dict[str, Any]:
+        """The same with the body in place of the sphere."""
+        if self.mesh:
+            return self._stage() | {"body": mesh_files.centred(self.mesh, _clay())}
+        points, faces = meshes.icosphere(5)
+        return self._stage() | {"body": meshes.triangles("body", _body(points), faces, _clay())}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The vertices, where the sphere has them."""
+        return (Parameter("sphere.vertex_positions"),)
+
+    def problem(self, name: str) -> Problem:
+        """The problem: the sphere's scene, and the body's pictures by Mitsuba's own `path` integrator."""
+        true = load(self.target)
+        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
+        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
+        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
+
+    def _stage(self) -> dict[str, Any]:
+        angles = 2 * np.pi * np.arange(self.views) / self.views
+        heights = np.where(np.arange(self.views) % 2 == 0, 1.9, 3.2)
+        return {
+            "type": "scene",
+            **{
+                f"camera_{number}": parts.camera(
+                    (3.8 * np.sin(angle), height, 3.8 * np.cos(angle)), (0, -0.1, 0), 34.0, self.resolution
+                )
+                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
+            },
+            "sun": staging.sun((0.35, 1.0, 0.45), 1.0),
+            "floor": parts.rectangle((0, -1.3, 0), (20, 0, 0), (0, 0, -20), parts.diffuse(0.12, 0.18, 0.25)),
+        }
+
+
+def _clay() -> dict[str, Any]:
+    return parts.twosided(parts.diffuse(0.8, 0.7, 0.55))
+
+
+def _body(directions: np.ndarray) -> np.ndarray:
+    """A pear with a bent neck and a dent in its side, from the unit sphere: (V, 3)."""
+    x, y, z = directions.T
+    neck = textures.ramp(y, -0.1, 0.9)
+    width = 0.78 - 0.42 * neck - 0.18 * np.exp(-((x - 0.9) ** 2 + (y + 0.2) ** 2 + z**2) / 0.12)
+    return np.stack([width * x + 0.3 * neck**2, 0.9 * y - 0.05, width * z - 0.1 * neck**2], -1)
