@@ -21,6 +21,7 @@ from unrender.variant import use
 if TYPE_CHECKING:
     from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, smoothed, statistics
     from unrender import grey_box as grey_box
+    from unrender.gradients.black_box import LossValues
     from unrender.gradients.estimate import Estimate
     from unrender.gradients.meta import MetaEstimator
     from unrender.gradients.path import PathGradient
@@ -50,6 +51,7 @@ _HOMES = {
     "Callback": "training.callbacks",
     "Estimate": "gradients.estimate",
     "Key": "keys",
+    "LossValues": "gradients.black_box",
     "MetaEstimator": "gradients.meta",
     "Parameter": "problem.parameter",
     "PathGradient": "gradients.path",
@@ -72,6 +74,7 @@ __all__ = [
     "Estimate",
     "InputError",
     "Key",
+    "LossValues",
     "MetaEstimator",
     "Parameter",
     "PathGradient",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
-import drjit as dr
 import numpy as np
 
 from unrender import arrays
@@ -12,30 +12,30 @@ from unrender.trees import Tree
 
 
 def ravel(tree: Tree) -> np.ndarray:
-    """All elements in key order, (n,), double precision."""
+    """All elements in key order, (n,), double precision. Waits for the device."""
     return np.concatenate([arrays.numpy(x).ravel().astype(np.float64) for x in tree.values()])
 
 
 def unravel(vector: np.ndarray, like: Tree) -> Tree:
-    """The tree of the shapes and kinds of `like` with these elements; the inverse of `ravel`."""
+    """The tree of the shapes and types of `like` with these elements, in memory of its own; the inverse of `ravel`."""
     found, start = {}, 0
     for key, x in like.items():
-        size = int(np.prod(arrays.shape(x)))
+        size = math.prod(arrays.shape(x))
         part = vector[start : start + size].reshape(arrays.shape(x))
         start += size
-        if arrays.is_drjit(x):  # in memory of its own, see `MitsubaRenderer.array`
-            found[key] = type(x)(part.astype(np.float32)) + dr.opaque(type(x), 0, ())
+        if arrays.is_drjit(x):  # the sum leaves NumPy's memory, see `MitsubaRenderer.array`
+            found[key] = type(x)(part.astype(np.float32)) + arrays.scalar(0.0, x)
         else:
-            found[key] = part
+            found[key] = part.astype(x.dtype)
     return found
 
 
 def spread(numbers: Mapping[str, float], like: Tree) -> np.ndarray:
     """One number per parameter, repeated for its elements, (n,)."""
-    return np.concatenate([np.full(int(np.prod(arrays.shape(x))), numbers[key]) for key, x in like.items()])
+    return np.concatenate([np.full(math.prod(arrays.shape(x)), float(numbers[key])) for key, x in like.items()])
 
 
 def within(step: np.ndarray, radius: float | None) -> np.ndarray:
-    """`step`, shortened to `radius` where it is longer."""
+    """`step`, shortened to the length `radius` where it is longer; None for no limit."""
     length = float(np.linalg.norm(step))
     return step if radius is None or length <= radius else step * (radius / length)

@@ -11,7 +11,7 @@ import pytest
 from unrender import arrays
 from unrender.errors import InputError
 from unrender.gradients.estimate import Estimate
-from unrender.optimizers import SGD, Adam, MetaAdam, Newton, NewtonCG
+from unrender.optimizers import SGD, Adam, MetaAdam
 from unrender.optimizers.schedules import Constant, Cosine, Exponential, Steps, Warmup
 
 OPTIMIZERS = [SGD(0.1), SGD(0.1, momentum=0.9), Adam(0.1), Adam(0.1, beta_1=0.5, beta_2=0.9, epsilon=0.01)]
@@ -236,94 +236,3 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
 def test_meta_adam_refuses(options, field):
     with pytest.raises(InputError, match=f"MetaAdam: {field}"):
         MetaAdam(**options)
-
-
-# ---------------------------------------------------------------------------------------------------- second order
-
-
-def bowl(n: int = 6, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A positive definite Hessian with a condition number of about a thousand, and a minimum."""
-    rng = np.random.default_rng(seed)
-    q, _ = np.linalg.qr(rng.normal(size=(n, n)))
-    return q @ np.diag(np.geomspace(0.01, 10, n)) @ q.T, rng.normal(size=n)
-
-
-def second_order(optimizer, hessian, gradient):
-    """The step of a first update, flat."""
-    like = {"a": np.zeros((2, 2)), "b": np.zeros(len(gradient) - 4)}
-
-    def product(tree):
-        flat = np.concatenate([tree["a"].ravel(), tree["b"]])
-        return split(hessian @ flat)
-
-    def split(x):
-        return {"a": x[:4].reshape(2, 2), "b": x[4:]}
-
-    estimate = Estimate(0.0, split(gradient), None, hessian, product)
-    step, _ = optimizer.update(estimate, optimizer.init(like), like)
-    return np.concatenate([step["a"].ravel(), step["b"]])
-
-
-@pytest.mark.parametrize(
-    "optimizer",
-    [Newton(trust_radius=None, damping=1e-6), NewtonCG(trust_radius=1e3, iterations=60)],
-    ids=["Newton", "NewtonCG"],
-)
-def test_one_newton_step_finds_the_bottom_of_a_bowl(optimizer):
-    hessian, minimum = bowl()
-    gradient = hessian @ (0.0 - minimum)
-    step = second_order(optimizer, hessian, gradient)
-    left = hessian @ (step - minimum)
-    assert np.linalg.norm(left) <= (0.11 if isinstance(optimizer, NewtonCG) else 1e-8) * np.linalg.norm(gradient)
-
-
-@pytest.mark.parametrize(
-    "optimizer", [Newton(trust_radius=0.25), NewtonCG(trust_radius=0.25)], ids=["Newton", "NewtonCG"]
-)
-def test_where_the_objective_bends_downwards_the_step_still_descends_and_stays_within_its_radius(optimizer):
-    hessian, minimum = bowl()
-    hessian = hessian - 3 * np.eye(6)
-    gradient = hessian @ minimum
-    step = second_order(optimizer, hessian, gradient)
-    assert step @ gradient < 0
-    assert np.linalg.norm(step) == pytest.approx(0.25, rel=1e-6) or isinstance(optimizer, Newton)
-    assert np.linalg.norm(step) <= 0.25 * (1 + 1e-9)
-
-
-def test_newton_cg_asks_for_no_more_products_than_it_may():
-    hessian, minimum = bowl()
-    calls = []
-
-    def product(tree):
-        calls.append(1)
-        return {"a": hessian @ tree["a"]}
-
-    optimizer = NewtonCG(trust_radius=1e3, iterations=3)
-    gradient = {"a": hessian @ -minimum}
-    optimizer.update(Estimate(0.0, gradient, None, None, product), optimizer.init(gradient), gradient)
-    assert len(calls) == 3
-
-
-def test_newton_steps_return_the_renderer_s_arrays():
-    hessian = np.eye(3)
-    parameters = {"a": mi.TensorXf(np.zeros(3, np.float32))}
-    gradient = {"a": mi.TensorXf(np.array([1.0, -2.0, 0.5], np.float32))}
-    optimizer = Newton(trust_radius=None)
-    step, _ = optimizer.update(Estimate(0.0, gradient, None, hessian), optimizer.init(parameters), parameters)
-    assert isinstance(step["a"], mi.TensorXf)
-    np.testing.assert_allclose(np.array(step["a"]), [-1.0, 2.0, -0.5], rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options", "field"),
-    [
-        (Newton, {"damping": 0.0}, "damping"),
-        (Newton, {"trust_radius": -1}, "trust_radius"),
-        (Newton, {"learning_rate": 0}, "learning_rate"),
-        (NewtonCG, {"iterations": 0}, "iterations"),
-        (NewtonCG, {"trust_radius": 0}, "trust_radius"),
-    ],
-)
-def test_second_order_refuses(kind, options, field):
-    with pytest.raises(InputError, match=f"{kind.__name__}: {field}"):
-        kind(**options)

@@ -3,16 +3,54 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from unrender import arrays
+from unrender import arrays, checks, flat
+from unrender.gradients.estimate import LOSSES, Estimate
 from unrender.keys import Key
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.rendering.port import Shot
 from unrender.trees import Tree
+
+
+@dataclass(frozen=True)
+class LossState:
+    """Nothing is kept."""
+
+
+@dataclass(frozen=True)
+class LossValues:
+    """The loss at any points, and no derivative: for searches such as `optimizers.CMAES`.
+
+    Every point of a step is rendered with the same random numbers. Unbiased for the expected loss of images with this noise.
+
+    Args:
+        spp: samples per pixel of a render, >= 1.
+    """
+
+    spp: int = 4
+
+    def __post_init__(self):
+        checks.whole("LossValues", "spp", self.spp, at_least=1)
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """The loss at any points."""
+        return frozenset({LOSSES})
+
+    def init(self, problem: Problem, parameters: Tree) -> LossState:
+        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
+        problem.renderer.select(list(parameters), None, derivatives=False)
+        return LossState()
+
+    def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
+        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (paths traced up to now in this step), "images" per view."""
+        box = BlackBox(problem, parameters, self.spp, key)
+        return Estimate(box.here(), {}, losses=box.losses, info=box.info), state
 
 
 class BlackBox:
@@ -25,12 +63,12 @@ class BlackBox:
         key: of the renders' random numbers.
 
     Attributes:
-        samples: paths traced so far.
+        info: for `Estimate.info`: "samples", the paths traced so far, and "images", each view's as `here` saw it.
     """
 
     def __init__(self, problem: Problem, parameters: Tree, spp: int, key: Key):
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
-        self.samples = 0
+        self.info: dict[str, Any] = {"samples": 0}
 
     def losses(self, points: np.ndarray) -> np.ndarray:
         """(B, n), all parameters flattened in key order, to (B,). Points outside the bounds count as the nearest inside.
@@ -39,11 +77,11 @@ class BlackBox:
         """
         return self._losses(points)[0]
 
-    def here(self) -> tuple[float, dict[int, Any]]:
-        """The loss at the parameters themselves, and each view's image (H, W, 3)."""
-        point = np.concatenate([arrays.numpy(x).ravel() for x in self.parameters.values()])
-        losses, images = self._losses(point[None])
-        return float(losses[0]), {view: arrays.mean_first(image) for view, image in images.items()}
+    def here(self) -> float:
+        """The loss at the parameters themselves."""
+        losses, images = self._losses(flat.ravel(self.parameters)[None])
+        self.info["images"] = {view: arrays.mean_first(image) for view, image in images.items()}
+        return float(losses[0])
 
     def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
         renderer, stacked, start = self.problem.renderer, {}, 0
@@ -59,6 +97,6 @@ class BlackBox:
             images[index] = renderer.image_batch(stacked, shot)
             parts.append(self.problem.loss_values(index, images[index]))
             height, width = renderer.resolutions()[view.sensor]
-            self.samples += len(points) * self.spp * height * width
+            self.info["samples"] += len(points) * self.spp * height * width
         arrays.evaluate(parts)
         return np.stack([arrays.numpy(part).astype(np.float64) for part in parts]).sum(axis=0), images

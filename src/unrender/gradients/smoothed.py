@@ -92,11 +92,12 @@ class SmoothedDerivatives:
     def estimate(
         self, problem: Problem, parameters: Tree, state: SmoothedState, key: Key
     ) -> tuple[Estimate, SmoothedState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view at the parameters themselves."""
+        """See `Estimator.estimate`. `info`: "samples" (paths traced, those of products included), "images" per view
+        at the parameters themselves."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0))
         theta = flat.ravel(parameters)
         sigma = self._sigma(parameters) * (self.schedule(state.step) if self.schedule else 1.0)
-        loss, images = box.here()
+        loss = box.here()
         seed = key.fold(1).uint32()
         options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
         gradient, error = smoothed.gradient(
@@ -130,7 +131,7 @@ class SmoothedDerivatives:
             hessian,
             product if self.order == "hvp" else None,
             box.losses,
-            info={"samples": box.samples, "images": images},
+            info=box.info,
         ), SmoothedState(state.step + 1)
 
     def _sigma(self, parameters: Tree) -> np.ndarray:

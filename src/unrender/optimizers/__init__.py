@@ -3,9 +3,11 @@
 from unrender.optimizers import schedules
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.cma_es import CMAES
+from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.optimizers.newton import Newton
 from unrender.optimizers.newton_cg import NewtonCG
 from unrender.optimizers.sgd import SGD
 
-__all__ = ["SGD", "Adam", "MetaAdam", "Newton", "NewtonCG", "Optimizer", "schedules"]
+__all__ = ["CMAES", "LBFGS", "SGD", "Adam", "MetaAdam", "Newton", "NewtonCG", "Optimizer", "schedules"]

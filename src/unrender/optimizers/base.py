@@ -14,7 +14,7 @@ class Optimizer(Protocol):
 
     @property
     def requires(self) -> frozenset[str]:
-        """What the estimator must provide: subset of {"gradient", "variance", "hessian", "hvp"}."""
+        """What the estimator must provide: subset of {"gradient", "variance", "hessian", "hvp", "losses"}."""
         ...
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> Any:

@@ -1,17 +1,26 @@
-"""Newton's method with a modified Hessian, for estimators that give one (Wang et al., section 2)."""
+"""Newton's method with a modified Hessian, for estimators that give one (Wang et al., section 2).
+
+Also what it shares with the other methods that choose a direction on the host: how parameters are scaled, and how a direction becomes a
+step.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from unrender import arrays, checks, flat
+from unrender.errors import InputError
 from unrender.gradients.estimate import GRADIENT, HESSIAN, Estimate
 from unrender.optimizers import rates
+from unrender.optimizers.adam import Adam, AdamState
 from unrender.optimizers.schedules import Schedule
 from unrender.trees import Tree
+
+_SECULAR_ITERATIONS = 60
 
 
 @dataclass(frozen=True)
@@ -20,34 +29,55 @@ class NewtonState:
 
     Attributes:
         step: steps made so far.
-        learning_rates: of each parameter, before the schedule.
+        learning_rates: of each parameter: its scale.
+        adam: of the Adam that directions pass through, in double precision on the host; None without one.
     """
 
     step: int
     learning_rates: dict[str, float]
+    adam: AdamState | None = None
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Steps −η H̃⁻¹ g (Eq. 3), no longer than a trust radius.
+    """Steps −γ H̃⁻¹ g (Eq. 3) with a positive definite H̃, within a trust region.
 
     H̃ has the eigenvectors of H and its eigenvalues' magnitudes, none below a share `damping` of the largest: where the objective bends
-    downwards, plain Newton steps would climb to a saddle or a maximum. Costs O(n³) time and O(n²) memory for n parameters in all.
+    downwards, plain Newton steps would climb to a saddle or a maximum. A step that would leave the trust region is replaced by the best
+    one inside, the minimum of gᵀs + sᵀ H̃ s / 2 for ‖s‖ <= Δ, which turns towards −g as Δ shrinks. (The paper shortens the step and
+    keeps its direction, which is that of the flattest eigenvectors, and they are the ones that noise is mistaken for.) Where H is zero
+    the step is −g, Δ long; where H is not finite there is none.
+
+    Scales: the step is sought for the coordinates u = x / η, where η is each parameter's learning rate, and Δ, like `damping`, is of u.
+    A position in metres and an angle in radians with η of 0.05 and 0.5 may so move by 0.05 Δ and 0.5 Δ. Inside the trust region and
+    without damping the step does not depend on η.
+
+    Noise: the step is a product of two estimates, so it is biased even where they are not (an inverse is convex); a small eigenvalue
+    that noise makes smaller gives a long step along itself. Noise of a tenth of H asks for `damping` around 0.03, as much noise as H for
+    0.3; `share` averages over steps, and so does `through`. Costs O(n³) time and O(n²) memory for n parameters in all.
 
     Args:
-        learning_rate: η, the share of the Newton step that is taken, > 0; for the parameters without their own.
-        trust_radius: the longest step, Euclidean, in units of the parameters, > 0; None for no limit.
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
+            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0; None for no limit.
         damping: the least eigenvalue's share of the largest, in (0, 1).
-        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
+        through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
+            optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
+        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
     """
 
     learning_rate: float = 1.0
     trust_radius: float | None = 0.5
-    damping: float = 1e-3
+    damping: float = 0.1
+    share: float = 1.0
+    through: Adam | None = None
+    trust_schedule: Schedule | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("Newton", self.learning_rate, self.schedule)
+        check("Newton", self)
         checks.number("Newton", "damping", self.damping, above=0.0, below=1.0)
         if self.trust_radius is not None:
             checks.number("Newton", "trust_radius", self.trust_radius, above=0.0)
@@ -59,17 +89,108 @@ class Newton:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
         """See `Optimizer.init`."""
-        return NewtonState(0, rates.per_parameter("Newton", parameters, self.learning_rate, learning_rates))
+        return begin("Newton", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
         """See `Optimizer.update`. On the host."""
         assert estimate.hessian is not None
-        gradient = flat.ravel(estimate.gradient)
-        values, vectors = np.linalg.eigh(arrays.numpy(estimate.hessian).astype(np.float64))
+        scale = flat.spread(state.learning_rates, parameters)
+        hessian = scale[:, None] * arrays.numpy(estimate.hessian).astype(np.float64) * scale
+        step = self._solve(scale * flat.ravel(estimate.gradient), hessian, reach("Newton", self, state))
+        return finish("Newton", self, scale * step, state, parameters)
+
+    def _solve(self, gradient: np.ndarray, hessian: np.ndarray, radius: float | None) -> np.ndarray:
+        none = np.zeros_like(gradient)
+        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all() and gradient.any()):
+            return none
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
         bend = np.abs(values)
-        bend = np.maximum(bend, max(self.damping * bend.max(), np.finfo(float).tiny))
-        direction = -vectors @ ((vectors.T @ gradient) / bend)
-        factor = rates.factor("Newton", self.schedule, state.step)
-        scale = flat.spread({key: rate * factor for key, rate in state.learning_rates.items()}, parameters)
-        step = flat.within(direction * scale, self.trust_radius)
-        return flat.unravel(step, parameters), NewtonState(state.step + 1, state.learning_rates)
+        bend = np.maximum(bend, self.damping * bend.max())
+        if self.trust_radius is None and not bend.all():
+            return none
+        with np.errstate(over="ignore", invalid="ignore"):  # `finish` looks at what came of it
+            return vectors @ _least(bend, vectors.T @ gradient, self.trust_radius)
+
+
+def _least(bend: np.ndarray, slope: np.ndarray, radius: float | None) -> np.ndarray:
+    """The s with ‖s‖ <= radius where Σ slope s + bend s² / 2 is least, per eigenvector: (n,), bend >= 0, slope not all zero.
+
+    It is −slope / (bend + λ) with the least λ >= 0 that makes it short enough (Nocedal and Wright, section 4.3). Newton's iteration for
+    1 / ‖s‖ = 1 / radius comes from below the root and stays there.
+    """
+    if radius is None:
+        return -slope / bend
+    extra = max(0.0, float(np.linalg.norm(slope)) / radius - float(bend.max()))
+    step = -slope / (bend + extra)
+    for _ in range(_SECULAR_ITERATIONS):
+        length = float(np.linalg.norm(step))
+        if length <= radius * (1 + 1e-10):
+            break
+        extra += length**2 / float(np.sum(step * step / (bend + extra))) * (length - radius) / radius
+        step = -slope / (bend + extra)
+    return flat.within(step, radius)
+
+
+class Directed(Protocol):
+    """The options of every method whose directions become steps by `finish`; `Newton` says what they do."""
+
+    @property
+    def learning_rate(self) -> float: ...
+
+    @property
+    def share(self) -> float: ...
+
+    @property
+    def through(self) -> Adam | None: ...
+
+    @property
+    def trust_radius(self) -> float | None: ...
+
+    @property
+    def trust_schedule(self) -> Schedule | None: ...
+
+    @property
+    def schedule(self) -> Schedule | None: ...
+
+
+def check(owner: str, options: Directed) -> None:
+    """Raise `InputError` unless they make sense."""
+    rates.check(owner, options.learning_rate, options.schedule)
+    rates.check(owner, options.learning_rate, options.trust_schedule)
+    if checks.number(owner, "share", options.share, above=0.0) > 1.0:
+        raise InputError(f"{owner}: share must be at most 1, got {options.share!r}")
+    if options.through is not None and not isinstance(options.through, Adam):
+        raise InputError(f"{owner}: through must be an Adam or None, got {options.through!r}")
+
+
+def begin(owner: str, options: Directed, parameters: Tree, learning_rates: Mapping[str, float] | None) -> NewtonState:
+    """The state before the first step. Raises `InputError` for learning rates that make no sense."""
+    own = rates.per_parameter(owner, parameters, options.learning_rate, learning_rates)
+    adam = None
+    if options.through is not None:
+        adam = options.through.init({k: np.zeros(arrays.shape(x)) for k, x in parameters.items()}, learning_rates)
+    return NewtonState(0, own, adam)
+
+
+def reach(owner: str, options: Directed, state: NewtonState) -> Any:
+    """The present trust radius; None where there is no limit."""
+    factor = rates.factor(owner, options.trust_schedule, state.step)
+    return None if options.trust_radius is None else options.trust_radius * factor
+
+
+def finish(
+    owner: str, options: Directed, direction: np.ndarray, state: NewtonState, parameters: Tree
+) -> tuple[Tree, NewtonState]:
+    """The steps that a direction (n,), in units of the parameters, becomes, and the next state.
+
+    A direction that is not finite counts as none.
+    """
+    if not np.isfinite(direction).all():
+        direction = np.zeros_like(direction)
+    step, adam = options.share * direction, state.adam
+    if options.through is not None and adam is not None:
+        opposite = flat.unravel(-direction, adam.first_moment)
+        steps, adam = options.through.update(Estimate(0.0, opposite), adam, opposite)
+        step = flat.ravel(steps)
+    factor = rates.factor(owner, options.schedule, state.step)
+    return flat.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from unrender import checks, flat
 from unrender.gradients.estimate import GRADIENT, HVP, Estimate
-from unrender.optimizers import rates
-from unrender.optimizers.newton import NewtonState
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.newton import NewtonState, begin, check, finish, reach
 from unrender.optimizers.schedules import Schedule
 from unrender.trees import Tree
 
@@ -19,27 +20,51 @@ from unrender.trees import Tree
 class NewtonCG:
     """A step that solves H s = −g by conjugate gradients (Fletcher and Reeves), truncated at a trust radius.
 
-    From s = 0 and v = r = −g: α = rᵀr / vᵀHv (Eq. 5, with v conjugate to those before), s += α v, r −= α H v, and the next v is
-    r + (r'ᵀr' / rᵀr) v. Ends after `iterations`, when the residual is a tenth of the gradient, when s reaches the trust radius,
-    or when vᵀHv <= 0: there the objective bends downwards along v, no minimum is in sight, and the step goes to the trust radius.
-    Never builds an n × n matrix.
+    From s = 0 and v = r = −g (Eq. 6): α = rᵀr / vᵀHv, which is Eq. 5 for v conjugate to those before, s += α v (Eq. 7), r −= α H v,
+    and the next v is r + (r'ᵀr' / rᵀr) v. It ends after `iterations`, when ‖r‖ is a share `tolerance` of ‖g‖, or when s reaches the
+    trust radius Δ. Where the objective bends downwards along −g, no minimum is in sight, and the step goes there to the radius
+    (Steihaug 1983). Memory is a few vectors; no n × n matrix is built. As many iterations as dimensions solve a well-conditioned
+    positive definite H exactly, without tolerance and damping.
+
+    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, and so is Δ; the products that are asked for
+    are of η v.
+
+    Noise: what is estimated as H v need not come from a symmetric matrix, nor from the same one each time. So the iterations end where they
+    would go by noise: at a v along which the curvature vᵀHv / vᵀv is less than a share `damping` of the greatest one met, or negative
+    (its magnitude, and no less than that share, decides how far v is still followed); when ‖r‖ exceeds ‖g‖; when v no longer descends
+    (vᵀg >= 0); at a product that is not finite. Thus s always descends by the gradient given, and few iterations are as good as many.
+    The step is biased even where gradient and products are not: it is not linear in them.
 
     Args:
-        learning_rate: the share of the step that is taken, > 0; for the parameters without their own.
-        trust_radius: Δ, the longest step, Euclidean, in units of the parameters, > 0.
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
+            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0.
         iterations: Hessian-vector products a step at most, >= 1.
-        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        tolerance: the residual's share of the gradient at which it ends, in [0, 1).
+        damping: the least curvature that is believed, as a share of the greatest, in [0, 1).
+        share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
+        through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
+            optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
+        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
     """
 
     learning_rate: float = 1.0
     trust_radius: float = 0.5
     iterations: int = 4
+    tolerance: float = 0.1
+    damping: float = 0.1
+    share: float = 1.0
+    through: Adam | None = None
+    trust_schedule: Schedule | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        rates.check("NewtonCG", self.learning_rate, self.schedule)
+        check("NewtonCG", self)
         checks.number("NewtonCG", "trust_radius", self.trust_radius, above=0.0)
         checks.whole("NewtonCG", "iterations", self.iterations, at_least=1)
+        checks.number("NewtonCG", "tolerance", self.tolerance, above=0.0, below=1.0, inclusive=True)
+        checks.number("NewtonCG", "damping", self.damping, above=0.0, below=1.0, inclusive=True)
 
     @property
     def requires(self) -> frozenset[str]:
@@ -48,37 +73,54 @@ class NewtonCG:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
         """See `Optimizer.init`."""
-        return NewtonState(0, rates.per_parameter("NewtonCG", parameters, self.learning_rate, learning_rates))
+        return begin("NewtonCG", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
-        """See `Optimizer.update`. On the host."""
-        direction = self._solve(estimate, parameters)
-        factor = rates.factor("NewtonCG", self.schedule, state.step)
-        scale = flat.spread({key: rate * factor for key, rate in state.learning_rates.items()}, parameters)
-        return flat.unravel(direction * scale, parameters), NewtonState(state.step + 1, state.learning_rates)
+        """See `Optimizer.update`. On the host, between products."""
+        hvp = estimate.hvp
+        assert hvp is not None
+        scale = flat.spread(state.learning_rates, parameters)
 
-    def _solve(self, estimate: Estimate, parameters: Tree) -> np.ndarray:
-        assert estimate.hvp is not None
-        residual = -flat.ravel(estimate.gradient)
-        v, step = residual, np.zeros_like(residual)
+        def product(v: np.ndarray) -> np.ndarray:
+            return scale * flat.ravel(hvp(flat.unravel(scale * v, parameters)))
+
+        radius = reach("NewtonCG", self, state)
+        step = self._solve(scale * flat.ravel(estimate.gradient), product, radius)
+        return finish("NewtonCG", self, scale * step, state, parameters)
+
+    def _solve(self, gradient: np.ndarray, product: Callable[[np.ndarray], np.ndarray], radius: float) -> np.ndarray:
+        step, residual = np.zeros_like(gradient), -gradient
+        v, sharpest = residual, 0.0
         first = square = float(residual @ residual)
-        for _ in range(self.iterations):
-            if square <= 0.01 * first or square == 0.0:
+        if not math.isfinite(first):
+            return step
+        for iteration in range(self.iterations):
+            if not self.tolerance**2 * first < square <= first or not v @ gradient < 0.0:
                 break
-            product = flat.ravel(estimate.hvp(flat.unravel(v, parameters)))
-            bend = float(v @ product)
-            alpha = square / bend if bend > 0 else np.inf
-            reach = self._to_the_radius(step, v)
-            step = step + min(alpha, reach) * v
-            if alpha >= reach:
+            bent = product(v)
+            if not np.isfinite(bent).all():
                 break
-            residual = residual - alpha * product
+            bend, length = float(v @ bent), float(v @ v)
+            left = _to_the_radius(step, v, radius)
+            if iteration == 0 and bend <= 0.0:
+                return left * v
+            sharpest = max(sharpest, abs(bend) / length)
+            least = self.damping * sharpest * length
+            believed = max(abs(bend), least)
+            if square >= believed * left:
+                return step + left * v
+            alpha = square / believed
+            step = step + alpha * v
+            if bend < least:
+                break
+            residual = residual - alpha * bent
             before, square = square, float(residual @ residual)
             v = residual + square / before * v
         return step
 
-    def _to_the_radius(self, step: np.ndarray, v: np.ndarray) -> float:
-        """The τ >= 0 at which step + τ v is on the sphere of the trust radius."""
-        a, b = float(v @ v), float(step @ v)
-        c = float(step @ step) - self.trust_radius**2
-        return (-b + np.sqrt(max(b * b - a * c, 0.0))) / a
+
+def _to_the_radius(step: np.ndarray, v: np.ndarray, radius: float) -> float:
+    """The τ >= 0 at which step + τ v is on the sphere of that radius."""
+    a, b = float(v @ v), float(step @ v)
+    c = float(step @ step) - radius**2
+    return (-b + math.sqrt(max(b * b - a * c, 0.0))) / a

@@ -40,19 +40,22 @@ class Constant:
 
 @dataclass(frozen=True)
 class Exponential:
-    """2^(−step / half_life).
+    """2^(−step / half_life), and never below `floor`.
 
     Args:
         half_life: steps after which the rate has halved, > 0.
+        floor: the least factor, >= 0.
     """
 
     half_life: float
+    floor: float = 0.0
 
     def __post_init__(self):
         checks.number("Exponential", "half_life", self.half_life, above=0.0)
+        checks.number("Exponential", "floor", self.floor, above=0.0, inclusive=True)
 
     def __call__(self, step: int) -> float:
-        return 0.5 ** (step / self.half_life)
+        return max(self.floor, 0.5 ** (step / self.half_life))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,89 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false, reportOperatorIssue=false
+
+"""The column "Mitsuba": the loop of its tutorials, on path gradients, where they are not zero."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from common import mitsuba_renderer
+from race import GOALS, WINDOW, Descent, measured
+
+import unrender as ur
+from unrender import flat
+
+MITSUBA = ("BUNNY", "TEXTURE")
+_SPP = {"BUNNY": 16, "TEXTURE": 8}
+
+
+def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Descent:
+    """One run of `mi.render`, `dr.backward`, `mi.ad.Adam`: projective sampling of silhouettes for BUNNY, `prb` for TEXTURE."""
+    renderer = mitsuba_renderer(problem)
+    scene, parameters = renderer.pair.previous, renderer.pair.previous_parameters
+    start = flat.ravel(problem.initial())
+    truth = np.concatenate([np.ravel(problem.truth[key]) for key in problem.initial()]).astype(float)
+    place: Callable[[Any], None]
+    if name == "BUNNY":
+        integrator = mi.load_dict({"type": "direct_projective", "sppi": 0})
+        key = "bunny.vertex_positions"
+        rest = dr.unravel(mi.Point3f, mi.Float(renderer.pair.current_parameters[key]))
+        box = next(shape for shape in renderer.pair.current.shapes() if shape.id() == "bunny").bbox()
+        centre = mi.Point3f(np.array(box.center()).reshape(3).tolist())
+
+        def pose(values: Any) -> None:
+            x, z, angle = (dr.gather(mi.Float, values, index) for index in range(3))
+            sine, cosine = dr.sin(angle), dr.cos(angle)
+            p = rest - centre
+            turned = mi.Point3f(cosine * p.x + sine * p.z, p.y, cosine * p.z - sine * p.x)
+            parameters[key] = dr.ravel(turned + centre + mi.Vector3f(x, 0, z))
+            parameters.update()
+
+        place = pose
+    else:
+        integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
+        key = problem.parameters[0].key
+        shape = tuple(parameters[key].shape)
+
+        def paint(values: Any) -> None:
+            parameters[key] = mi.TensorXf(values, shape)
+            parameters.update()
+
+        place = paint
+
+    points, times, errors = [start], [0.0], [1.0]
+    scale = float(np.sqrt(np.mean((start - truth) ** 2)))
+    for warm in (True, False):
+        optimizer = mi.ad.Adam(lr=rate)
+        optimizer["x"] = mi.Float(start)
+        clock, step = 0.0, 0
+        while clock < seconds and step < (2 if warm else 100_000):
+            began = time.perf_counter()
+            place(optimizer["x"])
+            image = mi.render(
+                scene,
+                parameters,
+                integrator=integrator,
+                spp=_SPP[name],
+                seed=mi.UInt32(2 * step),
+                seed_grad=2 * step + 1,
+            )
+            dr.backward(problem.loss_value(0, image))
+            optimizer.step()
+            dr.eval(optimizer["x"])
+            dr.sync_thread()
+            clock += time.perf_counter() - began
+            step += 1
+            if warm:
+                continue
+            points.append(np.array(optimizer["x"], float))
+            times.append(clock)
+            errors.append(float(np.sqrt(np.mean((points[-1] - truth) ** 2))) / scale)
+            if np.mean(errors[-WINDOW:]) < 0.8 * GOALS[-1]:
+                break
+    return measured(problem, points, times, errors, step * _SPP[name])

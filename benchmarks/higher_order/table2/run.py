@@ -1,0 +1,226 @@
+"""Table 2 of Wang et al.: seconds until the error has fallen by 90, 99 and 99.9 %, in the picture and in the parameters, over runs from
+random starts.
+
+    python benchmarks/higher_order/table2/run.py [--task MUG] [--runs 20] [--resolution 32]
+
+Methods: the stock loop on path gradients where it applies (BUNNY, with Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed
+gradient of Fischer and Ritschel 2023 with Adam; CMA-ES; and ours: the gradient (OurG) with Adam, the Hessian (OurH) with Newton's method,
+Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG. All render their perturbations
+by the same launches, with the same antithetic draws and shared random numbers, and shrink σ as they go. Each is tuned on each task over
+a grid (`grid`), on starts of its own, for the mean logarithm of its times; then the runs of all methods are done by turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from baseline import MITSUBA, mitsuba
+from common import read, write
+from race import GOALS, Descent, descend, numbers
+from tasks import TASKS, Task, begin
+
+import unrender as ur
+
+HERE = Path(__file__).resolve().parent
+TUNING = 2
+"""Starts that a method is tuned on, numbered from 1000."""
+FLOOR = 0.1
+"""σ shrinks to this share of its start, and no further."""
+_NEVER = 3.0
+"""A goal that is not met counts as this many times the budget when methods are tuned."""
+
+Config = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A column of the table.
+
+    Attributes:
+        make: (task, number of parameters, configuration) to estimator and optimizer.
+        grid: what is tried.
+    """
+
+    make: Callable[[Task, int, Config], tuple[Any, Any]]
+    grid: dict[str, tuple[float, ...]]
+
+    def configs(self) -> list[Config]:
+        return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
+
+
+def _samples(n: int) -> int:
+    """Renders that an aggregate gradient takes."""
+    return 8 if n <= 3 else 32 if n <= 32 else 128
+
+
+def _smoothed(task: Task, c: Config, samples: int, **more: Any) -> ur.SmoothedDerivatives:
+    schedule = ur.optimizers.schedules.Exponential(c["half_life"], FLOOR)
+    return ur.SmoothedDerivatives(task.sigma, samples, spp=task.spp, schedule=schedule, **more)
+
+
+def _adam(task: Task, c: Config) -> Any:
+    schedule = ur.optimizers.schedules.Exponential(2 * c["half_life"], FLOOR)
+    return ur.optimizers.Adam(c["rate"] * task.sigma, schedule=schedule)
+
+
+def _region(task: Task, n: int, c: Config) -> dict[str, Any]:
+    """The trust region, which shrinks with σ."""
+    schedule = ur.optimizers.schedules.Exponential(c["half_life"], FLOOR)
+    return {"trust_radius": c["radius"] * task.sigma * math.sqrt(n), "trust_schedule": schedule}
+
+
+def _fr22(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    return _smoothed(task, c, _samples(n), product=True), _adam(task, c)
+
+
+def _gradient(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    return _smoothed(task, c, max(_samples(n) // n, 4), aggregate=False), _adam(task, c)
+
+
+def _hessian(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    estimator = _smoothed(task, c, max(2 * _samples(n) // n, 4), order="hessian", aggregate=False)
+    return estimator, ur.optimizers.Newton(**_region(task, n, c))
+
+
+def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
+    def make(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+        samples = _samples(n) if aggregate else max(_samples(n) // n, 4)
+        estimator = _smoothed(task, c, samples, order="hvp", aggregate=aggregate)
+        return estimator, ur.optimizers.NewtonCG(iterations=min(n, 3), **_region(task, n, c))
+
+    return make
+
+
+def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    population = None if c["population"] == 0 else int(c["population"])
+    diagonal = n > 100
+    optimizer = ur.optimizers.CMAES(sigma0=c["deviation"] * task.sigma, population=population, diagonal=diagonal)
+    return ur.LossValues(spp=task.spp), optimizer
+
+
+_GRADIENT_GRID = {"half_life": (15, 40), "rate": (0.1, 0.3)}
+_NEWTON_GRID = {"half_life": (15, 40), "radius": (0.15, 0.5)}
+METHODS = {
+    "FR22": Method(_fr22, _GRADIENT_GRID),
+    "CMA-ES": Method(_search, {"deviation": (0.5, 1.0), "population": (0, 16)}),
+    "OurG": Method(_gradient, _GRADIENT_GRID),
+    "OurH": Method(_hessian, _NEWTON_GRID),
+    "OurHVP": Method(_products(False), _NEWTON_GRID),
+    "OurHVPA": Method(_products(True), _NEWTON_GRID),
+}
+LEFT_OUT = {("TEXTURE", "OurH"): "a Hessian of 1024 × 1024 elements, each from perturbations of its own"}
+
+
+def go(name: str, method: str, problem: ur.Problem, config: Config, run: int) -> Descent:
+    """One run."""
+    task = TASKS[name]
+    if method == "Mitsuba":
+        return mitsuba(name, problem, config["rate"] * task.sigma, task.seconds)
+    n = sum(value.size for value in problem.truth.values())
+    return descend(problem, *METHODS[method].make(task, n, config), task.seconds, run)
+
+
+def tune(name: str, method: str, problem: ur.Problem) -> tuple[Config, list[dict[str, Any]]]:
+    """The configuration of the least mean logarithm of times to the goals, and all that were tried."""
+    task = TASKS[name]
+    configs = [{"rate": rate} for rate in (0.03, 0.1, 0.3)] if method == "Mitsuba" else METHODS[method].configs()
+    tried = []
+    for config in configs:
+        scores = []
+        for start in range(1000, 1000 + TUNING):
+            found = go(name, method, begin(problem, task, start), config, start)
+            times = found.reached("parameter") + found.reached("image")
+            scores += [math.log(max(min(t, _NEVER * task.seconds), 1e-3)) for t in times]
+        tried.append({**config, "score": float(np.mean(scores))})
+    best = min(tried, key=lambda entry: entry["score"])
+    return {key: value for key, value in best.items() if key != "score"}, tried
+
+
+def race(name: str, runs: int) -> dict[str, Any]:
+    """One row: every method that applies, tuned, over the runs."""
+    task = TASKS[name]
+    problem = task.problem()
+    methods = [*(["Mitsuba"] if name in MITSUBA else []), *(m for m in METHODS if (name, m) not in LEFT_OUT)]
+    found: dict[str, Any] = {}
+    for method in methods:
+        config, tried = tune(name, method, problem)
+        found[method] = {"config": config, "tried": tried, "runs": []}
+        print(f"{name} {method}: {config}", flush=True)
+    for run in range(runs):
+        for method in methods:
+            descent = go(name, method, begin(problem, task, run), found[method]["config"], run)
+            found[method]["runs"].append(numbers(descent))
+    for method, entry in found.items():
+        entry["summary"] = summarise(entry["runs"])
+        print(f"{name} {method}: {entry['summary']}", flush=True)
+    return {"seconds": task.seconds, "sigma": task.sigma, "spp": task.spp, "options": task.options, "methods": found}
+
+
+def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians of the times (None where half of the runs or more never got there), and how many runs did."""
+    found: dict[str, Any] = {}
+    for which in ("parameter", "image"):
+        times = np.array([run[which] for run in runs], float)
+        medians = np.median(times, axis=0)
+        found[which] = [float(t) if math.isfinite(t) else None for t in medians]
+        found[f"{which}_count"] = np.isfinite(times).sum(axis=0).tolist()
+    return found
+
+
+def plot(results: dict[str, Any]) -> None:
+    """Per task: median error over time, in the picture and in the parameters, log-log."""
+    rows = results["tasks"]
+    figure, axes = plt.subplots(len(rows), 2, figsize=(10, 2.9 * len(rows)), squeeze=False, layout="constrained")
+    colour = dict(zip(["Mitsuba", *METHODS], plt.get_cmap("tab10").colors, strict=False))  # pyright: ignore[reportAttributeAccessIssue]
+    for axis_row, (name, row) in zip(axes, rows.items(), strict=True):
+        for axis, curve, what in zip(axis_row, ("image_curve", "curve"), ("picture", "parameters"), strict=True):
+            for method, entry in row["methods"].items():
+                ends = [run[curve][0][-1] for run in entry["runs"]]
+                grid = np.geomspace(3e-3, max(ends), 100)
+                values = [np.interp(grid, *run[curve], right=run[curve][1][-1]) for run in entry["runs"]]
+                axis.plot(grid, np.median(values, axis=0), color=colour[method], label=method)
+            for goal in GOALS:
+                axis.axhline(goal, color="#bbb", lw=0.6)
+            axis.set(
+                title=f"{name}: {what}", xscale="log", yscale="log", xlabel="seconds", ylabel="error / at the start"
+            )
+            axis.set_ylim(3e-4, 3)
+    axes[0][0].legend(fontsize=7)
+    figure.savefig(HERE / "figure.png", dpi=100)
+    print(f"wrote {HERE / 'figure.png'}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", action="append", choices=list(TASKS))
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--resolution", type=int, default=32)
+    parser.add_argument("--seconds", type=float, default=1.0, help="factor of every task's budget")
+    parser.add_argument("--plot-only", action="store_true")
+    asked = parser.parse_args()
+    if not asked.plot_only:
+        ur.use()
+        rows: dict[str, Any] = read(HERE)["tasks"] if (HERE / "results.json").is_file() else {}
+        for name in asked.task or TASKS:
+            task = TASKS[name]
+            sized = {**task.options, "resolution": asked.resolution} if name != "QUAD" else task.options
+            TASKS[name] = replace(task, options=sized, seconds=asked.seconds * task.seconds)
+            rows[name] = race(name, asked.runs)
+            rows = {key: rows[key] for key in TASKS if key in rows}
+            write(HERE, {"runs": asked.runs, "resolution": asked.resolution, "tasks": rows})
+    plot(read(HERE))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Limited-memory BFGS: curvature from the gradients of past steps (Liu and Nocedal 1989)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import LbfgsInvHessProduct
+
+from unrender import arrays, checks, flat
+from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.newton import NewtonState, begin, check, finish, reach
+from unrender.optimizers.schedules import Schedule
+from unrender.trees import Tree
+
+_FIRST = 0.1
+"""Length of a step before any curvature is known, as a share of the trust radius."""
+
+
+@dataclass(frozen=True)
+class LBFGSState:
+    """State between steps.
+
+    Attributes:
+        directed: what it shares with `Newton`.
+        parameters, gradient: (n,) each, of the last step, in the scaled coordinates u.
+        moves, changes: (history, n) each: s = Δu and y = Δg of past steps, the last one in the last row.
+        count: how many rows of them are in use, the last ones.
+    """
+
+    directed: NewtonState
+    parameters: np.ndarray
+    gradient: np.ndarray
+    moves: np.ndarray
+    changes: np.ndarray
+    count: int = 0
+
+
+@dataclass(frozen=True)
+class LBFGS:
+    """Steps −γ B g, no longer than a trust radius: B is BFGS's estimate of H⁻¹ from the last steps s and the changes y of the gradient
+    over them, starting from the identity times sᵀy / yᵀy of the last one. There is no line search: a step costs one gradient.
+
+    Until there is a pair (s, y) the step is −g, a tenth of the trust radius long. Needs 2 `history` n numbers of memory.
+
+    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, and so is Δ.
+
+    Noise: y is the difference of two gradients that each have noise of their own, which does not shrink with s. A pair with sᵀy below
+    `curvature` ‖s‖ ‖y‖, as where the objective bends downwards or y is mostly noise, is left out; what noise is in the others stays for
+    `history` steps. So noise in proportion to the gradient, up to a third of it, does little harm; noise of a constant size soon ends
+    the descent (the paper found that it "almost never converges" there), which a `schedule` delays. B is biased even where the
+    gradients are not.
+
+    Args:
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
+            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0.
+        history: pairs that are kept, >= 1.
+        curvature: the least cosine between s and y of a pair that is kept, in (0, 1).
+        share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
+        through: an Adam that takes the step's opposite in place of the gradient, and makes a step of its own length, by its own
+            learning rate or the parameter's.
+        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
+    """
+
+    learning_rate: float = 1.0
+    trust_radius: float = 0.5
+    history: int = 5
+    curvature: float = 0.01
+    share: float = 1.0
+    through: Adam | None = None
+    trust_schedule: Schedule | None = None
+    schedule: Schedule | None = None
+
+    def __post_init__(self):
+        check("LBFGS", self)
+        checks.number("LBFGS", "trust_radius", self.trust_radius, above=0.0)
+        checks.whole("LBFGS", "history", self.history, at_least=1)
+        checks.number("LBFGS", "curvature", self.curvature, above=0.0, below=1.0)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """A gradient."""
+        return frozenset({GRADIENT})
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> LBFGSState:
+        """See `Optimizer.init`."""
+        n = sum(math.prod(arrays.shape(x)) for x in parameters.values())
+        none, rows = np.zeros(n), np.zeros((self.history, n))
+        return LBFGSState(begin("LBFGS", self, parameters, learning_rates), none, none, rows, rows)
+
+    def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
+        """See `Optimizer.update`. On the host."""
+        scale = flat.spread(state.directed.learning_rates, parameters)
+        here, gradient = flat.ravel(parameters) / scale, scale * flat.ravel(estimate.gradient)
+        if state.directed.step:
+            state = self._remember(state, here - state.parameters, gradient - state.gradient)
+        direction = scale * self._direction(state, gradient, reach("LBFGS", self, state.directed))
+        steps, directed = finish("LBFGS", self, direction, state.directed, parameters)
+        return steps, replace(state, directed=directed, parameters=here, gradient=gradient)
+
+    def _remember(self, state: LBFGSState, move: np.ndarray, change: np.ndarray) -> LBFGSState:
+        """With this pair as the last one, where it tells of curvature."""
+        least = self.curvature * float(np.linalg.norm(move) * np.linalg.norm(change))
+        if not 0.0 < least <= float(move @ change):
+            return state
+        return replace(
+            state,
+            moves=np.concatenate([state.moves[1:], move[None]]),
+            changes=np.concatenate([state.changes[1:], change[None]]),
+            count=min(state.count + 1, self.history),
+        )
+
+    def _direction(self, state: LBFGSState, gradient: np.ndarray, radius: float) -> np.ndarray:
+        length = float(np.linalg.norm(gradient))
+        if not 0.0 < length < math.inf:
+            return np.zeros_like(gradient)
+        if state.count == 0:
+            return gradient * (-_FIRST * radius / length)
+        moves, changes = state.moves[-state.count :], state.changes[-state.count :]
+        # SciPy's B starts from the identity: in coordinates u / √β that is β in those of u.
+        beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])
+        inverse = LbfgsInvHessProduct(moves / math.sqrt(beta), changes * math.sqrt(beta))
+        return flat.within(-beta * inverse.matvec(gradient), radius)
