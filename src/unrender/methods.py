@@ -17,9 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, P
 
 from unrender import optimizers
 from unrender.errors import InputError
+from unrender.gradients.black_box import LossValues
 from unrender.gradients.estimate import Estimator
 from unrender.gradients.meta import MetaEstimator
 from unrender.gradients.path import PathGradient
+from unrender.gradients.smoothed import SmoothedDerivatives
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
@@ -127,6 +129,44 @@ class CoupledOptions(MetaCommonOptions):
     )
 
 
+class SmoothedOptions(Options):
+    """Options of `smoothed`."""
+
+    optimizer: Literal["newton-cg", "newton", "lbfgs", "adam", "cma-es"] = Field(
+        "newton-cg",
+        description="what takes the steps; newton forms n x n matrices, adam and lbfgs ask for gradients alone, cma-es for none",
+    )
+    sigma: PositiveFloat = Field(0.2, description="width of the smoothing at the start, in units of the parameters")
+    sigma_schedule: str | None = Field("exponential(40, 0.1)", description="sigma over the steps, as for schedule")
+    step: PositiveFloat = Field(
+        0.5,
+        description="as a share of sigma: the longest step; the learning rate, of adam; the first deviation, of cma-es",
+    )
+    samples: int = Field(16, ge=4, description="renders per view and derivative, products of the Hessian twice that")
+    spp: PositiveInt = Field(2, description="samples per pixel of a render")
+    aggregate: bool = Field(True, description="one draw serves all elements of a derivative; else samples for each")
+    iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
+
+    def start(self) -> tuple[Estimator, Optimizer]:
+        """Both parts with these options."""
+        schedule = parse_schedule(self.sigma_schedule)
+        length = self.step * self.sigma
+        if self.optimizer == "cma-es":
+            return LossValues(self.spp), optimizers.CMAES(sigma0=length)
+        order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
+        estimator = SmoothedDerivatives(
+            self.sigma, self.samples, order, self.aggregate, spp=self.spp, schedule=schedule
+        )
+        region: dict[str, Any] = {"trust_radius": length, "trust_schedule": schedule}
+        made: dict[str, Callable[[], Optimizer]] = {
+            "newton-cg": lambda: optimizers.NewtonCG(iterations=self.iterations, **region),
+            "newton": lambda: optimizers.Newton(**region),
+            "lbfgs": lambda: optimizers.LBFGS(**region),
+            "adam": lambda: optimizers.Adam(length, schedule=schedule),
+        }
+        return estimator, made[self.optimizer]()
+
+
 @dataclass(frozen=True)
 class Method:
     """A named way to recover a problem's parameters.
@@ -199,6 +239,10 @@ def _coupled(options: CoupledOptions) -> tuple[Estimator, Optimizer]:
     return MetaEstimator(coupled=True, spp=options.spp, image=image, **options.shared()), options.descent()
 
 
+def _smoothed(options: SmoothedOptions) -> tuple[Estimator, Optimizer]:
+    return options.start()
+
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -220,6 +264,12 @@ METHODS: dict[str, Method] = {
             "the same recursion, every sample in both of its terms, MetaAdam",
             CoupledOptions,
             _coupled,
+        ),
+        Method(
+            "smoothed",
+            "derivatives of a smoothed loss from perturbed renders alone, for poses and plateaus (Wang et al.), Newton-CG",
+            SmoothedOptions,
+            _smoothed,
         ),
     )
 }
@@ -281,7 +331,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
     """A part of a JSON schema."""
     if "enum" in schema:
         return " or ".join(schema["enum"])
-    words = {"integer": "a whole number", "number": "a number", "null": "none"}.get(schema.get("type", ""), "text")
+    words = {"integer": "a whole number", "number": "a number", "null": "none", "boolean": "true or false"}.get(
+        schema.get("type", ""), "text"
+    )
     names = {"exclusiveMinimum": "above", "minimum": "of at least", "exclusiveMaximum": "below", "maximum": "up to"}
     limits = [f"{word} {schema[name]:g}" for name, word in names.items() if name in schema]
     return f"{words} {' and '.join(limits)}".rstrip()

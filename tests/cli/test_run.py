@@ -58,6 +58,39 @@ def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsub
     assert unrender("report", "result").status == 0
 
 
+@pytest.mark.parametrize(
+    "settings", [[], ["--set", "optimizer=cma-es", "--set", "step=1.5"]], ids=["newton-cg", "cma-es"]
+)
+def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_variant: str, settings: list[str]):
+    """`mug`: its handle is hidden at the start."""
+    del problem
+    words = [
+        "run",
+        "mug",
+        "--method",
+        "smoothed",
+        "--set",
+        "sigma=0.6",
+        "--set",
+        f"optimizer={optimizer}",
+        "--steps",
+        80,
+    ]
+    answer = unrender(*words, "--out", "mug", "--variant", mitsuba_variant, *QUICK)
+    assert answer.status == 0, answer.error
+    record = json.loads(Path("mug", "run.json").read_text())
+    assert record["method"] == "smoothed"
+    told = [json.loads(line) for line in Path("mug", "history.jsonl").read_text().splitlines()]
+    assert told[0]["samples"] > 48 * 48 * 2 * 4
+    with np.load(Path("mug", "parameters.npz")) as found:
+        assert abs(float(found["mug.rotation.y"])) < 0.15
+    assert unrender("report", "mug").status == 0
+    refused = unrender("run", "mug", "--steps", 1, "--variant", mitsuba_variant)
+    assert refused.status == 2
+    assert "parameter mug.rotation.y: it cannot be recovered by path gradients" in refused.error
+    assert "smoothed" in refused.error.lower()
+
+
 def test_run_of_the_gallery_s_problem_without_a_renderer(unrender, problem: Path, mitsuba_variant: str):
     del problem
     words = ["run", "exponential", "--method", "coupled", "--set", "spp=32", "--steps", 150, "--out", "toy"]

@@ -7,11 +7,13 @@ from typing import Any
 import pytest
 
 from unrender.errors import InputError
+from unrender.gradients.black_box import LossValues
 from unrender.gradients.meta import MetaEstimator
 from unrender.gradients.path import PathGradient
+from unrender.gradients.smoothed import SmoothedDerivatives
 from unrender.images import Plain, RecursiveControlVariate
 from unrender.methods import METHODS, method, parse_schedule
-from unrender.optimizers import Adam, MetaAdam, schedules
+from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG, schedules
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -52,6 +54,23 @@ def test_meta_and_coupled_take_their_options():
     assert optimizer == Adam(0.1)
 
 
+def test_smoothed_takes_its_options():
+    estimator, optimizer = method("smoothed").start({"sigma": "0.4", "step": 0.25, "sigma_schedule": "cosine(50)"})
+    narrowing = schedules.Cosine(50)
+    assert estimator == SmoothedDerivatives(0.4, 16, "hvp", spp=2, schedule=narrowing)
+    assert optimizer == NewtonCG(trust_radius=0.1, iterations=3, trust_schedule=narrowing)
+    settings = {"sigma": 0.4, "step": 0.25, "spp": 4, "sigma_schedule": "none", "aggregate": "false"}
+    for name, order, made in (
+        ("newton", "hessian", Newton(trust_radius=0.1)),
+        ("lbfgs", "gradient", LBFGS(trust_radius=0.1)),
+        ("adam", "gradient", Adam(0.1)),
+    ):
+        estimator, optimizer = method("smoothed").start({**settings, "optimizer": name})
+        assert estimator == SmoothedDerivatives(0.4, 16, order, aggregate=False, spp=4)
+        assert optimizer == made
+    assert method("smoothed").start({**settings, "optimizer": "cma-es"}) == (LossValues(4), CMAES(sigma0=0.1))
+
+
 def test_none_is_none():
     assert method("plain").configure({"adjoint_spp": "none", "schedule": "None"}) == method("plain").configure({})
 
@@ -71,6 +90,9 @@ def test_none_is_none():
         ("plain", {"learning_rate": "fast"}, "option learning_rate: expected a number above 0, got 'fast'"),
         ("plain", {"beta_1": "1"}, "option beta_1: expected a number of at least 0 and below 1, got '1'"),
         ("rcv", {"space": "paths"}, "method rcv: option space: expected path or primary, got 'paths'"),
+        ("smoothed", {"sigma": "-1"}, "method smoothed: option sigma: expected a number above 0, got '-1'"),
+        ("smoothed", {"aggregate": "maybe"}, "option aggregate: expected true or false, got 'maybe'"),
+        ("smoothed", {"samples": 3}, "option samples: expected a whole number of at least 4, got 3"),
         ("plain", {"schedule": "cosin(3)"}, "method plain: schedule: unknown 'cosin'; did you mean cosine?"),
     ],
 )

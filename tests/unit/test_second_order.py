@@ -152,8 +152,16 @@ def test_without_curvature_the_step_is_the_gradients_and_as_long_as_the_radius(o
     np.testing.assert_allclose(step, -0.5 * gradient / np.linalg.norm(gradient), rtol=1e-9)
 
 
-@pytest.mark.parametrize("optimizer", FIRST_STEPS, ids=["Newton", "CG", "LBFGS"])
-@pytest.mark.parametrize("what", ["zero gradient", "bad curvature", "bad gradient"])
+@pytest.mark.parametrize(
+    ("optimizer", "what"),
+    [
+        (optimizer, what)
+        for optimizer in FIRST_STEPS
+        for what in ("zero gradient", "bad curvature", "bad gradient")
+        if not (isinstance(optimizer, LBFGS) and what == "bad curvature")  # it asks for none
+    ],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+)
 def test_no_step_where_nothing_is_known(optimizer, what):
     hessian, minimum = bowl()
     gradient = -hessian @ minimum
@@ -161,8 +169,6 @@ def test_no_step_where_nothing_is_known(optimizer, what):
         gradient = np.zeros(6)
     elif what == "bad curvature":
         hessian[2, 1] = np.nan
-        if isinstance(optimizer, LBFGS):
-            pytest.skip("it asks for none")
     else:
         gradient[3] = np.inf
     np.testing.assert_array_equal(first_step(optimizer, gradient, hessian), np.zeros(6))
