@@ -64,18 +64,7 @@ def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsub
 def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_variant: str, settings: list[str]):
     """`mug`: its handle is hidden at the start."""
     del problem
-    words = [
-        "run",
-        "mug",
-        "--method",
-        "smoothed",
-        "--set",
-        "sigma=0.6",
-        "--set",
-        f"optimizer={optimizer}",
-        "--steps",
-        80,
-    ]
+    words = ["run", "mug", "--method", "smoothed", "--set", "sigma=0.6", *settings, "--steps", 80]
     answer = unrender(*words, "--out", "mug", "--variant", mitsuba_variant, *QUICK)
     assert answer.status == 0, answer.error
     record = json.loads(Path("mug", "run.json").read_text())
