@@ -33,11 +33,11 @@ from tasks import TASKS, Task, begin
 import unrender as ur
 
 HERE = Path(__file__).resolve().parent
-TUNING = 2
+TUNING = 4
 """Starts that a method is tuned on, numbered from 1000."""
 FLOOR = 0.1
 """σ shrinks to this share of its start, and no further."""
-_NEVER = 3.0
+_NEVER = 10.0
 """A goal that is not met counts as this many times the budget when methods are tuned."""
 
 Config = dict[str, float]
