@@ -3,7 +3,7 @@
 
 """What a perturbation costs: `bunny` at 64², 4 spp, poses by rays against vertices that are moved and rendered anew.
 
-    python benchmarks/higher_order/speed/run.py [--resolution 64] [--spp 4] [--vertices 36000]
+    python benchmarks/higher_order/speed/run.py [--resolution 64] [--spp 4] [--detail 1 3]
 
 Ours: one launch for a batch of poses; milliseconds per perturbation, of the call and of its kernels alone, by the size of the batch.
 The other: the mesh's vertices are transformed on the device, written to the scene, whose acceleration structure is rebuilt, and
@@ -103,14 +103,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--spp", type=int, default=4)
-    parser.add_argument("--vertices", type=int, nargs="+", default=[3000, 36000], help="about how many the mesh has")
+    parser.add_argument("--detail", type=int, nargs="+", default=[1, 3], help="of the meshes")
     parser.add_argument("--plot-only", action="store_true")
     asked = parser.parse_args()
     if not asked.plot_only:
         ur.use()
         began, meshes = time.perf_counter(), {}
-        for vertices in asked.vertices:
-            problem = ur.gallery.problem("bunny", resolution=asked.resolution, vertices=vertices, reference_spp=16)
+        for detail in asked.detail:
+            problem = ur.gallery.problem("bunny", resolution=asked.resolution, detail=detail, reference_spp=16)
             count = mitsuba_renderer(problem).parameters()["bunny.vertex_positions"].shape[0] // 3
             rows = batches(problem, asked.spp)
             moved, still = moved_vertices(problem, asked.spp)

@@ -26,6 +26,9 @@ class Bunny:
 
     resolution: int = fields.resolution(48)
     mesh: str = mesh_files.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
+    detail: int = fields.whole(
+        1, "how fine the mesh made by code is: 3600 vertices at 1, times the square", at_least=1, at_most=16
+    )
     reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(2, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
@@ -33,7 +36,7 @@ class Bunny:
     def scene(self) -> dict[str, Any]:
         """The animal: 1 along its longest side, on the floor y = 0 at the origin, the sun at the camera's left."""
         fur = parts.twosided(parts.diffuse(0.75, 0.6, 0.45))
-        made = mesh_files.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(), fur)
+        made = mesh_files.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(self.detail), fur)
         return {
             "type": "scene",
             "camera": parts.camera((0.1, 2.0, 3.0), (0.1, 0.33, 0), 30.0, self.resolution),
@@ -50,13 +53,13 @@ class Bunny:
         )
 
 
-def _animal() -> list[meshes.Sheet]:
+def _animal(detail: int) -> list[meshes.Sheet]:
     """A sitting hare that looks along +x and a little to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
 
     def ball(centre: tuple[float, ...], radii: tuple[float, ...], tilt: float = 0.0) -> meshes.Sheet:
         c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
         turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(radii)
-        return meshes.Sheet(_turned(meshes.ellipsoid(turned, np.array(centre), 16, 24)))
+        return meshes.Sheet(_turned(meshes.ellipsoid(turned, np.array(centre), 16 * detail, 24 * detail)))
 
     return [
         ball((-0.05, 0.27, 0), (0.36, 0.25, 0.23), 12),

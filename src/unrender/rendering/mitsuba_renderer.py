@@ -63,6 +63,8 @@ class MitsubaRenderer:
     def __init__(self, description: SceneDescription, max_depth: int = 6):
         self.max_depth = max_depth
         self.pair = ScenePair(description)
+        sizes = [sensor.film().crop_size() for sensor in self.pair.current.sensors()]
+        self._resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._poses = poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = dict(self.pair.info())
         self._info |= {key: poses.info(pose) for key, pose in self._poses.items()}
@@ -96,8 +98,7 @@ class MitsubaRenderer:
 
     def resolutions(self) -> list[tuple[int, int]]:
         """(height, width) of each sensor's film, after cropping."""
-        sizes = [sensor.film().crop_size() for sensor in self.pair.current.sensors()]
-        return [(int(s[1]), int(s[0])) for s in sizes]
+        return self._resolutions
 
     def array(self, values: np.ndarray) -> Any:
         """`mi.TensorXf` with these values, in memory of its own.
