@@ -34,6 +34,7 @@ CUTS: dict[str, dict[str, bool]] = {
     "aggregate": {"aggregate": True},
     "antithetic": {"antithetic": True},
     "baseline": {"baseline": True},
+    "antithetic and baseline": {"antithetic": True, "baseline": True},
     "low-discrepancy": {"low_discrepancy": True},
     "all": {"aggregate": True, "antithetic": True, "baseline": True, "low_discrepancy": True},
     "all but low-discrepancy": {"aggregate": True, "antithetic": True, "baseline": True},
