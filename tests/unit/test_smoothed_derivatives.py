@@ -1,0 +1,118 @@
+"""`SmoothedDerivatives` and `LossValues`: what they refuse, count, and cost in memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.keys import Key
+from unrender.optimizers.schedules import Exponential
+from unrender.rendering.analytic import AnalyticRenderer
+
+
+def problem(n: int = 3, **more: Any) -> ur.Problem:
+    """`n` numbers seen in four pixels; images without noise."""
+    rng = np.random.default_rng(0)
+    renderer = AnalyticRenderer({"x": rng.uniform(0.3, 0.7, n)}, rng.random((12, n)) / n, noise=0.0, shape=(2, 2))
+    view = ur.View(renderer.exact({}))
+    return ur.Problem(renderer, [ur.Parameter("x", initial=0.5, **more)], [view], truth=renderer.values(["x"]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sigma": 0.0}, "sigma must be a finite number > 0, got 0.0"),
+        ({"sigma": -1}, "sigma must be a finite number > 0, got -1"),
+        ({"sigma": float("nan")}, "sigma must be a finite number > 0"),
+        ({"sigma": {"x": 0}}, "sigma of x must be a finite number > 0, got 0"),
+        ({"sigma": 0.1, "samples": 3}, "samples must be a whole number of at least 4, got 3"),
+        ({"sigma": 0.1, "samples": 8, "low_discrepancy": True}, "samples must be a whole number of at least 16, got 8"),
+        ({"sigma": 0.1, "order": "third"}, 'order must be "gradient", "hessian" or "hvp"'),
+        ({"sigma": 0.1, "order": "hvp", "product": True}, 'product=True goes with order="gradient"'),
+        ({"sigma": 0.1, "spp": 0}, "spp must be a whole number of at least 1, got 0"),
+        ({"sigma": 0.1, "epsilon": 0}, "epsilon must be a finite number > 0, got 0"),
+    ],
+)
+def test_arguments_that_make_no_sense(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ur.InputError) as caught:
+        ur.SmoothedDerivatives(**arguments)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_problems_that_it_cannot_take() -> None:
+    with pytest.raises(ur.InputError, match="sigma has no entry for parameter x"):
+        ur.estimate(problem(), ur.SmoothedDerivatives({"y": 0.1}))
+    renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5)}, np.ones((12, 4)), shape=(2, 2))
+    asked = ur.Problem(
+        renderer,
+        [ur.Parameter("x", initial=0.2, preconditioner=ur.preconditioners.LargeSteps(1.0))],
+        [ur.View(renderer.exact({}))],
+    )
+    with pytest.raises(ur.InputError, match="parameter x has a preconditioner"):
+        ur.estimate(asked, ur.SmoothedDerivatives(0.1))
+    with pytest.raises(ur.InputError, match=r'"hvp".*does not provide'):
+        ur.optimize(problem(), ur.SmoothedDerivatives(0.1), ur.optimizers.NewtonCG(), steps=1)
+    with pytest.raises(ur.InputError, match=r'"gradient".*does not provide'):
+        ur.optimize(problem(), ur.LossValues(), ur.optimizers.Adam(), steps=1)
+
+
+def test_a_parameter_that_cannot_be_perturbed_is_refused() -> None:
+    asked = ur.gallery.problem("mug", resolution=8, reference_spp=1)
+    with pytest.raises(ur.InputError, match=r"mug\.faces cannot be recovered: Mitsuba marks it as not differentiable"):
+        ur.Problem(asked.renderer, [ur.Parameter("mug.faces")], asked.views)
+
+
+def test_all_paths_are_counted_those_of_products_too() -> None:
+    def samples(estimator: Any, optimizer: Any) -> int:
+        history = ur.optimize(problem(), estimator, optimizer, steps=1).history
+        return history[0]["samples"] // (4 * estimator.spp)  # renders
+
+    optimizers = ur.optimizers
+    gradient = ur.SmoothedDerivatives(0.1, samples=16)
+    assert samples(gradient, optimizers.Adam()) == 1 + 16
+    assert samples(ur.SmoothedDerivatives(0.1, samples=16, aggregate=False), optimizers.Adam()) == 1 + 3 * 16
+    products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2)
+    assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
+    whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False)
+    assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16 + 1
+    assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
+
+
+def test_sigma_follows_its_schedule() -> None:
+    """Of a linear loss in an L1 problem the gradient is the same at any σ, but perturbed points tell it."""
+    asked, seen = problem(), []
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    render = renderer.image_batch
+
+    def watch(parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
+        if len(parameters["x"]) > 1:
+            seen.append(float(np.abs(parameters["x"] - parameters["x"].mean(0)).max()))
+        return render(parameters, shot)
+
+    renderer.image_batch = watch  # pyright: ignore[reportAttributeAccessIssue]
+    estimator = ur.SmoothedDerivatives(0.1, samples=64, schedule=Exponential(1, floor=0.2))
+    state, parameters = estimator.init(asked, asked.initial()), asked.initial()
+    for _ in range(5):
+        _, state = estimator.estimate(asked, parameters, state, Key(0))
+    np.testing.assert_allclose(np.array(seen) / seen[0], [1, 0.5, 0.25, 0.2, 0.2], rtol=1e-6)
+
+
+def test_products_never_make_a_matrix() -> None:
+    """A step of Newton-CG on 6000 numbers, whose Hessian would take 288 MB."""
+    asked = problem(6000)
+    estimator = ur.SmoothedDerivatives(0.05, samples=8, order="hvp")
+    optimizer = ur.optimizers.NewtonCG(iterations=2)
+    parameters = asked.initial()
+    state, memory = estimator.init(asked, parameters), optimizer.init(parameters)
+    tracemalloc.start()
+    found, _ = estimator.estimate(asked, parameters, state, Key(0))
+    optimizer.update(found, memory, parameters)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 200 * 8 * 6000
