@@ -109,8 +109,8 @@ def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     return ur.LossValues(spp=task.spp), optimizer
 
 
-_GRADIENT_GRID = {"half_life": (15, 40), "rate": (0.1, 0.3)}
-_NEWTON_GRID = {"half_life": (15, 40), "radius": (0.15, 0.5)}
+_GRADIENT_GRID = {"half_life": (25, 60), "rate": (0.1, 0.3)}
+_NEWTON_GRID = {"half_life": (25, 60), "radius": (0.15, 0.5)}
 METHODS = {
     "FR22": Method(_fr22, _GRADIENT_GRID),
     "CMA-ES": Method(_search, {"deviation": (0.5, 1.0), "population": (0, 16)}),

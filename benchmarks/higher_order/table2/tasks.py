@@ -96,7 +96,7 @@ def _grey(rng: np.random.Generator, initial: np.ndarray, truth: np.ndarray) -> n
 
 TASKS = {
     "QUAD": Task("quad", _quad, 0.5, 0.6),
-    "BOX2": Task("box2", _beside, 0.4, 1.5),
+    "BOX2": Task("box2", _beside, 0.5, 1.5),
     "BOX10": Task("box10", _around(0.08), 0.3, 4.0, spp=2),
     "MUG": Task("mug", _hidden, 0.6, 2.0),
     "SHADOW": Task("shadow", _around(0.2), 0.4, 1.5),
