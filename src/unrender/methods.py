@@ -38,6 +38,7 @@ SCHEDULES: dict[str, type] = {
     "warmup": schedules.Warmup,
 }
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+_WIDTH = pydantic.TypeAdapter(PositiveFloat)
 _CALL = re.compile(r"\s*([A-Za-z_]+)\s*(?:\(([^()]*)\))?\s*")
 
 
@@ -136,7 +137,10 @@ class SmoothedOptions(Options):
         "newton-cg",
         description="what takes the steps; newton forms n x n matrices, adam and lbfgs ask for gradients alone, cma-es for none",
     )
-    sigma: PositiveFloat = Field(0.2, description="width of the smoothing at the start, in units of the parameters")
+    sigma: PositiveFloat | str = Field(
+        0.2,
+        description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
+    )
     sigma_schedule: str | None = Field("exponential(40, 0.1)", description="sigma over the steps, as for schedule")
     step: PositiveFloat = Field(
         0.5,
@@ -149,20 +153,17 @@ class SmoothedOptions(Options):
 
     def start(self) -> tuple[Estimator, Optimizer]:
         """Both parts with these options."""
-        schedule = parse_schedule(self.sigma_schedule)
-        length = self.step * self.sigma
+        schedule, sigma = parse_schedule(self.sigma_schedule), parse_widths(self.sigma)
+        common = sigma["*"] if isinstance(sigma, dict) else sigma
         if self.optimizer == "cma-es":
-            return LossValues(self.spp), optimizers.CMAES(sigma0=length)
+            return LossValues(self.spp), optimizers.CMAES(sigma0=self.step * common)
         order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
-        estimator = SmoothedDerivatives(
-            self.sigma, self.samples, order, self.aggregate, spp=self.spp, schedule=schedule
-        )
-        region: dict[str, Any] = {"trust_radius": length, "trust_schedule": schedule}
+        estimator = SmoothedDerivatives(sigma, self.samples, order, self.aggregate, spp=self.spp, schedule=schedule)
         made: dict[str, Callable[[], Optimizer]] = {
-            "newton-cg": lambda: optimizers.NewtonCG(iterations=self.iterations, **region),
-            "newton": lambda: optimizers.Newton(**region),
-            "lbfgs": lambda: optimizers.LBFGS(**region),
-            "adam": lambda: optimizers.Adam(length, schedule=schedule),
+            "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
+            "newton": lambda: optimizers.Newton(trust_radius=self.step),
+            "lbfgs": lambda: optimizers.LBFGS(trust_radius=self.step),
+            "adam": lambda: optimizers.Adam(self.step * common, schedule=schedule),
         }
         return estimator, made[self.optimizer]()
 
@@ -314,6 +315,26 @@ def parse_schedule(text: str | None) -> schedules.Schedule | None:
         return kind(**arguments)
     except InputError as error:
         raise InputError(f"schedule: {error}") from error
+
+
+def parse_widths(given: float | str) -> float | dict[str, float]:
+    """A width for all parameters, or {key: width, "*": width of the others} from "0.2, mug.rotation.y=0.6".
+
+    Raises:
+        InputError: no width for the others, or what is no number above 0.
+    """
+    if not isinstance(given, str):
+        return given
+    widths: dict[str, float] = {}
+    for part in given.split(","):
+        key, _, number = part.rpartition("=")
+        try:
+            widths[key.strip() or "*"] = _WIDTH.validate_python(number.strip())
+        except pydantic.ValidationError as error:
+            raise InputError(f"sigma: expected a number above 0, got {number.strip()!r}") from error
+    if "*" not in widths:
+        raise InputError(f"sigma: expected a number for all others too, as in 0.2, mug.rotation.y=0.6, got {given!r}")
+    return widths if len(widths) > 1 else widths["*"]
 
 
 def _number(text: str) -> int | float:

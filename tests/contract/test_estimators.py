@@ -48,8 +48,8 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
-    "Newton": lambda: ur.optimizers.Newton(share=0.1),
-    "NewtonCG": lambda: ur.optimizers.NewtonCG(share=0.1),
+    "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, share=0.1),
+    "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, share=0.1),
     "LBFGS": lambda: ur.optimizers.LBFGS(share=0.1, schedule=ur.optimizers.schedules.Exponential(100)),
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
 }

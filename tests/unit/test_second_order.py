@@ -557,9 +557,9 @@ def test_steps_have_the_parameters_type_and_memory_of_their_own():
 @pytest.mark.parametrize(
     ("optimizer", "order"),
     [
-        (Newton(trust_radius=0.1), "hessian"),
-        (NewtonCG(trust_radius=0.1, through=Adam(0.03)), "hvp"),
-        (LBFGS(trust_radius=0.1), "gradient"),
+        (Newton(trust_radius=2.0), "hessian"),
+        (NewtonCG(trust_radius=2.0, through=Adam(0.03)), "hvp"),
+        (LBFGS(trust_radius=2.0), "gradient"),
         (CMAES(sigma0=0.2), "gradient"),
     ],
     ids=["Newton", "NewtonCG", "LBFGS", "CMAES"],
@@ -614,3 +614,24 @@ def test_bad_arguments_are_named(make, message):
         make()
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("optimizer", [Newton(), NewtonCG(), LBFGS()], ids=["Newton", "NewtonCG", "LBFGS"])
+def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
+    """Half a σ of each parameter, wherever the gradient is steep enough; and no farther than with σ as the unit of the parameters."""
+    parameters = {"a": np.zeros(2), "b": np.zeros(1)}
+    gradient = {"a": np.array([3e3, -1e3]), "b": np.array([2e3])}
+
+    def first(width: dict[str, float] | None) -> np.ndarray:
+        scale = np.array([width["a"], width["a"], width["b"]]) if width else np.ones(3)
+        hessian = np.diag(1 / scale**2)
+        found = Estimate(
+            0.0, gradient, hessian=hessian, hvp=lambda v: flat.unravel(hessian @ flat.ravel(v), parameters), width=width
+        )
+        return flat.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
+
+    for width in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
+        step = first(width)
+        reach = np.linalg.norm(step / np.array([width["a"], width["a"], width["b"]]))
+        assert reach == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
+    assert np.linalg.norm(first(None)) == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)

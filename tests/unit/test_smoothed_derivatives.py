@@ -46,7 +46,9 @@ def test_arguments_that_make_no_sense(arguments: dict[str, Any], message: str) -
 
 def test_problems_that_it_cannot_take() -> None:
     with pytest.raises(ur.InputError, match="sigma has no entry for parameter x"):
-        ur.estimate(problem(), ur.SmoothedDerivatives({"y": 0.1}))
+        ur.estimate(problem(), ur.SmoothedDerivatives({}))
+    with pytest.raises(ur.InputError, match="sigma names y, which is none of the parameters"):
+        ur.estimate(problem(), ur.SmoothedDerivatives({"*": 0.1, "y": 0.1}))
     renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5)}, np.ones((12, 4)), shape=(2, 2))
     asked = ur.Problem(
         renderer,

@@ -74,10 +74,9 @@ def _adam(task: Task, c: Config) -> Any:
     return ur.optimizers.Adam(c["rate"] * task.sigma, schedule=schedule)
 
 
-def _region(task: Task, n: int, c: Config) -> dict[str, Any]:
-    """The trust region, which shrinks with σ."""
-    schedule = ur.optimizers.schedules.Exponential(c["half_life"], FLOOR)
-    return {"trust_radius": c["radius"] * task.sigma * math.sqrt(n), "trust_schedule": schedule}
+def _radius(n: int, c: Config) -> float:
+    """The trust radius: of each number's share, in units of σ."""
+    return c["radius"] * math.sqrt(n)
 
 
 def _fr22(task: Task, n: int, c: Config) -> tuple[Any, Any]:
@@ -90,14 +89,14 @@ def _gradient(task: Task, n: int, c: Config) -> tuple[Any, Any]:
 
 def _hessian(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     estimator = _smoothed(task, c, max(2 * _samples(n) // n, 4), order="hessian", aggregate=False)
-    return estimator, ur.optimizers.Newton(**_region(task, n, c))
+    return estimator, ur.optimizers.Newton(trust_radius=_radius(n, c))
 
 
 def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
     def make(task: Task, n: int, c: Config) -> tuple[Any, Any]:
         samples = _samples(n) if aggregate else max(_samples(n) // n, 4)
         estimator = _smoothed(task, c, samples, order="hvp", aggregate=aggregate)
-        return estimator, ur.optimizers.NewtonCG(iterations=min(n, 3), **_region(task, n, c))
+        return estimator, ur.optimizers.NewtonCG(trust_radius=_radius(n, c), iterations=min(n, 3))
 
     return make
 

@@ -32,6 +32,8 @@ class Estimate:
         hvp: the product of the Hessian with a tree, or None.
         losses: the loss at many points at once, (B, n) to (B,) NumPy arrays over all parameters flattened in key order, every point
             with this step's random numbers; or None.
+        width: {key: σ}, how far around the parameters the derivatives tell of the loss, where they are smoothed; None where they are local.
+            Trust regions are measured in it.
         info: for people: samples traced, control weights, images. Never read back.
         preconditioned: whether `gradient` and `variance` are already those of u, where a parameter with a preconditioner S is
             x = S u: estimators that remember per element must do so in the coordinates of the descent.
@@ -43,6 +45,7 @@ class Estimate:
     hessian: Array | None = None
     hvp: Callable[[Tree], Tree] | None = None
     losses: Callable[[np.ndarray], np.ndarray] | None = None
+    width: Mapping[str, float] | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     preconditioned: bool = False
 

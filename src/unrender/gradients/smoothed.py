@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
-from unrender import arrays, checks, flat, smoothed
+from unrender import checks, flat, smoothed
 from unrender.errors import InputError
 from unrender.gradients.black_box import BlackBox
 from unrender.gradients.estimate import GRADIENT, HESSIAN, HVP, LOSSES, VARIANCE, Estimate
 from unrender.keys import Key
+from unrender.names import did_you_mean
 from unrender.optimizers.schedules import Schedule
 from unrender.problem.problem import Problem
 from unrender.trees import Tree
@@ -38,7 +36,7 @@ class SmoothedDerivatives:
     product has the bias of its central difference (`smoothed.hvp`).
 
     Args:
-        sigma: σ in units of the parameters, > 0: one number, or {key: number}.
+        sigma: σ in units of the parameters, > 0: one number, or {key: number}, where "*" stands for all keys that are not named.
         samples: renders per view and derivative, >= 4; without `aggregate`, per element of the derivative too.
         order: "gradient", "hessian" (n × n, for few parameters), or "hvp".
         aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
@@ -86,7 +84,7 @@ class SmoothedDerivatives:
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
         problem.renderer.select(list(parameters), None, derivatives=False)
-        self._sigma(parameters)
+        self._widths(parameters)
         return SmoothedState()
 
     def estimate(
@@ -96,7 +94,9 @@ class SmoothedDerivatives:
         at the parameters themselves."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0))
         theta = flat.ravel(parameters)
-        sigma = self._sigma(parameters) * (self.schedule(state.step) if self.schedule else 1.0)
+        factor = self.schedule(state.step) if self.schedule else 1.0
+        width = {k: factor * number for k, number in self._widths(parameters).items()}
+        sigma = flat.spread(width, parameters)
         loss = box.here()
         seed = key.fold(1).uint32()
         options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
@@ -131,13 +131,19 @@ class SmoothedDerivatives:
             hessian,
             product if self.order == "hvp" else None,
             box.losses,
+            width,
             info=box.info,
         ), SmoothedState(state.step + 1)
 
-    def _sigma(self, parameters: Tree) -> np.ndarray:
+    def _widths(self, parameters: Tree) -> dict[str, float]:
+        """σ of each parameter at the start."""
         if not isinstance(self.sigma, Mapping):
-            return np.full(sum(math.prod(arrays.shape(x)) for x in parameters.values()), float(self.sigma))
-        missing = [key for key in parameters if key not in self.sigma]
+            return dict.fromkeys(parameters, float(self.sigma))
+        for key in self.sigma:
+            if key != "*" and key not in parameters:
+                hint = did_you_mean(key, parameters)
+                raise InputError(f"SmoothedDerivatives: sigma names {key}, which is none of the parameters{hint}")
+        missing = [key for key in parameters if key not in self.sigma and "*" not in self.sigma]
         if missing:
             raise InputError(f"SmoothedDerivatives: sigma has no entry for parameter {missing[0]}")
-        return flat.spread(self.sigma, parameters)
+        return {key: float(self.sigma[key] if key in self.sigma else self.sigma["*"]) for key in parameters}

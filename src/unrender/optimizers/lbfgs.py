@@ -12,7 +12,7 @@ from scipy.optimize import LbfgsInvHessProduct
 from unrender import arrays, checks, flat
 from unrender.gradients.estimate import GRADIENT, Estimate
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.newton import NewtonState, begin, check, finish, reach
+from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
 from unrender.optimizers.schedules import Schedule
 from unrender.trees import Tree
 
@@ -26,8 +26,8 @@ class LBFGSState:
 
     Attributes:
         directed: what it shares with `Newton`.
-        parameters, gradient: (n,) each, of the last step, in the scaled coordinates u.
-        moves, changes: (history, n) each: s = Δu and y = Δg of past steps, the last one in the last row.
+        parameters, gradient: (n,) each, of the last step.
+        moves, changes: (history, n) each: s = Δx and y = Δg of past steps, the last one in the last row.
         count: how many rows of them are in use, the last ones.
     """
 
@@ -46,7 +46,7 @@ class LBFGS:
 
     Until there is a pair (s, y) the step is −g, a tenth of the trust radius long. Needs 2 `history` n numbers of memory.
 
-    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, and so is Δ.
+    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, times its σ, and so is Δ.
 
     Noise: y is the difference of two gradients that each have noise of their own, which does not shrink with s. A pair with sᵀy below
     `curvature` ‖s‖ ‖y‖, as where the objective bends downwards or y is mostly noise, is left out; what noise is in the others stays for
@@ -56,14 +56,13 @@ class LBFGS:
 
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0.
+            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0.
         history: pairs that are kept, >= 1.
         curvature: the least cosine between s and y of a pair that is kept, in (0, 1).
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, and makes a step of its own length, by its own
             learning rate or the parameter's.
-        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
         schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
     """
 
@@ -73,7 +72,6 @@ class LBFGS:
     curvature: float = 0.01
     share: float = 1.0
     through: Adam | None = None
-    trust_schedule: Schedule | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
@@ -95,17 +93,17 @@ class LBFGS:
 
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
         """See `Optimizer.update`. On the host."""
-        scale = flat.spread(state.directed.learning_rates, parameters)
-        here, gradient = flat.ravel(parameters) / scale, scale * flat.ravel(estimate.gradient)
+        scale = scales(estimate, state.directed, parameters)
+        here, gradient = flat.ravel(parameters), flat.ravel(estimate.gradient)
         if state.directed.step:
-            state = self._remember(state, here - state.parameters, gradient - state.gradient)
-        direction = scale * self._direction(state, gradient, reach("LBFGS", self, state.directed))
+            state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)
+        direction = scale * self._direction(state, scale * gradient, scale)
         steps, directed = finish("LBFGS", self, direction, state.directed, parameters)
         return steps, replace(state, directed=directed, parameters=here, gradient=gradient)
 
-    def _remember(self, state: LBFGSState, move: np.ndarray, change: np.ndarray) -> LBFGSState:
+    def _remember(self, state: LBFGSState, move: np.ndarray, change: np.ndarray, scale: np.ndarray) -> LBFGSState:
         """With this pair as the last one, where it tells of curvature."""
-        least = self.curvature * float(np.linalg.norm(move) * np.linalg.norm(change))
+        least = self.curvature * float(np.linalg.norm(move / scale) * np.linalg.norm(change * scale))
         if not 0.0 < least <= float(move @ change):
             return state
         return replace(
@@ -115,14 +113,14 @@ class LBFGS:
             count=min(state.count + 1, self.history),
         )
 
-    def _direction(self, state: LBFGSState, gradient: np.ndarray, radius: float) -> np.ndarray:
+    def _direction(self, state: LBFGSState, gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
         length = float(np.linalg.norm(gradient))
         if not 0.0 < length < math.inf:
             return np.zeros_like(gradient)
         if state.count == 0:
-            return gradient * (-_FIRST * radius / length)
-        moves, changes = state.moves[-state.count :], state.changes[-state.count :]
+            return gradient * (-_FIRST * self.trust_radius / length)
+        moves, changes = state.moves[-state.count :] / scale, state.changes[-state.count :] * scale
         # SciPy's B starts from the identity: in coordinates u / √β that is β in those of u.
         beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])
         inverse = LbfgsInvHessProduct(moves / math.sqrt(beta), changes * math.sqrt(beta))
-        return flat.within(-beta * inverse.matvec(gradient), radius)
+        return flat.within(-beta * inverse.matvec(gradient), self.trust_radius)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -48,9 +48,10 @@ class Newton:
     keeps its direction, which is that of the flattest eigenvectors, and they are the ones that noise is mistaken for.) Where H is zero
     the step is −g, Δ long; where H is not finite there is none.
 
-    Scales: the step is sought for the coordinates u = x / η, where η is each parameter's learning rate, and Δ, like `damping`, is of u.
-    A position in metres and an angle in radians with η of 0.05 and 0.5 may so move by 0.05 Δ and 0.5 Δ. Inside the trust region and
-    without damping the step does not depend on η.
+    Scales: the step is sought for the coordinates u = x / η, where η is each parameter's learning rate, times the σ of derivatives that
+    are smoothed (`Estimate.width`): of what is farther they tell nothing. Δ, like `damping`, is of u. A position in metres and an
+    angle in radians with η of 0.05 and 0.5 may so move by 0.05 Δ and 0.5 Δ. Inside the trust region and without damping the step
+    does not depend on η.
 
     Noise: the step is a product of two estimates, so it is biased even where they are not (an inverse is convex); a small eigenvalue
     that noise makes smaller gives a long step along itself. Noise of a tenth of H asks for `damping` around 0.03, as much noise as H for
@@ -58,13 +59,12 @@ class Newton:
 
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0; None for no limit.
+            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0; None for no limit.
         damping: the least eigenvalue's share of the largest, in (0, 1).
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
             optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
-        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
         schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
     """
 
@@ -73,7 +73,6 @@ class Newton:
     damping: float = 0.1
     share: float = 1.0
     through: Adam | None = None
-    trust_schedule: Schedule | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
@@ -94,12 +93,12 @@ class Newton:
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
         """See `Optimizer.update`. On the host."""
         assert estimate.hessian is not None
-        scale = flat.spread(state.learning_rates, parameters)
+        scale = scales(estimate, state, parameters)
         hessian = scale[:, None] * arrays.numpy(estimate.hessian).astype(np.float64) * scale
-        step = self._solve(scale * flat.ravel(estimate.gradient), hessian, reach("Newton", self, state))
+        step = self._solve(scale * flat.ravel(estimate.gradient), hessian)
         return finish("Newton", self, scale * step, state, parameters)
 
-    def _solve(self, gradient: np.ndarray, hessian: np.ndarray, radius: float | None) -> np.ndarray:
+    def _solve(self, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
         none = np.zeros_like(gradient)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all() and gradient.any()):
             return none
@@ -144,19 +143,12 @@ class Directed(Protocol):
     def through(self) -> Adam | None: ...
 
     @property
-    def trust_radius(self) -> float | None: ...
-
-    @property
-    def trust_schedule(self) -> Schedule | None: ...
-
-    @property
     def schedule(self) -> Schedule | None: ...
 
 
 def check(owner: str, options: Directed) -> None:
     """Raise `InputError` unless they make sense."""
     rates.check(owner, options.learning_rate, options.schedule)
-    rates.check(owner, options.learning_rate, options.trust_schedule)
     if checks.number(owner, "share", options.share, above=0.0) > 1.0:
         raise InputError(f"{owner}: share must be at most 1, got {options.share!r}")
     if options.through is not None and not isinstance(options.through, Adam):
@@ -172,10 +164,10 @@ def begin(owner: str, options: Directed, parameters: Tree, learning_rates: Mappi
     return NewtonState(0, own, adam)
 
 
-def reach(owner: str, options: Directed, state: NewtonState) -> Any:
-    """The present trust radius; None where there is no limit."""
-    factor = rates.factor(owner, options.trust_schedule, state.step)
-    return None if options.trust_radius is None else options.trust_radius * factor
+def scales(estimate: Estimate, state: NewtonState, parameters: Tree) -> np.ndarray:
+    """The unit of each element's coordinate u, (n,): its learning rate, times the width that the estimate holds for, if any."""
+    width = estimate.width
+    return flat.spread({k: η * (width[k] if width else 1.0) for k, η in state.learning_rates.items()}, parameters)
 
 
 def finish(

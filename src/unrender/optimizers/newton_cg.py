@@ -11,7 +11,7 @@ import numpy as np
 from unrender import checks, flat
 from unrender.gradients.estimate import GRADIENT, HVP, Estimate
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.newton import NewtonState, begin, check, finish, reach
+from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
 from unrender.optimizers.schedules import Schedule
 from unrender.trees import Tree
 
@@ -26,8 +26,8 @@ class NewtonCG:
     (Steihaug 1983). Memory is a few vectors; no n × n matrix is built. As many iterations as dimensions solve a well-conditioned
     positive definite H exactly, without tolerance and damping.
 
-    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, and so is Δ; the products that are asked for
-    are of η v.
+    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, times its σ, and so is Δ; the products that
+    are asked for are of η v.
 
     Noise: what is estimated as H v need not come from a symmetric matrix, nor from the same one each time. So the iterations end where they
     would go by noise: at a v along which the curvature vᵀHv / vᵀv is less than a share `damping` of the greatest one met, or negative
@@ -37,15 +37,14 @@ class NewtonCG:
 
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements, in units of η, > 0.
+            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0.
         iterations: Hessian-vector products a step at most, >= 1.
         tolerance: the residual's share of the gradient at which it ends, in [0, 1).
         damping: the least curvature that is believed, as a share of the greatest, in [0, 1).
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
             optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
-        trust_schedule: factor of Δ by step: derivatives smoothed by a σ that shrinks tell of a region that shrinks with it.
         schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
     """
 
@@ -56,7 +55,6 @@ class NewtonCG:
     damping: float = 0.1
     share: float = 1.0
     through: Adam | None = None
-    trust_schedule: Schedule | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
@@ -79,16 +77,15 @@ class NewtonCG:
         """See `Optimizer.update`. On the host, between products."""
         hvp = estimate.hvp
         assert hvp is not None
-        scale = flat.spread(state.learning_rates, parameters)
+        scale = scales(estimate, state, parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
             return scale * flat.ravel(hvp(flat.unravel(scale * v, parameters)))
 
-        radius = reach("NewtonCG", self, state)
-        step = self._solve(scale * flat.ravel(estimate.gradient), product, radius)
+        step = self._solve(scale * flat.ravel(estimate.gradient), product)
         return finish("NewtonCG", self, scale * step, state, parameters)
 
-    def _solve(self, gradient: np.ndarray, product: Callable[[np.ndarray], np.ndarray], radius: float) -> np.ndarray:
+    def _solve(self, gradient: np.ndarray, product: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         step, residual = np.zeros_like(gradient), -gradient
         v, sharpest = residual, 0.0
         first = square = float(residual @ residual)
@@ -101,7 +98,7 @@ class NewtonCG:
             if not np.isfinite(bent).all():
                 break
             bend, length = float(v @ bent), float(v @ v)
-            left = _to_the_radius(step, v, radius)
+            left = _to_the_radius(step, v, self.trust_radius)
             if iteration == 0 and bend <= 0.0:
                 return left * v
             sharpest = max(sharpest, abs(bend) / length)
