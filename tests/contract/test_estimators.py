@@ -50,7 +50,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
     "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, share=0.1),
     "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, share=0.1),
-    "LBFGS": lambda: ur.optimizers.LBFGS(share=0.1, schedule=ur.optimizers.schedules.Exponential(100)),
+    "LBFGS": lambda: ur.optimizers.LBFGS(trust_radius=0.1, curvature=0.5, history=20, through=OPTIMIZERS["Adam"]()),
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
 }
 FITTING = [
