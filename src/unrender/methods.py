@@ -141,14 +141,16 @@ class SmoothedOptions(Options):
         0.2,
         description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
     )
-    sigma_schedule: str | None = Field("exponential(40, 0.1)", description="sigma over the steps, as for schedule")
+    sigma_schedule: str | None = Field("exponential(25, 0.1)", description="sigma over the steps, as for schedule")
     step: PositiveFloat = Field(
         0.5,
         description="as a share of sigma: the longest step; the learning rate, of adam; the first deviation, of cma-es",
     )
-    samples: int = Field(16, ge=4, description="renders per view and derivative, products of the Hessian twice that")
+    samples: int = Field(16, ge=4, description="renders per view and step, for each derivative that has its own")
     spp: PositiveInt = Field(2, description="samples per pixel of a render")
-    aggregate: bool = Field(True, description="one draw serves all elements of a derivative; else samples for each")
+    together: bool = Field(
+        True, description="gradient and curvature from the same renders; else each from its own, as in the paper"
+    )
     iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
 
     def start(self) -> tuple[Estimator, Optimizer]:
@@ -158,7 +160,9 @@ class SmoothedOptions(Options):
         if self.optimizer == "cma-es":
             return LossValues(self.spp), optimizers.CMAES(sigma0=self.step * common)
         order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
-        estimator = SmoothedDerivatives(sigma, self.samples, order, self.aggregate, spp=self.spp, schedule=schedule)
+        estimator = SmoothedDerivatives(
+            sigma, self.samples, order, together=self.together, spp=self.spp, schedule=schedule
+        )
         made: dict[str, Callable[[], Optimizer]] = {
             "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
             "newton": lambda: optimizers.Newton(trust_radius=self.step),

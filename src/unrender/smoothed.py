@@ -151,6 +151,60 @@ def hvp(
     return _first_order(job, aggregate, difference)
 
 
+def together(
+    f: Function,
+    theta: Any,
+    sigma: Any,
+    samples: int,
+    seed: int = 0,
+    low_discrepancy: bool = False,
+) -> Together:
+    """Gradient, Hessian and its products from the same evaluations of f, at f(θ) and at `samples` points in antithetic pairs.
+
+    The difference of a pair tells of the gradient, its mean less f(θ) of the Hessian (`gaussian.gradient_kernel`,
+    `gaussian.hessian_kernel`). Draws are from the mixture of both aggregates, half of each, whose density weighs them all; so every
+    derivative is unbiased, and products with any number of vectors are of one symmetric matrix, which is never built.
+
+    The arguments are those of `gradient`.
+    """
+    job = _Job("together", f, theta, sigma, samples, seed, True, low_discrepancy)
+
+    def mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        first = chosen < 0.5
+        rest = np.where(first, 2 * chosen, 2 * chosen - 1)
+        drawn = gaussian.gradient_mixture(rest, u, normal), gaussian.hessian_mixture(rest, u, normal)
+        return np.where(first[:, None], *drawn)
+
+    z = job.draw(mixture)
+    offset = job.value_at_theta()
+    both = job.evaluate(np.concatenate([job.theta - job.sigma * z, job.theta + job.sigma * z]))
+    ratio = 0.5 * (gaussian.gradient_ratio(z) + gaussian.hessian_ratio(z))
+    odd = 0.5 * (both[: len(z)] - both[len(z) :]) / ratio
+    even = (0.5 * (both[: len(z)] + both[len(z) :]) - offset) / ratio
+    return Together(job, z, odd, even)
+
+
+class Together:
+    """What `together` found; each derivative with its standard error."""
+
+    def __init__(self, job: _Job, z: np.ndarray, odd: np.ndarray, even: np.ndarray):
+        self._job, self._z, self._odd, self._even = job, z, odd, even
+
+    def gradient(self) -> tuple[np.ndarray, np.ndarray]:
+        """∇ S f(θ), (n,), and its standard error."""
+        return self._job.summarise(self._odd[:, None] * gaussian.gradient_kernel(self._z, self._job.sigma))
+
+    def hessian(self) -> tuple[np.ndarray, np.ndarray]:
+        """∇² S f(θ), (n, n), and its standard error."""
+        return self._job.summarise(self._even[:, None, None] * gaussian.hessian_kernel(self._z, self._job.sigma))
+
+    def hvp(self, v: Any) -> tuple[np.ndarray, np.ndarray]:
+        """∇² S f(θ) v, (n,), and its standard error: no evaluation, O(samples n) time and memory."""
+        direction, scaled = self._job.vector("v", v), self._z / self._job.sigma
+        products = scaled * (scaled @ direction)[:, None] - direction / self._job.sigma**2
+        return self._job.summarise(self._even[:, None] * products)
+
+
 def _first_order(
     job: _Job, aggregate: bool, values_at: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -79,8 +79,10 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
     assert samples(gradient, optimizers.Adam()) == 1 + 16
     assert samples(ur.SmoothedDerivatives(0.1, samples=16, aggregate=False), optimizers.Adam()) == 1 + 3 * 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2)
+    assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16 + 1
+    products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, together=False)
     assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
-    whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False)
+    whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, together=False)
     assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16 + 1
     assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
 
@@ -105,10 +107,11 @@ def test_sigma_follows_its_schedule() -> None:
     np.testing.assert_allclose(np.array(seen) / seen[0], [1, 0.5, 0.25, 0.2, 0.2], rtol=1e-6)
 
 
-def test_products_never_make_a_matrix() -> None:
+@pytest.mark.parametrize("together", [True, False])
+def test_products_never_make_a_matrix(together: bool) -> None:
     """A step of Newton-CG on 6000 numbers, whose Hessian would take 288 MB."""
     asked = problem(6000)
-    estimator = ur.SmoothedDerivatives(0.05, samples=8, order="hvp")
+    estimator = ur.SmoothedDerivatives(0.05, samples=8, order="hvp", together=together)
     optimizer = ur.optimizers.NewtonCG(iterations=2)
     parameters = asked.initial()
     state, memory = estimator.init(asked, parameters), optimizer.init(parameters)

@@ -4,10 +4,11 @@ random starts.
     python benchmarks/higher_order/table2/run.py [--task MUG] [--runs 20] [--resolution 32]
 
 Methods: the stock loop on path gradients where it applies (BUNNY, with Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed
-gradient of Fischer and Ritschel 2023 with Adam; CMA-ES; and ours: the gradient (OurG) with Adam, the Hessian (OurH) with Newton's method,
-Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG. All render their perturbations
-by the same launches, with the same antithetic draws and shared random numbers, and shrink σ as they go. Each is tuned on each task over
-a grid (`grid`), on starts of its own, for the mean logarithm of its times; then the runs of all methods are done by turns.
+gradient of Fischer and Ritschel 2023 with Adam; CMA-ES; and ours: the gradient (OurG) with Adam, the Hessian (OurH) with Newton's
+method, Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG; and, beyond the paper,
+gradient and products from the same renders (OurTogether). All render their perturbations by the same launches, with antithetic draws
+and shared random numbers, and shrink σ as they go. Each is tuned on each task over a grid (`grid`), on starts of its own, for the
+mean logarithm of its times; then the runs of all methods are done by turns.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def _samples(n: int) -> int:
 
 def _smoothed(task: Task, c: Config, samples: int, **more: Any) -> ur.SmoothedDerivatives:
     schedule = ur.optimizers.schedules.Exponential(c["half_life"], FLOOR)
-    return ur.SmoothedDerivatives(task.sigma, samples, spp=task.spp, schedule=schedule, **more)
+    return ur.SmoothedDerivatives(task.sigma, samples, spp=task.spp, schedule=schedule, **{"together": False, **more})
 
 
 def _adam(task: Task, c: Config) -> Any:
@@ -101,6 +102,11 @@ def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
     return make
 
 
+def _together(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    estimator = _smoothed(task, c, _samples(n), order="hvp", together=True)
+    return estimator, ur.optimizers.NewtonCG(trust_radius=_radius(n, c), iterations=min(n, 5))
+
+
 def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     population = None if c["population"] == 0 else int(c["population"])
     diagonal = n > 100
@@ -117,6 +123,7 @@ METHODS = {
     "OurH": Method(_hessian, _NEWTON_GRID),
     "OurHVP": Method(_products(False), _NEWTON_GRID),
     "OurHVPA": Method(_products(True), _NEWTON_GRID),
+    "OurTogether": Method(_together, {"half_life": (15, 40), "radius": (0.25, 0.5)}),
 }
 LEFT_OUT = {("TEXTURE", "OurH"): "a Hessian of 1024 × 1024 elements, each from perturbations of its own"}
 
@@ -146,11 +153,13 @@ def tune(name: str, method: str, problem: ur.Problem) -> tuple[Config, list[dict
     return {key: value for key, value in best.items() if key != "score"}, tried
 
 
-def race(name: str, runs: int) -> dict[str, Any]:
-    """One row: every method that applies, tuned, over the runs."""
+def race(name: str, runs: int, chosen: list[str] | None, kept: dict[str, Any]) -> dict[str, Any]:
+    """One row: every method that applies, or those `chosen` beside what was `kept` of the others, tuned, over the runs."""
     task = TASKS[name]
     problem = task.problem()
     methods = [*(["Mitsuba"] if name in MITSUBA else []), *(m for m in METHODS if (name, m) not in LEFT_OUT)]
+    if chosen:
+        methods = [method for method in methods if method in chosen]
     found: dict[str, Any] = {}
     for method in methods:
         config, tried = tune(name, method, problem)
@@ -163,7 +172,13 @@ def race(name: str, runs: int) -> dict[str, Any]:
     for method, entry in found.items():
         entry["summary"] = summarise(entry["runs"])
         print(f"{name} {method}: {entry['summary']}", flush=True)
-    return {"seconds": task.seconds, "sigma": task.sigma, "spp": task.spp, "options": task.options, "methods": found}
+    return {
+        "seconds": task.seconds,
+        "sigma": task.sigma,
+        "spp": task.spp,
+        "options": task.options,
+        "methods": {**kept, **found},
+    }
 
 
 def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -203,6 +218,7 @@ def plot(results: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", action="append", choices=list(TASKS))
+    parser.add_argument("--method", action="append", choices=["Mitsuba", *METHODS], help="race these, keep the others")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--resolution", type=int, default=32)
     parser.add_argument("--seconds", type=float, default=1.0, help="factor of every task's budget")
@@ -215,7 +231,8 @@ def main() -> None:
             task = TASKS[name]
             sized = {**task.options, "resolution": asked.resolution} if name != "QUAD" else task.options
             TASKS[name] = replace(task, options=sized, seconds=asked.seconds * task.seconds)
-            rows[name] = race(name, asked.runs)
+            kept = rows.get(name, {}).get("methods", {}) if asked.method else {}
+            rows[name] = race(name, asked.runs, asked.method, kept)
             rows = {key: rows[key] for key in TASKS if key in rows}
             write(HERE, {"runs": asked.runs, "resolution": asked.resolution, "tasks": rows})
     plot(read(HERE))

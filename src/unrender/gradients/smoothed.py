@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
+
+import numpy as np
 
 from unrender import checks, flat, smoothed
 from unrender.errors import InputError
@@ -15,6 +17,9 @@ from unrender.names import did_you_mean
 from unrender.optimizers.schedules import Schedule
 from unrender.problem.problem import Problem
 from unrender.trees import Tree
+
+_Derivatives = tuple[tuple[np.ndarray, np.ndarray], Callable[[], np.ndarray], Callable[[np.ndarray], np.ndarray]]
+"""Gradient with standard error, what makes the Hessian, what makes its product with a vector."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +37,8 @@ class SmoothedDerivatives:
     count. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not of
     the noise. Perturbed parameters are moved into their bounds before they are rendered.
 
-    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss; the Hessian-vector
-    product has the bias of its central difference (`smoothed.hvp`).
+    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss; but
+    products that are not `together` have the bias of their central difference (`smoothed.hvp`).
 
     Args:
         sigma: σ in units of the parameters, > 0: one number, or {key: number}, where "*" stands for all keys that are not named.
@@ -42,9 +47,12 @@ class SmoothedDerivatives:
         aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
         product: every dimension from its own gradient kernel at once, in place of `aggregate`: the gradient of Fischer and
             Ritschel 2023, "FR22" in the paper, whose smoothing is not a Gaussian's; gradients only.
+        together: with "hessian" and "hvp", gradient and curvature from the same renders (`smoothed.together`), so that curvature costs
+            nothing. Without, as the paper has it: a Hessian from draws of its own, products by the difference of two gradients, each
+            taking twice `samples` renders. `aggregate` and `baseline` are for that.
         antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
-        epsilon: of Hessian-vector products, in units of σ, > 0 (see `unrender.smoothed.hvp`): pictures of edges jump, so more than the
+        epsilon: of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): pictures of edges jump, so more than the
             default there.
         schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.optimizers.schedules`.
     """
@@ -54,6 +62,7 @@ class SmoothedDerivatives:
     order: Literal["gradient", "hessian", "hvp"] = "gradient"
     aggregate: bool = True
     product: bool = False
+    together: bool = True
     antithetic: bool = True
     baseline: bool = True
     low_discrepancy: bool = False
@@ -93,47 +102,42 @@ class SmoothedDerivatives:
         """See `Estimator.estimate`. `info`: "samples" (paths traced, those of products included), "images" per view
         at the parameters themselves."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0))
-        theta = flat.ravel(parameters)
         factor = self.schedule(state.step) if self.schedule else 1.0
         width = {k: factor * number for k, number in self._widths(parameters).items()}
-        sigma = flat.spread(width, parameters)
+        theta, sigma = flat.ravel(parameters), flat.spread(width, parameters)
         loss = box.here()
-        seed = key.fold(1).uint32()
-        options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
-        gradient, error = smoothed.gradient(
-            box.losses,
-            theta,
-            sigma,
-            self.samples,
-            seed,
-            aggregate=self.aggregate,
-            product=self.product,
-            baseline=self.baseline,
-            **options,
-        )
-        hessian = None
-        if self.order == "hessian":
-            hessian, _ = smoothed.hessian(
-                box.losses, theta, sigma, self.samples, seed, self.aggregate, baseline=self.baseline, **options
-            )
-
-        def product(v: Tree) -> Tree:
-            direction, samples = flat.ravel(v), 2 * self.samples
-            found, _ = smoothed.hvp(
-                box.losses, theta, direction, sigma, samples, seed, self.aggregate, epsilon=self.epsilon, **options
-            )
-            return flat.unravel(found, parameters)
-
-        return Estimate(
+        ask = self._together if self.together and self.order != "gradient" else self._apart
+        (gradient, error), hessian, product = ask(box, theta, sigma, key.fold(1).uint32())
+        found = Estimate(
             loss,
             flat.unravel(gradient, parameters),
             flat.unravel(error**2, parameters),
-            hessian,
-            product if self.order == "hvp" else None,
+            hessian() if self.order == "hessian" else None,
+            (lambda v: flat.unravel(product(flat.ravel(v)), parameters)) if self.order == "hvp" else None,
             box.losses,
             width,
             info=box.info,
-        ), SmoothedState(state.step + 1)
+        )
+        return found, SmoothedState(state.step + 1)
+
+    def _together(self, box: BlackBox, theta: np.ndarray, sigma: np.ndarray, seed: int) -> _Derivatives:
+        """The gradient with its standard error, and how to get the others: from the same renders."""
+        found = smoothed.together(box.losses, theta, sigma, self.samples, seed, self.low_discrepancy)
+        return found.gradient(), lambda: found.hessian()[0], lambda v: found.hvp(v)[0]
+
+    def _apart(self, box: BlackBox, theta: np.ndarray, sigma: np.ndarray, seed: int) -> _Derivatives:
+        """Likewise, each from renders of its own."""
+        point = (box.losses, theta, sigma, self.samples, seed, self.aggregate)
+        options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
+        gradient = smoothed.gradient(*point, product=self.product, baseline=self.baseline, **options)
+
+        def product(v: np.ndarray) -> np.ndarray:
+            samples = 2 * self.samples
+            return smoothed.hvp(
+                box.losses, theta, v, sigma, samples, seed, self.aggregate, epsilon=self.epsilon, **options
+            )[0]
+
+        return gradient, lambda: smoothed.hessian(*point, baseline=self.baseline, **options)[0], product
 
     def _widths(self, parameters: Tree) -> dict[str, float]:
         """σ of each parameter at the start."""
