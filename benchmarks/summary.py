@@ -226,11 +226,14 @@ def differences(found: dict[str, Any]) -> str:
     steps = next(iter(found["variance"].values()))["steps"]
     sizes = f"{found['resolution']}², {found['spp']} spp, {found['runs']} runs. Var ΔF / Var F by step, a share of the way to the truth:"
     first = table(["problem", "space", "slope, log-log", *(f"{s:g}" for s in steps)], rows)
-    cost = found["cost"]
-    keys = list(next(iter(cost.values())))
-    second = table(["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys])
-    parts = f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {found['cost_resolution']}²:"
-    return f"{sizes}\n\n{first}\n\n{parts}\n\n{second}"
+    blocks = [sizes, first]
+    for size, cost in found["cost"].items():
+        keys = list(next(iter(cost.values())))
+        blocks.append(f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {size}²:")
+        blocks.append(
+            table(["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys])
+        )
+    return "\n\n".join(blocks)
 
 
 def races(found: dict[str, Any]) -> str:

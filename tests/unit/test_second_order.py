@@ -558,7 +558,7 @@ def test_steps_have_the_parameters_type_and_memory_of_their_own():
     ("optimizer", "order"),
     [
         (Newton(trust_radius=2.0), "hessian"),
-        (NewtonCG(trust_radius=2.0, through=Adam(0.03)), "hvp"),
+        (NewtonCG(trust_radius=2.0, through=Adam(0.03, schedule=Exponential(20))), "hvp"),
         (LBFGS(trust_radius=2.0), "gradient"),
         (CMAES(sigma0=0.2), "gradient"),
     ],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender import arrays, flat
+from unrender import flat
 from unrender.gradients.black_box import BlackBox
 from unrender.keys import Key
 
@@ -114,10 +114,12 @@ def numbers(descent: Descent) -> dict[str, Any]:
         "steps": len(descent.seconds) - 1,
         "evaluations": descent.evaluations,
         "final": float(descent.parameter[-WINDOW:].mean()),
-        "curve": [descent.seconds[keep].round(4).tolist(), [float(f"{e:.4g}") for e in descent.parameter[keep]]],
+        "parameter_curve": [
+            descent.seconds[keep].round(4).tolist(),
+            [float(f"{e:.4g}") for e in descent.parameter[keep]],
+        ],
         "image_curve": [
             descent.seconds[np.isfinite(descent.image)].round(4).tolist(),
             [float(f"{e:.4g}") for e in descent.image[np.isfinite(descent.image)]],
         ],
-        "spread": arrays.number(np.std(descent.parameter[-WINDOW:])),
     }

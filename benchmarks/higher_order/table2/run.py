@@ -170,7 +170,7 @@ def race(name: str, runs: int, chosen: list[str] | None, kept: dict[str, Any]) -
             descent = go(name, method, begin(problem, task, run), found[method]["config"], run)
             found[method]["runs"].append(numbers(descent))
     for method, entry in found.items():
-        entry["summary"] = summarise(entry["runs"])
+        entry["summary"], entry["curves"] = summarise(entry["runs"]), medians(entry["runs"])
         print(f"{name} {method}: {entry['summary']}", flush=True)
     return {
         "seconds": task.seconds,
@@ -192,18 +192,26 @@ def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
+def medians(runs: list[dict[str, Any]]) -> dict[str, list[list[float]]]:
+    """Seconds and the median error there, in the picture and in the parameters; the runs give up their own curves for it."""
+    found = {}
+    for which in ("image", "parameter"):
+        curves = [run.pop(f"{which}_curve") for run in runs]
+        grid = np.geomspace(3e-3, max(curve[0][-1] for curve in curves), 100)
+        values = np.median([np.interp(grid, *curve, right=curve[1][-1]) for curve in curves], axis=0)
+        found[which] = [[float(f"{x:.4g}") for x in row] for row in (grid, values)]
+    return found
+
+
 def plot(results: dict[str, Any]) -> None:
     """Per task: median error over time, in the picture and in the parameters, log-log."""
     rows = results["tasks"]
     figure, axes = plt.subplots(len(rows), 2, figsize=(10, 2.9 * len(rows)), squeeze=False, layout="constrained")
     colour = dict(zip(["Mitsuba", *METHODS], plt.get_cmap("tab10").colors, strict=False))  # pyright: ignore[reportAttributeAccessIssue]
     for axis_row, (name, row) in zip(axes, rows.items(), strict=True):
-        for axis, curve, what in zip(axis_row, ("image_curve", "curve"), ("picture", "parameters"), strict=True):
+        for axis, curve, what in zip(axis_row, ("image", "parameter"), ("picture", "parameters"), strict=True):
             for method, entry in row["methods"].items():
-                ends = [run[curve][0][-1] for run in entry["runs"]]
-                grid = np.geomspace(3e-3, max(ends), 100)
-                values = [np.interp(grid, *run[curve], right=run[curve][1][-1]) for run in entry["runs"]]
-                axis.plot(grid, np.median(values, axis=0), color=colour[method], label=method)
+                axis.plot(*entry["curves"][curve], color=colour[method], label=method)
             for goal in GOALS:
                 axis.axhline(goal, color="#bbb", lw=0.6)
             axis.set(

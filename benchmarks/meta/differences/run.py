@@ -127,23 +127,29 @@ def plot(results: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--resolution", type=int, default=32)
-    parser.add_argument("--cost-resolution", type=int, default=96)
+    parser.add_argument("--cost-resolution", type=int, nargs="+", default=[96, 256])
+    parser.add_argument("--costs-only", action="store_true", help="keep the variances that were measured before")
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--runs", type=int, default=48)
     parser.add_argument("--plot-only", action="store_true")
     asked = parser.parse_args()
     if not asked.plot_only:
         ur.use()
-        small = {"resolution": asked.resolution, "texture_resolution": 16, "reference_spp": 512}
         loss = "RelativeL2"
+        cost: dict[str, Any] = read(HERE)["cost"] if asked.costs_only else {}
+        for size in asked.cost_resolution:
+            large = {"resolution": size, "reference_spp": 16}
+            cost[str(size)] = {n: costs(ur.gallery.problem(n, loss=loss, **large)) for n in PROBLEMS}
+        if asked.costs_only:
+            kept = ("resolution", "spp", "runs", "variance")
+            write(HERE, {**{key: read(HERE)[key] for key in kept}, "cost": cost})
+            return plot(read(HERE))
+        small = {"resolution": asked.resolution, "texture_resolution": 16, "reference_spp": 512}
         variance = {n: variances(ur.gallery.problem(n, loss=loss, **small), asked.spp, asked.runs) for n in PROBLEMS}
-        large = {"resolution": asked.cost_resolution, "reference_spp": 16}
-        cost = {n: costs(ur.gallery.problem(n, loss=loss, **large)) for n in PROBLEMS}
         write(
             HERE,
             {
                 "resolution": asked.resolution,
-                "cost_resolution": asked.cost_resolution,
                 "spp": asked.spp,
                 "runs": asked.runs,
                 "variance": variance,
