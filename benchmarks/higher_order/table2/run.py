@@ -217,8 +217,9 @@ def plot(results: dict[str, Any]) -> None:
             axis.set(
                 title=f"{name}: {what}", xscale="log", yscale="log", xlabel="seconds", ylabel="error / at the start"
             )
-            axis.set_ylim(3e-4, 3)
-    axes[0][0].legend(fontsize=7)
+            axis.set(xlim=(3e-3, row["seconds"]), ylim=(3e-4, 3))
+        if len(row["methods"]) > 6 or name == next(iter(rows)):
+            axis_row[0].legend(fontsize=6)
     figure.savefig(HERE / "figure.png", dpi=100)
     print(f"wrote {HERE / 'figure.png'}")
 
