@@ -16,13 +16,22 @@ def ravel(tree: Tree) -> np.ndarray:
     return np.concatenate([arrays.numpy(x).ravel().astype(np.float64) for x in tree.values()])
 
 
-def unravel(vector: np.ndarray, like: Tree) -> Tree:
-    """The tree of the shapes and types of `like` with these elements, in memory of its own; the inverse of `ravel`."""
+def parts(vectors: np.ndarray, like: Tree) -> dict[str, np.ndarray]:
+    """{key: (..., *shape)} of the shapes of `like`, from (..., n)."""
     found, start = {}, 0
     for key, x in like.items():
-        size = math.prod(arrays.shape(x))
-        part = vector[start : start + size].reshape(arrays.shape(x))
+        shape = arrays.shape(x)
+        size = math.prod(shape)
+        found[key] = vectors[..., start : start + size].reshape((*vectors.shape[:-1], *shape))
         start += size
+    return found
+
+
+def unravel(vector: np.ndarray, like: Tree) -> Tree:
+    """The tree of the shapes and types of `like` with these elements, in memory of its own; the inverse of `ravel`."""
+    found = {}
+    for key, part in parts(vector, like).items():
+        x = like[key]
         if arrays.is_drjit(x):  # the sum leaves NumPy's memory, see `MitsubaRenderer.array`
             found[key] = type(x)(part.astype(np.float32)) + arrays.scalar(0.0, x)
         else:

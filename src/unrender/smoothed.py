@@ -169,18 +169,11 @@ def together(
     """
     job = _Job("together", f, theta, sigma, samples, seed, True, low_discrepancy)
 
-    def mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        first = chosen < 0.5
-        rest = np.where(first, 2 * chosen, 2 * chosen - 1)
-        drawn = gaussian.gradient_mixture(rest, u, normal), gaussian.hessian_mixture(rest, u, normal)
-        return np.where(first[:, None], *drawn)
-
-    z = job.draw(mixture)
+    z = job.draw(gaussian.joint_mixture)
     offset = job.value_at_theta()
-    both = job.evaluate(np.concatenate([job.theta - job.sigma * z, job.theta + job.sigma * z]))
-    ratio = 0.5 * (gaussian.gradient_ratio(z) + gaussian.hessian_ratio(z))
-    odd = 0.5 * (both[: len(z)] - both[len(z) :]) / ratio
-    even = (0.5 * (both[: len(z)] + both[len(z) :]) - offset) / ratio
+    behind, ahead = job.pairs(z)
+    ratio = gaussian.joint_ratio(z)
+    odd, even = 0.5 * (behind - ahead) / ratio, (0.5 * (behind + ahead) - offset) / ratio
     return Together(job, z, odd, even)
 
 
@@ -273,9 +266,8 @@ class _Job:
         parts = []
         for replicate in range(_REPLICATES):
             rng = np.random.default_rng([self.seed, stream, replicate])
-            with (
-                warnings.catch_warnings()
-            ):  # of counts that are no power of 2, whose balance is less good and good enough
+            # Of counts that are no power of 2, whose balance is less good, and good enough.
+            with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 points = qmc.Sobol(self.n + 1, scramble=True, rng=rng).random(max(self.draws // _REPLICATES, 1))
             u = _inside(points[:, 1:])
@@ -287,15 +279,21 @@ class _Job:
         centre = self.theta if theta is None else theta
         if not self.antithetic:
             return self.evaluate(centre - self.sigma * z) - offset
-        both = self.evaluate(np.concatenate([centre - self.sigma * z, centre + self.sigma * z]))
-        return 0.5 * (both[: len(z)] - both[len(z) :])
+        behind, ahead = self.pairs(z, centre)
+        return 0.5 * (behind - ahead)
 
     def even(self, z: np.ndarray, offset: float) -> np.ndarray:
         """f(θ − σ z), or with antithetic draws its mean with f(θ + σ z): what an even kernel weighs."""
         if not self.antithetic:
             return self.evaluate(self.theta - self.sigma * z) - offset
-        both = self.evaluate(np.concatenate([self.theta - self.sigma * z, self.theta + self.sigma * z]))
-        return 0.5 * (both[: len(z)] + both[len(z) :]) - offset
+        behind, ahead = self.pairs(z)
+        return 0.5 * (behind + ahead) - offset
+
+    def pairs(self, z: np.ndarray, theta: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """f(θ − σ z) and f(θ + σ z), (B,) each, by one call of f."""
+        centre = self.theta if theta is None else theta
+        both = self.evaluate(np.concatenate([centre - self.sigma * z, centre + self.sigma * z]))
+        return both[: len(z)], both[len(z) :]
 
     def value_at_theta(self) -> float:
         return float(self.evaluate(self.theta[None])[0])

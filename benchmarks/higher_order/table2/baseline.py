@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from common import mitsuba_renderer
-from race import GOALS, WINDOW, Descent, measured
+from race import GOALS, WINDOW, Descent, measured, truth_of
 
 import unrender as ur
 from unrender import flat
@@ -27,7 +27,7 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
     renderer = mitsuba_renderer(problem)
     scene, parameters = renderer.pair.previous, renderer.pair.previous_parameters
     start = flat.ravel(problem.initial())
-    truth = np.concatenate([np.ravel(problem.truth[key]) for key in problem.initial()]).astype(float)
+    truth = truth_of(problem)
     place: Callable[[Any], None]
     if name == "BUNNY":
         integrator = mi.load_dict({"type": "direct_projective", "sppi": 0})

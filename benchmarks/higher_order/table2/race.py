@@ -75,7 +75,7 @@ class _Track(ur.Callback):
 
 def descend(problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int) -> Descent:
     """One run of the library's."""
-    truth, start = _truth(problem), flat.ravel(problem.initial())
+    truth, start = truth_of(problem), flat.ravel(problem.initial())
     track = _Track(truth, start)
     ur.optimize(problem, estimator, optimizer, seconds=seconds, seed=seed, callbacks=[track])
     size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
@@ -98,10 +98,11 @@ def measured(
 
 
 def _stack(problem: ur.Problem, points: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:
-    return np.stack([_truth(problem), *(points[index] for index in chosen)])
+    return np.stack([truth_of(problem), *(points[index] for index in chosen)])
 
 
-def _truth(problem: ur.Problem) -> np.ndarray:
+def truth_of(problem: ur.Problem) -> np.ndarray:
+    """The true parameters, flattened in key order."""
     return np.concatenate([np.ravel(problem.truth[key]) for key in problem.initial()]).astype(float)
 
 

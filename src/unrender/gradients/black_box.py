@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +47,8 @@ class LossValues:
         return LossState()
 
     def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
-        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (paths traced up to now in this step), "images" per view."""
+        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those that the optimizer asks for
+        included), "images" per view."""
         box = BlackBox(problem, parameters, self.spp, key)
         return Estimate(box.here(), {}, losses=box.losses, info=box.info), state
 
@@ -84,13 +84,8 @@ class BlackBox:
         return float(losses[0])
 
     def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
-        renderer, stacked, start = self.problem.renderer, {}, 0
-        for key, x in self.parameters.items():
-            shape = arrays.shape(x)
-            size = math.prod(shape)
-            part = points[:, start : start + size].reshape(len(points), *shape)
-            stacked[key] = project(part, *self.problem.bounds[key])
-            start += size
+        renderer, bounds = self.problem.renderer, self.problem.bounds
+        stacked = {key: project(x, *bounds[key]) for key, x in flat.parts(points, self.parameters).items()}
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             shot = Shot(view.sensor, self.spp, self.key.fold(index).uint32())

@@ -156,7 +156,7 @@ class PosedScene:
         return [self.static, *self.parts.values()]
 
     def numbers(self, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The poses as one array, (9 per target, B), from {key: (B, *shape)} of all chosen keys."""
+        """The poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
         count = len(next(iter(parameters.values())))
         rows = np.zeros((len(self._centres), 7, count), np.float32)
         rows[:, 6] = 1.0

@@ -116,3 +116,15 @@ def hessian_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np
     off = i != j
     z[rows[off], j[off]] = gradient_sample(u[rows[off], j[off]])
     return z
+
+
+def joint_ratio(z: np.ndarray) -> np.ndarray:
+    """The mixture of both aggregates, half of each, divided by φ(z): (B, n) to (B,)."""
+    return 0.5 * (gradient_ratio(z) + hessian_ratio(z))
+
+
+def joint_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Draws from it; the arguments are those of `gradient_mixture`."""
+    first = chosen < 0.5
+    rest = np.where(first, 2 * chosen, 2 * chosen - 1)
+    return np.where(first[:, None], gradient_mixture(rest, u, normal), hessian_mixture(rest, u, normal))
