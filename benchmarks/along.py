@@ -12,6 +12,7 @@ import unrender as ur
 from unrender import arrays
 from unrender.images.base import ImageEstimate, ImageEstimator
 from unrender.keys import Key
+from unrender.problem.frames import WholeView
 from unrender.rendering.port import Shot
 from unrender.trees import Tree
 
@@ -112,7 +113,7 @@ def follow(
     problem.renderer.select(list(path[0]), image.space)
     state = image.init(problem, path[0])
     for step, parameters in enumerate(path):
-        estimate, kept = image.estimate(problem, parameters, state, 0, spp, 1, Key(seed, step))
+        estimate, kept = image.estimate(problem, parameters, state, WholeView(problem, 0), spp, 1, Key(seed, step))
         state = image.advance(parameters, state, (kept,))
         arrays.evaluate(state, estimate.images, dict(estimate.info))
         yield estimate

@@ -17,7 +17,7 @@ dimensions of φ by `unrender.smoothed`. No matrix of n × n, or of weights × w
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ def loss(
     baseline: bool = True,
     low_discrepancy: bool = False,
     epsilon: float = 0.1,
+    together: bool = False,
 ) -> torch.Tensor:
     """f(φ), with the derivatives of S f(φ): differentiable twice by torch.
 
@@ -70,6 +71,8 @@ def loss(
             `aggregate`, for each of the n elements.
         seed: of the draws; a new one for each step.
         aggregate, antithetic, baseline, low_discrepancy, epsilon: see `smoothed.gradient` and `smoothed.hvp`.
+        together: gradient and products from the same evaluations (`smoothed.together`): products cost no call of f and have no bias, and
+            `aggregate`, `antithetic`, `baseline` and `epsilon` count for nothing.
 
     Returns:
         () for φ of (n,), (K,) for (K, n), of φ's type and on its device.
@@ -83,7 +86,7 @@ def loss(
     if not torch.isfinite(phi).all():
         raise InputError("grey_box.loss: phi has elements that are not finite: the network before it has diverged")
     options = {"aggregate": aggregate, "antithetic": antithetic, "low_discrepancy": low_discrepancy}
-    box = _BlackBox(f, phi.ndim == 2, sigma, samples, seed, baseline, epsilon, options)
+    box = _BlackBox(f, phi.ndim == 2, sigma, samples, seed, baseline, epsilon, options, together)
     # On the host before it enters the black box: torch then calls f on the thread that called torch.
     rows = torch.atleast_2d(phi).to("cpu", torch.float64)
     if torch.is_grad_enabled() and phi.requires_grad:
@@ -178,11 +181,17 @@ class _BlackBox:
     baseline: bool
     epsilon: float
     options: dict[str, bool]
+    together: bool = False
+    found: list[smoothed.Together] = field(default_factory=list)
+    """Of each item, since `first_order`, with `together`."""
 
     def values(self, phi: np.ndarray) -> np.ndarray:
         return self._evaluate(phi, np.arange(len(phi)))
 
     def first_order(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.together:
+            return self._all_orders(phi)
+
         def call(item: int) -> _Call:
             theta, seed = phi[item], self._seed(item)
 
@@ -197,7 +206,18 @@ class _BlackBox:
         values, gradients = zip(*self._at_once([call(item) for item in range(len(phi))]), strict=True)
         return np.array(values), np.array(gradients)
 
+    def _all_orders(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def call(item: int) -> _Call:
+            point = (phi[item], self.sigma, self.samples, self._seed(item), self.options["low_discrepancy"])
+            return lambda f: smoothed.together(f, *point)
+
+        self.found[:] = self._at_once([call(item) for item in range(len(phi))])
+        return np.array([one.value for one in self.found]), np.array([one.gradient()[0] for one in self.found])
+
     def product(self, phi: np.ndarray, v: np.ndarray) -> np.ndarray:
+        if self.together:
+            return np.array([found.hvp(direction)[0] for found, direction in zip(self.found, v, strict=True)])
+
         def call(item: int) -> _Call:
             # Twice the samples: as many draws at each side of the difference as the gradient has, and by the seed the same ones.
             return lambda f: smoothed.hvp(

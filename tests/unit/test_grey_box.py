@@ -97,6 +97,19 @@ def test_each_order_is_one_call_of_the_black_box(torch: Any, loss: Any) -> None:
     assert f.calls[2:] == [5]
 
 
+def test_together_products_cost_no_call_of_the_black_box(torch: Any, loss: Any) -> None:
+    f = Counted(bowls)
+    phi = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
+    values = loss(f, phi, 0.1, 64, together=True)
+    np.testing.assert_allclose(values.detach().numpy(), bowls(phi.detach().numpy(), np.arange(5)))
+    (gradient,) = torch.autograd.grad(values.sum(), phi, create_graph=True)
+    basis = [torch.autograd.grad(gradient, phi, v.expand(5, 3), retain_graph=True)[0].numpy() for v in torch.eye(3)]
+    assert f.calls == [5 * (1 + 64)]
+    hessians = np.stack(basis, axis=1)
+    np.testing.assert_allclose(hessians, hessians.transpose(0, 2, 1), atol=1e-9)
+    assert np.abs(hessians.mean(axis=0) - 2 * np.eye(3)).max() < 1.0
+
+
 def test_first_and_second_order_take_the_same_draws_and_equal_seeds_repeat_them(torch: Any, loss: Any) -> None:
     seen: list[np.ndarray] = []
 

@@ -132,6 +132,32 @@ def test_where_the_objective_bends_downwards_the_step_descends_to_the_radius(opt
         assert np.linalg.norm(step) == pytest.approx(0.25, rel=1e-6)
 
 
+@pytest.mark.parametrize("radius", [1e-3, 0.1, 100.0])
+def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
+    """Products too large by any factor, a gradient that is mostly noise: the step still ends where the loss is least along it."""
+    hessian, minimum = bowl(condition=10.0)
+    like, rng = {"x": np.zeros(6)}, np.random.default_rng(3)
+    gradient = hessian @ -minimum + 3 * rng.standard_normal(6)
+
+    def losses(points):
+        away = points - minimum
+        return 0.5 * np.einsum("bi,ij,bj->b", away, hessian, away)
+
+    def step(sign):
+        estimate = dataclasses.replace(known(sign * gradient, 50 * hessian, like), losses=losses)
+        optimizer = NewtonCG(trust_radius=radius, iterations=1, line=True)
+        assert optimizer.requires == {"gradient", "hvp", "losses"}
+        return flat.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
+
+    found = step(1.0)
+    assert np.linalg.norm(found) <= radius * (1 + 1e-9)
+    direction = -gradient / np.linalg.norm(gradient)
+    assert found @ direction == pytest.approx(np.linalg.norm(found))
+    slope = direction @ hessian @ (found - minimum)
+    assert slope == pytest.approx(0.0, abs=1e-9) if radius == 100.0 else slope < 0.0
+    assert not step(-1.0).any(), "a direction that climbs was followed"
+
+
 @pytest.mark.parametrize("radius", [1e-3, 0.1, 1.0])
 def test_newtons_step_is_the_best_one_within_its_radius(radius):
     hessian, minimum = bowl()

@@ -79,12 +79,77 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
     assert samples(gradient, optimizers.Adam()) == 1 + 16
     assert samples(ur.SmoothedDerivatives(0.1, samples=16, aggregate=False), optimizers.Adam()) == 1 + 3 * 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2)
-    assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16 + 1
+    assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, together=False)
     assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
     whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, together=False)
-    assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16 + 1
+    assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16
     assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
+
+
+@pytest.mark.parametrize("order", ["gradient", "hessian", "hvp"])
+def test_gradient_and_curvature_take_one_launch(order: Any) -> None:
+    """The loss at the parameters is rendered beside the first perturbations, and only once."""
+    asked, counts = problem(), []
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    render = renderer.image_batch
+
+    def watch(parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
+        counts.append(len(parameters["x"]))
+        return render(parameters, shot)
+
+    renderer.image_batch = watch  # pyright: ignore[reportAttributeAccessIssue]
+    estimator = ur.SmoothedDerivatives(0.1, samples=16, order=order)
+    parameters = {"x": np.full(3, 0.4)}
+    found, _ = estimator.estimate(asked, parameters, estimator.init(asked, parameters), Key(0))
+    if found.hvp is not None:
+        found.hvp(parameters)
+    assert counts == [1 + 16]
+    assert found.losses is not None
+    assert found.losses(np.full((1, 3), 0.4)) == found.loss
+    assert counts == [1 + 16]
+    assert found.losses(np.full((2, 3), 0.4)) == pytest.approx([found.loss] * 2)
+    np.testing.assert_allclose(found.info["images"][0], renderer.exact(parameters), rtol=1e-6)
+
+
+class _Landscape:
+    """A loss of one number: pictures of what `height` says, against black, in an L1 loss."""
+
+    def __init__(self, height: Any):
+        truth = AnalyticRenderer({"x": np.zeros(1)}, np.ones((12, 1)), noise=0.0, shape=(2, 2))
+        self.problem = ur.Problem(
+            truth, [ur.Parameter("x", initial=0.0)], [ur.View(np.zeros((2, 2, 3)))], ur.losses.L1()
+        )
+        truth.image_batch = self.render  # pyright: ignore[reportAttributeAccessIssue]
+        self.height = height
+
+    def render(self, parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
+        del shot
+        return np.broadcast_to(self.height(parameters["x"])[:, :, None, None], (len(parameters["x"]), 2, 2, 3))
+
+    def age(self, at: float, steps: int = 40, **options: Any) -> float:
+        estimator = ur.SmoothedDerivatives(0.1, samples=8, arrival=True, **options)
+        parameters = {"x": np.array([at])}
+        state = estimator.init(self.problem, parameters)
+        for step in range(steps):
+            _, state = estimator.estimate(self.problem, parameters, state, Key(step))
+        return state.age / steps
+
+
+@pytest.mark.parametrize("options", [{}, {"order": "hvp"}, {"order": "hvp", "together": False}], ids=str)
+def test_sigma_waits_for_the_descent_to_arrive(options: dict[str, Any]) -> None:
+    """At the bottom of a bowl time passes, on a slope, a plateau and a summit it stands still."""
+    bowl = _Landscape(lambda x: 1 + x * x)
+    assert 0.5 < bowl.age(0.0, **options) <= 1.0
+    assert bowl.age(3.0, **options) < 0.05
+    assert _Landscape(lambda x: np.abs(x)).age(0.0, **options) > 0.7
+    assert _Landscape(lambda x: np.ones_like(x)).age(0.0, **options) == 0.0
+    assert _Landscape(lambda x: 9 - x * x).age(0.0, **options) == 0.0
+    still = ur.SmoothedDerivatives(0.1, samples=8, schedule=Exponential(1), arrival=True, **options)
+    parameters = {"x": np.array([3.0])}
+    found, _ = still.estimate(bowl.problem, parameters, still.init(bowl.problem, parameters), Key(0))
+    assert found.width == {"x": 0.1}
 
 
 def test_sigma_follows_its_schedule() -> None:

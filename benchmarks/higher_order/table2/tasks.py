@@ -23,6 +23,7 @@ class Task:
         sigma: scale of the smoothing that methods are tuned around, in units of the parameters.
         seconds: when a run is given up.
         spp: samples per pixel of a perturbed render.
+        scales: {key: factor of σ, and of learning rates}, of parameters in other units than the rest.
     """
 
     gallery: str
@@ -31,14 +32,23 @@ class Task:
     seconds: float
     spp: int = 1
     options: dict[str, Any] = field(default_factory=dict)
+    scales: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def widths(self) -> dict[str, float]:
+        """σ by parameter, for `SmoothedDerivatives`."""
+        return {"*": self.sigma, **{key: factor * self.sigma for key, factor in self.scales.items()}}
 
     def problem(self) -> ur.Problem:
         """The task, from the gallery's own start."""
         return ur.gallery.problem(self.gallery, **self.options)
 
 
-def begin(problem: ur.Problem, task: Task, run: int) -> ur.Problem:
-    """The same problem, on the same renderer, from the start of run number `run`."""
+def begin(problem: ur.Problem, task: Task, run: int, rate: float | None = None) -> ur.Problem:
+    """The same problem, on the same renderer, from the start of run number `run`.
+
+    `rate` is the learning rate in units of σ that parameters with a σ of their own get; None where σ itself is the unit of steps.
+    """
     initial = {key: np.array(value) for key, value in problem.initial().items()}
     vector = np.concatenate([value.ravel() for value in initial.values()]).astype(float)
     truth = np.concatenate([np.ravel(problem.truth[key]) for key in initial]).astype(float)
@@ -48,7 +58,11 @@ def begin(problem: ur.Problem, task: Task, run: int) -> ur.Problem:
     for key, value in initial.items():
         moved[key] = point[offset : offset + value.size].reshape(value.shape)
         offset += value.size
-    parameters = [replace(p, initial=moved[p.key], bounds=problem.bounds[p.key]) for p in problem.parameters]
+    own = {} if rate is None else {key: rate * task.widths[key] for key in task.scales}
+    parameters = [
+        replace(p, initial=moved[p.key], bounds=problem.bounds[p.key], learning_rate=own.get(p.key))
+        for p in problem.parameters
+    ]
     return ur.Problem(
         problem.renderer,
         parameters,
@@ -95,12 +109,12 @@ def _grey(rng: np.random.Generator, initial: np.ndarray, truth: np.ndarray) -> n
 
 
 TASKS = {
-    "QUAD": Task("quad", _quad, 0.5, 0.6),
+    "QUAD": Task("quad", _quad, 0.5, 0.3),
     "BOX2": Task("box2", _beside, 0.5, 1.5),
-    "BOX10": Task("box10", _around(0.08), 0.3, 4.0, spp=2),
-    "MUG": Task("mug", _hidden, 0.6, 2.0),
+    "BOX10": Task("box10", _around(0.08), 0.3, 3.5, spp=2),
+    "MUG": Task("mug", _hidden, 0.6, 2.5),
     "SHADOW": Task("shadow", _around(0.2), 0.4, 1.5),
-    "BUNNY": Task("bunny", _bunny, 0.2, 2.5),
-    "TEXTURE": Task("poster", _grey, 0.1, 8.0),
+    "BUNNY": Task("bunny", _bunny, 0.2, 3.0, spp=4, scales={"bunny.rotation.y": 2.5}),
+    "TEXTURE": Task("poster", _grey, 0.1, 16.0, spp=2, options={"reference_spp": 16384}),
 }
 """By the paper's names."""

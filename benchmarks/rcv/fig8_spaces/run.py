@@ -28,6 +28,7 @@ import unrender as ur
 from unrender import arrays
 from unrender.images.base import ImageEstimator
 from unrender.keys import Key
+from unrender.problem.frames import WholeView
 from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
@@ -86,7 +87,7 @@ def costs(problem: ur.Problem, path: list[Tree], spp: int) -> dict[str, dict[str
 
         def one_image(n: int, image: ImageEstimator = image, box: dict[str, Any] = box) -> None:
             now = path[n % len(path)]
-            estimate, kept = image.estimate(problem, now, box["image"], 0, spp, 1, Key(1, n))
+            estimate, kept = image.estimate(problem, now, box["image"], WholeView(problem, 0), spp, 1, Key(1, n))
             box["image"] = image.advance(now, box["image"], (kept,))
             dr.eval(estimate.images, box["image"])
 

@@ -21,7 +21,8 @@ class Poster:
     """The grey texture of a poster that a lamp lights directly.
 
     One view; one unknown, the reflectance (texture_resolution², 1), from one grey: 1024 numbers by default. The loss is a convex
-    quadratic in them, smooth and without a plateau; their number is what is hard where derivatives come from perturbations.
+    quadratic in them, smooth and without a plateau; their number is what is hard where derivatives come from perturbations. Texels are
+    not blended: with as many pixels each has its own, and the Hessian is diagonal.
     """
 
     resolution: int = fields.resolution(64)
@@ -33,7 +34,9 @@ class Poster:
     def scene(self) -> dict[str, Any]:
         """The poster: x and y in [-1, 1] at z = 0, filling the picture; the lamp before it, above the camera's field."""
         picture = textures.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True)
-        paint = {"type": "diffuse", "reflectance": textures.bitmap(picture.astype(np.float32))}
+        # Texels are squares. Between texels blended into one another no picture tells the finest pattern from the grey that it averages to.
+        texels = textures.bitmap(picture.astype(np.float32)) | {"filter_type": "nearest"}
+        paint = {"type": "diffuse", "reflectance": texels}
         down = np.array([0.0, -0.6, -0.8])
         return {
             "type": "scene",

@@ -56,6 +56,9 @@ class LossValues:
 class BlackBox:
     """The problem's loss at any points, all with the same random numbers.
 
+    The loss at the parameters themselves is rendered once, beside the first points that are asked for: launches of small pictures cost
+    as much as what is in them.
+
     Args:
         problem: whose renderer has selected the parameters (`Renderer.select`, `derivatives=False`).
         parameters: the current ones; they give keys and shapes.
@@ -63,25 +66,38 @@ class BlackBox:
         key: of the renders' random numbers.
 
     Attributes:
-        info: for `Estimate.info`: "samples", the paths traced so far, and "images", each view's as `here` saw it.
+        info: for `Estimate.info`: "samples", the paths traced so far, and "images", each view's at the parameters themselves.
     """
 
     def __init__(self, problem: Problem, parameters: Tree, spp: int, key: Key):
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
         self.info: dict[str, Any] = {"samples": 0}
+        self._theta = flat.ravel(parameters)
+        self._here: float | None = None
 
     def losses(self, points: np.ndarray) -> np.ndarray:
         """(B, n), all parameters flattened in key order, to (B,). Points outside the bounds count as the nearest inside.
 
         Unbiased for the expected loss of images with this noise.
         """
-        return self._losses(points)[0]
+        if len(points) == 1 and np.array_equal(points[0], self._theta):
+            return np.array([self.here()])
+        if self._here is not None:
+            return self._losses(points)[0]
+        return self._with_here(points)[1:]
 
     def here(self) -> float:
         """The loss at the parameters themselves."""
-        losses, images = self._losses(flat.ravel(self.parameters)[None])
-        self.info["images"] = {view: arrays.mean_first(image) for view, image in images.items()}
-        return float(losses[0])
+        if self._here is None:
+            self._with_here(np.empty((0, self._theta.size)))
+        assert self._here is not None
+        return self._here
+
+    def _with_here(self, points: np.ndarray) -> np.ndarray:
+        losses, images = self._losses(np.concatenate([self._theta[None], points]))
+        self.info["images"] = {view: image[0] for view, image in images.items()}
+        self._here = float(losses[0])
+        return losses
 
     def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
         renderer, bounds = self.problem.renderer, self.problem.bounds

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender import checks, flat
-from unrender.gradients.estimate import GRADIENT, HVP, Estimate
+from unrender.gradients.estimate import GRADIENT, HVP, LOSSES, Estimate
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
 from unrender.optimizers.schedules import Schedule
@@ -45,7 +45,11 @@ class NewtonCG:
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
             optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`. Near the optimum the step
+            is as noisy as the gradient: shrinking steps average the noise, which Adam's mean does for its own.
+        line: take the step's direction alone, and its length from a parabola through the losses here and a step to either side: two
+            evaluations (and the estimator must provide losses). For many parameters, where the gradient is mostly noise and the
+            curvature along it, from the same draws, is not that of the loss. Those losses are not smoothed.
     """
 
     learning_rate: float = 1.0
@@ -56,6 +60,7 @@ class NewtonCG:
     share: float = 1.0
     through: Adam | None = None
     schedule: Schedule | None = None
+    line: bool = False
 
     def __post_init__(self):
         check("NewtonCG", self)
@@ -66,8 +71,8 @@ class NewtonCG:
 
     @property
     def requires(self) -> frozenset[str]:
-        """A gradient and Hessian-vector products."""
-        return frozenset({GRADIENT, HVP})
+        """A gradient and Hessian-vector products; with `line`, the loss at points of its own."""
+        return frozenset({GRADIENT, HVP, *([LOSSES] if self.line else [])})
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
         """See `Optimizer.init`."""
@@ -83,7 +88,25 @@ class NewtonCG:
             return scale * flat.ravel(hvp(flat.unravel(scale * v, parameters)))
 
         step = self._solve(scale * flat.ravel(estimate.gradient), product)
+        if self.line and step.any():
+            step = self._to_the_least(step, self._losses(estimate, scale * step, parameters))
         return finish("NewtonCG", self, scale * step, state, parameters)
+
+    @staticmethod
+    def _losses(estimate: Estimate, step: np.ndarray, parameters: Tree) -> np.ndarray:
+        """The losses a step behind, here, and a step ahead."""
+        assert estimate.losses is not None
+        here = flat.ravel(parameters)
+        return estimate.losses(np.stack([here - step, here, here + step]))
+
+    def _to_the_least(self, step: np.ndarray, losses: np.ndarray) -> np.ndarray:
+        """The multiple of `step` within the trust radius at which the parabola through three losses is least; none backwards."""
+        behind, here, ahead = losses
+        slope, bend = 0.5 * (ahead - behind), ahead + behind - 2 * here
+        farthest = self.trust_radius / float(np.linalg.norm(step))
+        if slope >= 0.0 or not np.isfinite(losses).all():
+            return np.zeros_like(step)
+        return (farthest if bend * farthest <= -slope else -slope / bend) * step
 
     def _solve(self, gradient: np.ndarray, product: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         step, residual = np.zeros_like(gradient), -gradient

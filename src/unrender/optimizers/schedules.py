@@ -1,6 +1,7 @@
-"""Factors of the learning rate as functions of the step.
+"""Factors of the learning rate, or of a smoothing's width, as functions of the step.
 
-A schedule is a callable that takes the number of steps already made (>= 0) and returns a factor >= 0.
+A schedule is a callable that takes the number of steps already made (>= 0) and returns a factor >= 0. The number need not be whole: who
+measures progress otherwise than in steps (`SmoothedDerivatives(arrival=True)`) asks by that.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from unrender.errors import InputError
 class Schedule(Protocol):
     """A pure function of the step."""
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         """The factor of the learning rate at `step`, which counts from 0."""
         ...
 
@@ -34,7 +35,7 @@ class Constant:
     def __post_init__(self):
         checks.number("Constant", "factor", self.factor, above=0.0, inclusive=True)
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         return self.factor
 
 
@@ -54,7 +55,7 @@ class Exponential:
         checks.number("Exponential", "half_life", self.half_life, above=0.0)
         checks.number("Exponential", "floor", self.floor, above=0.0, inclusive=True)
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         return max(self.floor, 0.5 ** (step / self.half_life))
 
 
@@ -74,7 +75,7 @@ class Cosine:
         checks.whole("Cosine", "steps", self.steps, at_least=1)
         checks.number("Cosine", "floor", self.floor, above=0.0, inclusive=True)
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         done = min(step / self.steps, 1.0)
         return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * done))
 
@@ -95,7 +96,7 @@ class Steps:
         checks.whole("Steps", "every", self.every, at_least=1)
         checks.number("Steps", "factor", self.factor, above=0.0)
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         return float(self.factor) ** (step // self.every)
 
 
@@ -117,7 +118,7 @@ class Warmup:
         if self.then is not None and not callable(self.then):
             raise InputError(f"Warmup: then must be a schedule or None, got {self.then!r}")
 
-    def __call__(self, step: int) -> float:
+    def __call__(self, step: float) -> float:
         if step < self.steps:
             return (step + 1) / self.steps
         return 1.0 if self.then is None else self.then(step - self.steps)
