@@ -96,6 +96,13 @@ def stacked(x: Array) -> Array:
     return type(x)(x.array, (1, *x.shape)) if is_drjit(x) else x[None]
 
 
+def concatenated(parts: list[Array]) -> Array:
+    """Arrays (n, ...) one behind the other, along their first axis."""
+    if len(parts) == 1:
+        return parts[0]
+    return dr.concat(parts, axis=0) if is_drjit(parts[0]) else np.concatenate(parts)
+
+
 def total(x: Array) -> Array:
     """The sum over all elements, left lazy on Dr.Jit."""
     return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)
@@ -118,6 +125,87 @@ def numpy(x: Array) -> np.ndarray:
     return np.array(x.numpy() if is_drjit(x) else x)
 
 
+def like(values: np.ndarray, x: Array) -> Array:
+    """`values` as an array of the kind of `x`, in memory of its own (Dr.Jit would borrow NumPy's)."""
+    if not is_drjit(x):
+        return np.array(values, x.dtype)
+    given = type(x)(np.ascontiguousarray(values, np.float32))
+    owned = type(x)(given.array * dr.opaque(type(given.array), 1), given.shape)
+    dr.eval(owned)
+    return owned
+
+
 def number(x: Array) -> float:
     """A Python float from an array of one element. Waits for the device."""
     return float(numpy(x).reshape(-1)[0]) if is_drjit(x) else float(x)
+
+
+def like_integers(values: np.ndarray, like: Array) -> Array:
+    """Whole numbers in [0, 2**32) in the form that indexes arrays such as `like`: `np.uint32`, or Dr.Jit's UInt32 in memory of its own."""
+    values = np.ascontiguousarray(values, np.uint32)
+    if not is_drjit(like):
+        return values
+    kind = dr.uint32_array_t(dr.array_t(like))
+    owned = kind(values) + dr.opaque(kind, 0)
+    dr.eval(owned)
+    return owned
+
+
+def gather_rows(x: Array, index: Array) -> Array:
+    """The rows `index` (N,) of `x` (P, C): (N, C)."""
+    if not is_drjit(x):
+        return x[index]
+    width = x.shape[1]
+    kind = type(index)
+    element = dr.arange(kind, dr.width(index) * width)
+    row = element // width
+    flat = dr.gather(dr.array_t(x), x.array, dr.gather(kind, index, row) * width + (element - row * width))
+    return type(x)(flat, (dr.width(index), width))
+
+
+def gather(x: Array, index: Array) -> Array:
+    """The elements `index` of a one-dimensional array."""
+    return dr.gather(type(x), x, index) if is_drjit(x) else x[index]
+
+
+def last_at_most(ascending: Array, values: Array) -> Array:
+    """For each value the index of the last element of `ascending` that is not above it; the first element must not be."""
+    if not is_drjit(ascending):
+        return (np.searchsorted(ascending, values, side="right") - 1).astype(np.uint32)
+    kind = type(values)
+    found = dr.binary_search(0, dr.width(ascending), lambda index: dr.gather(kind, ascending, index) <= values)
+    return kind(found) - 1
+
+
+def count_up(like: Array, count: int) -> Array:
+    """0, 1, 2, ..., whole numbers that index arrays such as `like`."""
+    return (
+        dr.arange(dr.uint32_array_t(dr.array_t(like)), count) if is_drjit(like) else np.arange(count, dtype=np.uint32)
+    )
+
+
+def integer(value: int, like: Array) -> Array:
+    """A whole number in [0, 2**32) that changes from step to step, in a form that does not compile a new kernel each time."""
+    return dr.opaque(dr.uint32_array_t(dr.array_t(like)), value) if is_drjit(like) else np.uint32(value)
+
+
+def random_integers(like: Array, seed: int, count: int, below: int) -> Array:
+    """`count` whole numbers, uniform in [0, below)."""
+    if not is_drjit(like):
+        return np.random.default_rng(seed).integers(below, size=count, dtype=np.uint32)
+    return dr.rng(seed).integers(dr.uint32_array_t(dr.array_t(like)), count, 0, below)
+
+
+def random_below(bounds: Array, like: Array, seed: int) -> Array:
+    """For each whole number one that is uniform below it."""
+    if not is_drjit(like):
+        return np.random.default_rng(seed).integers(bounds, dtype=np.uint32)
+    kind = type(bounds)
+    number = dr.rng(seed).random(dr.array_t(like), dr.width(bounds))
+    return dr.minimum(kind(number * bounds), bounds - 1)
+
+
+def rows(x: Array) -> Array:
+    """(..., C) to (N, C)."""
+    width = x.shape[-1]
+    return type(x)(x.array, (len(x.array) // width, width)) if is_drjit(x) else x.reshape(-1, width)

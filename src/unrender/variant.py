@@ -108,6 +108,15 @@ def use(variant: str = "auto") -> str:
     return chosen
 
 
+def use_threads(count: int) -> None:
+    """Let that many threads of the processor work, >= 1. Before the first kernel of the process: later, Dr.Jit may crash."""
+    ensure()
+    import drjit as dr
+
+    if dr.thread_count() != count:
+        dr.set_thread_count(count)
+
+
 def current() -> str | None:
     """The variant that Mitsuba is set to, whoever set it; None before any was chosen. Imports nothing."""
     mi = sys.modules.get("mitsuba")

@@ -132,6 +132,15 @@ class AnalyticRenderer:
         """See `Renderer.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
+    def tangent_moment(self, parameters: Tree, paths: AnalyticPaths, tangents: Tree) -> np.ndarray:
+        """See `Renderer.tangent_moment`."""
+        del parameters
+        along = {key: tangents.get(key, np.zeros_like(value)) for key, value in self._values.items()}
+        slopes = (self.matrix @ self._flat(along))[self._rows(paths.pixels)].reshape(-1, 3, 1)
+        samples = slopes * (1 + self.noise * (2 * paths.numbers[..., 0] - 1))
+        shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
+        return np.mean(samples**2, axis=-1).reshape(shape)
+
     def _flat(self, parameters: Tree) -> np.ndarray:
         return np.concatenate([np.ravel(parameters.get(key, value)) for key, value in self._values.items()])
 

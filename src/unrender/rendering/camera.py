@@ -83,6 +83,71 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
     return ray, weight
 
 
+def rays_of_many(
+    sensors: Any, settings: Films, which: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
+) -> tuple[Any, Any]:
+    """Camera rays of pixels that belong to different sensors, samples of a pixel side by side.
+
+    Args:
+        sensors: `mitsuba.SensorPtr`, all of the scene's.
+        settings: of all of them.
+        which: `mi.UInt32`, the index of each pixel's sensor.
+        sampler, seed, spp, pixels, count: see `rays`.
+
+    Returns:
+        `mi.RayDifferential3f` and its weight per lane; count * spp lanes.
+    """
+    lanes = count * spp
+    sampler.seed(seed, lanes)
+    index = dr.arange(mi.UInt32, lanes) // spp
+    pixel, which = dr.gather(mi.UInt32, pixels, index), dr.gather(mi.UInt32, which, index)
+    width, height = dr.gather(mi.UInt32, settings.widths, which), dr.gather(mi.UInt32, settings.heights, which)
+    # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.
+    y = pixel // dr.maximum(width, 1)
+    position = mi.Point2f(pixel - y * width, y) + sampler.next_2d()
+    time = mi.Float(0)
+    if settings.shutters is not None:
+        opening, open_time = settings.shutters
+        time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
+    aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
+    ray, weight = dr.gather(mi.SensorPtr, sensors, which).sample_ray_differential(
+        time, 0.5, mi.Point2f(position.x / width, position.y / height), aperture
+    )
+    ray.scale_differential(spp**-0.5)
+    return ray, weight
+
+
+@dataclass(frozen=True)
+class Films:
+    """What rays of several sensors need to know of them.
+
+    Attributes:
+        widths, heights: of the films in pixels, `mi.UInt32`.
+        aperture: whether any needs an aperture sample.
+        shutters: opening times and durations, `mi.Float`; None where none has one.
+    """
+
+    widths: Any
+    heights: Any
+    aperture: bool
+    shutters: tuple[Any, Any] | None
+
+    @classmethod
+    def of(cls, sensors: Any) -> Films:
+        """Of a list of `mitsuba.Sensor`."""
+        sizes = [sensor.film().crop_size() for sensor in sensors]
+        times = [float(sensor.shutter_open_time()) for sensor in sensors]
+        shutters = None
+        if any(time > 0 for time in times):
+            shutters = mi.Float([float(sensor.shutter_open()) for sensor in sensors]), mi.Float(times)
+        return cls(
+            mi.UInt32([int(size[0]) for size in sizes]),
+            mi.UInt32([int(size[1]) for size in sizes]),
+            any(sensor.needs_aperture_sample() for sensor in sensors),
+            shutters,
+        )
+
+
 def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any:
     """The mean of each pixel's samples, per group.
 

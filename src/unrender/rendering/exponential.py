@@ -21,7 +21,7 @@ RATE = "rate"
 
 @dataclass(frozen=True)
 class ExponentialPaths:
-    """The samples of a rendering at λ = 1, (groups, samples of each)."""
+    """The samples of a rendering at λ = 1, (groups, *shape of a picture, samples of each)."""
 
     unit: np.ndarray
 
@@ -62,7 +62,8 @@ class ExponentialRenderer:
 
     def image(self, parameters: Tree, shot: Shot) -> Rendering:
         """See `Renderer.image`."""
-        numbers = np.random.default_rng(shot.seed).random((shot.groups, shot.spp // shot.groups))
+        shape = (1, 1) if shot.pixels is None else (len(shot.pixels),)
+        numbers = np.random.default_rng(shot.seed).random((shot.groups, *shape, shot.spp // shot.groups))
         paths = ExponentialPaths(-np.log1p(-numbers))
         return Rendering(self._images(parameters, paths), None, paths)
 
@@ -89,6 +90,11 @@ class ExponentialRenderer:
         """See `Renderer.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
+    def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
+        """See `Renderer.tangent_moment`."""
+        slopes = paths.unit[0] * float(tangents[RATE]) / float(parameters[RATE]) ** 2
+        return np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
+
     def _images(self, parameters: Tree, paths: ExponentialPaths) -> np.ndarray:
-        means = paths.unit.mean(axis=1) / float(parameters[RATE])
-        return np.broadcast_to(means[:, None, None, None], (len(means), 1, 1, 3)).copy()
+        means = paths.unit.mean(axis=-1) / float(parameters[RATE])
+        return np.repeat(means[..., None], 3, axis=-1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,15 +19,27 @@ import numpy as np
 from unrender.errors import InputError
 from unrender.names import did_you_mean
 from unrender.rendering import camera, poses
+from unrender.rendering.leaves import bring, gradients
 from unrender.rendering.path_pair import DELTA_EQUAL, PathPair
 from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
-from unrender.rendering.scene_pair import Carriage, SceneDescription, ScenePair, from_tensor, to_tensor
+from unrender.rendering.prb_kernel import PrbKernel
+from unrender.rendering.scene_pair import (
+    Carriage,
+    SceneDescription,
+    ScenePair,
+    from_tensor,
+    to_tensor,
+)
+from unrender.rendering.volume_pair import VolumePair
 from unrender.trees import Tree
 
 _log = logging.getLogger("unrender")
 
 _LANES = 1 << 22
 """Paths per launch of a batch: what fits a small machine's memory."""
+
+
+_living: weakref.WeakSet[MitsubaRenderer] = weakref.WeakSet()
 
 
 @dataclass(frozen=True)
@@ -38,12 +51,14 @@ class Paths:
         radiance: per lane.
         previous: likewise of the previous state; None unless a pair was rendered.
         space: where the pair shares its samples.
+        other: parameters of the previous state; None unless a pair was rendered.
     """
 
     shot: Shot
     radiance: Any
     previous: Any = None
     space: Space = "path"
+    other: Tree | None = None
 
 
 class MitsubaRenderer:
@@ -67,6 +82,8 @@ class MitsubaRenderer:
         self._resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._poses = poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = dict(self.pair.info())
+        if self.pair.volumetric:
+            self._poses = {}  # posed shapes live in scenes of their own, which media do not reach
         self._info |= {key: poses.info(pose) for key, pose in self._poses.items()}
         self._posed: poses.PosedScene | None = None
         self._attached = True
@@ -77,9 +94,12 @@ class MitsubaRenderer:
         self._loaded: Tree = {}
         self._loaded_previous: Tree = {}
         self._geometric = False
-        self._kernel: Any = PathPair(max_depth)
+        self._film_settings: camera.Films | None = None
+        self._recordable = True
+        self._kernel = self._path_kernel([])
         self._frozen: dict[tuple, Callable[..., Any]] = {}
         self._sampler = mi.load_dict({"type": "independent"})
+        _living.add(self)
 
     # ------------------------------------------------------------------ what there is
 
@@ -136,11 +156,20 @@ class MitsubaRenderer:
         self._keys, self._attached = list(keys), derivatives
         self._native = {key: self.pair.current_parameters[key] for key in own}
         self._geometric = geometric and derivatives
+        self._recordable = not any(ride.phase for ride in rides)
         changing = [ride for ride in rides if ride.delta != DELTA_EQUAL] if derivatives else []
-        self._kernel = PathPair(self.max_depth, changing_delta=bool(changing))
+        self._kernel = self._path_kernel(rides if derivatives else [])
         self._delta_table = self._delta_kinds(changing)
         self._leaves, self._leaves_previous, self._loaded, self._loaded_previous = {}, {}, {}, {}
         self._frozen.clear()
+
+    def _path_kernel(self, rides: list[Carriage]) -> Any:
+        """The path tracer for these parameters' derivatives."""
+        delta = any(ride.delta != DELTA_EQUAL for ride in rides)
+        if not self.pair.volumetric:
+            return PathPair(self.max_depth, changing_delta=delta)
+        media = any(ride.medium for ride in rides)
+        return VolumePair(self.max_depth, changing_delta=delta, differentiate_media=media, emission=self.pair.emissive)
 
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
         if key not in self._info:
@@ -219,14 +248,18 @@ class MitsubaRenderer:
             radiance, radiance_previous = self._run("pair", shot, self._tables())
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, shot), self._develop(radiance_previous, shot)
-        return Rendering(*images, Paths(shot, radiance, radiance_previous, space))
+        return Rendering(*images, Paths(shot, radiance, radiance_previous, space, previous))
 
     def adjoint(self, parameters: Tree, paths: Paths, weights: Any) -> Tree:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `Renderer.adjoint`."""
+        if self.pair.volumetric and paths.other is not None and paths.space == "path":
+            # Where a pair collides in a medium depends on both states: so does its replay.
+            nothing = self.array(np.zeros(weights.shape))
+            return self.adjoint_pair(parameters, paths.other, paths, weights, nothing)[0]
         self._set_current(parameters)
         shot = paths.shot
         self._run("adjoint", shot, {"delta": self._delta_table}, paths.radiance, weights)
-        gradient = _gradients(self._leaves)
+        gradient = gradients(self._leaves)
         dr.eval(gradient)
         return gradient
 
@@ -241,16 +274,45 @@ class MitsubaRenderer:
         if paths.space == "primary":
             tables = {"delta": self._delta_table}
             self._run("adjoint", shot, tables, paths.radiance, weights)
-            gradient = _gradients(self._leaves)
+            gradient = gradients(self._leaves)
             dr.eval(gradient)
             self._run("previous adjoint", shot, tables, paths.previous, weights_previous)
         else:
             states = (paths.radiance, weights, paths.previous, weights_previous)
             self._run("adjoint pair", shot, self._tables(), *states)
-            gradient = _gradients(self._leaves)
-        gradient_previous = _gradients(self._leaves_previous)
+            gradient = gradients(self._leaves)
+        gradient_previous = gradients(self._leaves_previous)
         dr.eval(gradient, gradient_previous)
         return gradient, gradient_previous
+
+    def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> Any:
+        """Path replay in forward mode: the squared derivative of each path along the tangents. See `Renderer.tangent_moment`."""
+        if self.pair.volumetric:
+            raise InputError(
+                "pixels: adaptive probabilities are not known in scenes with participating media; use LossProportional or Uniform"
+            )
+        self._loaded.clear()
+        self._set_current(parameters)
+        shot = paths.shot
+        self._clear_gradients()
+        for key, leaf in self._leaves.items():
+            dr.set_grad(leaf, from_tensor(tangents[key], self._native[key]))
+        for renderer in _living:
+            renderer._derive()
+        squares = self._run("tangent", shot, {"delta": self._delta_table}, paths.radiance)
+        dr.eval(squares)
+        return self._develop(squares, shot)[0]
+
+    def _derive(self) -> None:
+        """Carry tangents from the leaves to what the scenes derive from them, which cuts the ties between the two: the next rendering
+        brings fresh leaves. A call through a pointer sees all objects of its kind, so all scenes of the process must be cut before one
+        is differentiated forward.
+        """
+        for leaf in (*self._leaves.values(), *self._leaves_previous.values()):
+            dr.enqueue(dr.ADMode.Forward, leaf)
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+        self._loaded.clear()
+        self._loaded_previous.clear()
 
     def _tables(self) -> dict[str, Any]:
         return dict(self.pair.tables(), delta=self._delta_table)
@@ -268,27 +330,39 @@ class MitsubaRenderer:
     def _run(self, what: str, shot: Shot, tables: Any = None, *more: Any, copies: int = 1) -> Any:
         """Call the frozen kernel for shots of this form: traced once, replayed at each step."""
         count = self._count(shot)
-        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None, copies)
+        several = shot.sensors is not None
+        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None, several, copies)
         trace = self._trace_poses if what == "poses" else self._trace
         if key not in self._frozen:
-            self._frozen[key] = _uncollected(dr.freeze(trace(what, shot.sensor, shot.spp, count, copies)))
+            traced = trace(what, shot.sensor, shot.spp, count, copies)
+            # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
+            self._frozen[key] = _uncollected(dr.freeze(traced)) if self._recordable else traced
         scene = self.pair.previous if what.startswith("previous") else self.pair.current
         if what == "poses":
             assert self._posed is not None
             scene = self._posed.scenes()
-        arguments = (scene, [self.pair.current, *self.pair.others()], tables, mi.UInt32(shot.seed), shot.pixels, *more)
+        living = [self.pair.current, *self.pair.others()]
+        chosen = (self._films(), shot.sensors) if several else None
+        if self.pair.volumetric:
+            tables = {**(tables or {}), **self.pair.media(what.startswith("previous"), shot.sensor)}
+        arguments = (scene, living, tables, mi.UInt32(shot.seed), shot.pixels, chosen, *more)
         try:
-            self._clear_gradients()
+            if what != "tangent":  # where they are the input
+                self._clear_gradients()
             return self._frozen[key](*arguments)
         except RuntimeError as error:
             if "frozen function" not in str(error):
                 raise
-            # Mitsuba objects outside these scenes, even unused ones, can keep Dr.Jit from recording.
+            # Mitsuba objects outside these scenes, even unused ones, can keep Dr.Jit from recording; so do the numbers of
+            # phase functions, which it does not find.
             _log.warning(
                 "this process holds other Mitsuba objects, which keep kernels from being frozen: steps are slower"
+                if not self.pair.volumetric
+                else "phase functions or other Mitsuba objects keep kernels from being frozen: steps are slower"
             )
             self._frozen[key] = trace(what, shot.sensor, shot.spp, count, copies)
-            self._clear_gradients()
+            if what != "tangent":
+                self._clear_gradients()
             return self._frozen[key](*arguments)
 
     def _clear_gradients(self) -> None:
@@ -300,8 +374,8 @@ class MitsubaRenderer:
         posed, kernel = self._posed, self._kernel
         assert posed is not None
 
-        def trace(scenes, living, numbers, seed, pixels):
-            del living
+        def trace(scenes, living, numbers, seed, pixels, chosen):
+            del living, chosen
             batch = dr.arange(mi.UInt32, copies * count * spp) // (count * spp)
             assembly = posed.at(scenes, numbers, batch)
             sampler = camera.RepeatingSampler(count * spp)
@@ -315,19 +389,38 @@ class MitsubaRenderer:
 
         return trace
 
+    def _films(self) -> camera.Films:
+        if self._film_settings is None:
+            if len({str(sensor.get_medium()) for sensor in self.pair.current.sensors()}) > 1:
+                raise InputError(
+                    "pixels: the sensors stand in different media, so their pixels cannot be drawn together"
+                )
+            self._film_settings = camera.Films.of(self.pair.current.sensors())
+        return self._film_settings
+
     def _trace(self, what: str, sensor: int, spp: int, count: int, copies: int) -> Callable[..., Any]:
         assert copies == 1
-        kernel = self._geometric_kernel() if self._geometric else self._kernel
+        kernel = PrbKernel(self.max_depth) if self._geometric else self._kernel
 
         pair = what.endswith("pair")
         backward = "adjoint" in what
 
-        def trace(scene, living, tables, seed, pixels, radiance=None, weights=None, radianceₚ=None, weightsₚ=None):
+        def trace(
+            scene, living, tables, seed, pixels, chosen, radiance=None, weights=None, radianceₚ=None, weightsₚ=None
+        ):
             del living  # read through pointers, if at all
             # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
             sampler = self._sampler.clone()
             with dr.suspend_grad():
-                ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
+                if chosen is None:
+                    ray, ray_weight = camera.rays(scene.sensors()[sensor], sampler, seed, spp, pixels, count)
+                else:
+                    films, which = chosen
+                    sensors = scene.sensors_dr()
+                    ray, ray_weight = camera.rays_of_many(sensors, films, which, sampler, seed, spp, pixels, count)
+                if what == "tangent":
+                    δ, _ = kernel.sample(dr.ADMode.Forward, scene, tables, sampler, ray, None, radiance)
+                    return dr.square(δ * ray_weight)
                 if backward:
                     δL = camera.expose(weights, spp, count) * ray_weight
                     δLₚ = camera.expose(weightsₚ, spp, count) * ray_weight if pair else None
@@ -338,41 +431,15 @@ class MitsubaRenderer:
 
         return trace
 
-    def _geometric_kernel(self) -> Any:
-        return PrbKernel(self.max_depth)
-
     # ------------------------------------------------------------------ the two states
 
     def _set_current(self, parameters: Tree) -> None:
-        _bring(self.pair.current_parameters, parameters, self._native, self._loaded, self._leaves, self._attached)
+        bring(self.pair.current_parameters, parameters, self._native, self._loaded, self._leaves, self._attached)
 
     def _set_previous(self, parameters: Tree) -> None:
-        _bring(
+        bring(
             self.pair.previous_parameters, parameters, self._native, self._loaded_previous, self._leaves_previous, True
         )
-
-
-def _bring(
-    scene: Any, parameters: Tree, native: dict[str, Any], loaded: Tree, leaves: dict[str, Any], attached: bool
-) -> None:
-    """Bring a scene to `parameters`, as fresh leaves of the gradient: attached for all of a run or never, since frozen kernels would
-    be traced anew if that changed between the primal and the adjoint pass."""
-    changed = False
-    for key, value in parameters.items():
-        if loaded.get(key) is not value:
-            leaf = from_tensor(value, native[key])
-            if attached:
-                dr.enable_grad(leaf)
-                leaves[key] = leaf
-            scene[key] = leaf
-            loaded[key] = value
-            changed = True
-    if changed:
-        scene.update()
-
-
-def _gradients(leaves: dict[str, Any]) -> Tree:
-    return {key: to_tensor(dr.grad(leaf)) for key, leaf in leaves.items()}
 
 
 def _uncollected(frozen: Callable[..., Any]) -> Callable[..., Any]:
@@ -388,20 +455,3 @@ def _uncollected(frozen: Callable[..., Any]) -> Callable[..., Any]:
                 gc.enable()
 
     return call
-
-
-class PrbKernel:
-    """Mitsuba's `prb` behind the interface of `PathPair`, for parameters that move geometry: its adjoint carries the
-    continuous part of their derivative. Visibility is left out, so those gradients are biased."""
-
-    def __init__(self, max_depth: int):
-        self._integrator = mi.load_dict({"type": "prb", "max_depth": max_depth})
-
-    def sample(
-        self, mode, scene, tables, sampler, ray, δL=None, state_in=None, pair=False, δLₚ=None, stateₚ_in=None
-    ) -> tuple[Any, Any]:
-        """See `PathPair.sample`; never a pair."""
-        del tables, pair, δLₚ, stateₚ_in
-        active = mi.Bool(True)
-        L = self._integrator.sample(mode, scene, sampler, ray, δL, state_in, active)[0]
-        return L, None

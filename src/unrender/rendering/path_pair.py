@@ -57,22 +57,23 @@ class PathPair:
 
         Args:
             mode: `Primal`, or `Backward` to replay the paths of a primal pass and back-propagate `δL` into the parameters
-                of `scene`, with `pair` also `δLₚ` into those of the previous scene (path replay, Vicini et al. 2021). Call
-                under `dr.suspend_grad()`.
+                of `scene`, with `pair` also `δLₚ` into those of the previous scene (path replay, Vicini et al. 2021), or `Forward` to
+                replay them and carry the tangents of the parameters of `scene` forward. Call under `dr.suspend_grad()`.
             scene: the current scene.
             tables: of `ScenePair.tables()`, used with `pair`; its "delta" entry, used with `changing_delta`.
             sampler: seeded; the same seed replays the same paths.
             ray: camera rays.
             δL: adjoint radiance per lane, with `Backward`.
-            state_in: radiance per lane that the primal pass returned, with `Backward`.
+            state_in: radiance per lane that the primal pass returned, with `Backward` and `Forward`.
             pair: whether the previous state rides along.
             δLₚ, stateₚ_in: likewise for the previous state, with `Backward` and `pair`.
             geometry: what rays meet in place of `scene` (`poses.Assembly`), or None.
 
         Returns:
-            radiance of the current and of the previous state per lane. Both unbiased.
+            radiance of the current and of the previous state per lane, both unbiased; with `Forward` the derivative of the radiance
+            along the tangents, and zero.
         """
-        primal = mode == dr.ADMode.Primal
+        primal, forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
         geometry = scene if geometry is None else geometry
         follow_delta = self.changing_delta and (pair or not primal)
         bsdf_ctx = mi.BSDFContext()
@@ -164,10 +165,14 @@ class PathPair:
                     if dr.hint(follow_delta, mode="scalar"):
                         lobe = self._delta_value(kind, bsdf, si, bs, sample_1, sample_2, active_next & delta)
                         value = dr.select(delta, lobe, f)
-                    Lo = δL * (Le + Ld + L * relative(value))
-                    if dr.hint(pair, mode="scalar"):
-                        Lo += δLₚ * (Leₚ + Ldₚ + Lₚ * relative(valueₚ))
-                    dr.backward_from(Lo)
+                    Lo = Le + Ld + L * relative(value)
+                    if dr.hint(forward, mode="scalar"):
+                        δL += dr.forward_to(Lo)
+                    else:
+                        Lo = δL * Lo
+                        if dr.hint(pair, mode="scalar"):
+                            Lo += δLₚ * (Leₚ + Ldₚ + Lₚ * relative(valueₚ))
+                        dr.backward_from(Lo)
             ray = si.spawn_ray(si.to_world(bs.wo))
             η *= bs.eta
             β *= weight
@@ -192,7 +197,7 @@ class PathPair:
             depth[si.is_valid()] += 1
             active = active_next
 
-        return L, Lₚ
+        return δL if forward else L, Lₚ
 
     def _delta_value(self, kind, bsdf, si, bs, sample_1, sample_2, active):
         """The value of the perfectly specular lobe that was sampled, which no BSDF evaluation returns.

@@ -52,6 +52,7 @@ class Shot:
         seed: an integer in [0, 2**32), from `Key.uint32()`.
         groups: how many independent images the samples are split into.
         pixels: flat pixel indices (row-major), or None for the whole film.
+        sensors: of each chosen pixel, in place of `sensor`; None where all are of that one.
     """
 
     sensor: int
@@ -59,6 +60,7 @@ class Shot:
     seed: int
     groups: int = 1
     pixels: Array | None = None
+    sensors: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -130,5 +132,14 @@ class Renderer(Protocol):
     ) -> tuple[Tree, Tree]:
         """`adjoint` of both states of an `image_pair`, on its paths and in its space: the gradient of sum(weights[g] * images[g])
         with respect to `current`, and of sum(weights_previous[g] * previous[g]) with respect to `previous`.
+        """
+        ...
+
+    def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> Array:
+        """The mean over a pixel's samples of (Σ_k v_k ∂f/∂θ_k)², for the tangents v, on the paths of a rendering in one group: of the
+        shape of one of its images.
+
+        Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
+        derivatives of a path.
         """
         ...

@@ -26,6 +26,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from unrender.errors import InputError
 from unrender.rendering.port import ParameterInfo
@@ -145,11 +146,7 @@ class PosedScene:
         rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self.static = _scene([*rest, *scene.sensors()])
         self.parts = {name: _scene([shape]) for name, shape in posed.items()}
-        self._centres = {name: _centre(shape.bbox()) for name, shape in posed.items()}
-        for sensor in scene.sensors():
-            if sensor.id() in targets:
-                matrix = np.array(sensor.world_transform().matrix.numpy(), float).reshape(4, 4)
-                self._centres[sensor.id()] = matrix[:3, 3].tolist()
+        self._centres = _centres(scene, targets)
 
     def scenes(self) -> list[Any]:
         """All scenes, to hand to frozen kernels."""
@@ -223,6 +220,38 @@ class Assembly:
         for part, pose in self.parts:
             blocked |= part.ray_test(pose.ray_inside(ray), active & ~blocked)
         return blocked
+
+
+def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """{id of a shape or sensor: (4, 4)}: what stands before its `to_world` in these poses.
+
+    Args:
+        scene: as loaded.
+        parameters: {key: value} of poses.
+    """
+    known = keys(scene)
+    found = {}
+    chosen = {key: known[key] for key in parameters}
+    for target, centre in _centres(scene, {key.target for key in chosen.values()}).items():
+        numbers = np.array([0, 0, 0, 0, 0, 0, 1.0])
+        for key, (owner, first, size) in _slots(chosen).items():
+            if owner == target:
+                numbers[first : first + size] = np.reshape(parameters[key], -1)
+        linear = numbers[6] * Rotation.from_rotvec(numbers[3:6]).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = linear, centre + numbers[:3] - linear @ centre
+        found[target] = matrix
+    return found
+
+
+def _centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
+    """What each of the targets turns about, shapes before sensors."""
+    found = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
+    for sensor in scene.sensors():
+        if sensor.id() in targets:
+            matrix = np.array(sensor.world_transform().matrix.numpy(), float).reshape(4, 4)
+            found[sensor.id()] = matrix[:3, 3].tolist()
+    return found
 
 
 def _slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:

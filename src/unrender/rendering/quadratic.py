@@ -91,6 +91,11 @@ class QuadraticRenderer:
         """See `Renderer.adjoint_pair`. Exact."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
+    def tangent_moment(self, parameters: Tree, paths: Shot, tangents: Tree) -> np.ndarray:
+        """See `Renderer.tangent_moment`. Exact."""
+        del parameters
+        return self._images(tangents, paths)[0] ** 2
+
     def _images(self, parameters: Tree, shot: Shot) -> np.ndarray:
         shape = (1, 1) if shot.pixels is None else (len(shot.pixels),)
         pixel = self._jacobian @ np.asarray(parameters[POINT])

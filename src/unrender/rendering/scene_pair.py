@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.errors import InputError
+from unrender.rendering import emissive
 from unrender.rendering.path_pair import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.port import ParameterInfo
 from unrender.variant import ensure
@@ -42,6 +43,7 @@ def load(description: SceneDescription) -> Any:
     Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
     """
     ensure()
+    emissive.register()
     if callable(description):
         description = description()
     try:
@@ -67,6 +69,8 @@ def load(description: SceneDescription) -> Any:
 
 
 def _one_line(error: Exception) -> str:
+    if own := re.search(r"InputError: (.+)", str(error)):  # of a plugin of ours, under Mitsuba's traceback
+        return own[1]
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines)[:400] or type(error).__name__
 
@@ -81,6 +85,8 @@ class Carriage:
         reason: why one path cannot serve two values of it, "" if it can.
         blind: whether path replay cannot tell its derivative either, for the same reason.
         delta: how the BSDF's perfectly specular lobes follow it, one of `path_pair.DELTA_...`.
+        medium: whether extinction or scattering of a participating medium depends on it.
+        phase: whether it belongs to a phase function.
     """
 
     geometric: bool
@@ -88,6 +94,8 @@ class Carriage:
     reason: str
     blind: bool = False
     delta: int = DELTA_EQUAL
+    medium: bool = False
+    phase: bool = False
 
 
 _living: weakref.WeakSet[ScenePair] = weakref.WeakSet()
@@ -103,15 +111,19 @@ class ScenePair:
     Attributes:
         current, previous: `mitsuba.Scene`.
         current_parameters, previous_parameters: their `mitsuba.SceneParameters`.
+        volumetric: whether there is a participating medium.
     """
 
     def __init__(self, description: SceneDescription):
         self.description = description
         self.current = load(description)
         self.current_parameters = mi.traverse(self.current)
+        self.volumetric = bool(media(self.current))
+        self._check_media()
         self._previous: Any = None
         self._previous_parameters: Any = None
         self._tables: dict[str, Any] | None = None
+        self._media: dict[tuple[bool, int], dict[str, Any]] = {}
         _living.add(self)
 
     @property
@@ -144,19 +156,59 @@ class ScenePair:
                 )
 
     def tables(self) -> dict[str, Any]:
-        """Pointer tables {"bsdf" | "emitter" | "shape": UInt32}, from registry ids of current to those of previous."""
+        """Pointer tables {"bsdf" | "emitter" | "shape" | "medium": UInt32}, from registry ids of current to those of previous."""
         if self._tables is None:
             current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
             self._tables = {
                 "bsdf": _table(current.bsdf(), previous.bsdf()),
                 "emitter": _table(self.current.emitters_dr(), self.previous.emitters_dr()),
                 "shape": _table(current, previous),
+                "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
             }
         return self._tables
 
+    def media(self, previous: bool, sensor: int) -> dict[str, Any]:
+        """Tables of one of the two scenes {"camera" | "emits": UInt32}: the registry id of the medium that a sensor says it stands in, 0
+        for none; by registry ids, 1 for media that emit."""
+        if (previous, sensor) not in self._media:
+            scene = self.previous if previous else self.current
+            camera = scene.sensors()[sensor].get_medium()
+            found = {_id(medium): emissive.emits(medium) for medium in media(scene)}
+            emits = np.zeros(max(found, default=0) + 1, np.uint32)
+            for number, shines in found.items():
+                emits[number] = shines
+            tables = {"camera": dr.opaque(mi.UInt32, _id(camera)), "emits": mi.UInt32(emits)}
+            self._media[previous, sensor] = tables
+        return self._media[previous, sensor]
+
+    def _check_media(self) -> None:
+        """Raise `InputError` where the scene itself gives a medium values that make no sense: Mitsuba takes them as they are."""
+        for key in self.current_parameters.keys():  # noqa: SIM118 (iterating gives pairs)
+            if not carriage(self.current_parameters, key).medium:
+                continue
+            low, high = _physical_range(self.current_parameters, key)
+            values = to_tensor(self.current_parameters[key]).numpy()
+            if not np.isfinite(values).all():
+                raise InputError(f"scene: {key} holds values that are not finite")
+            if low is not None and values.min(initial=np.inf) < low:
+                raise InputError(f"scene: {key} must be at least {low:g}, got {values.min():g}")
+            if high is not None and values.max(initial=-np.inf) > high:
+                raise InputError(f"scene: {key} must be at most {high:g}, got {values.max():g}")
+
+    @property
+    def emissive(self) -> bool:
+        """Whether there is a medium that emits."""
+        return any(emissive.emits(medium) for medium in media(self.current))
+
     def carriage(self, key: str) -> Carriage:
         """How the parameter `key` reaches the picture."""
-        return carriage(self.current_parameters, key)
+        ride = carriage(self.current_parameters, key)
+        if self.volumetric and ride.geometric:
+            return replace(ride, reason=f"{ride.reason}, in a scene with media", blind=True)
+        if self.volumetric and ride.delta == DELTA_MASK:
+            # Connections to emitters pass masks, and their derivative would be needed there too.
+            return replace(ride, reason="it is the opacity of a mask in a scene with media", blind=True)
+        return ride
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
@@ -184,9 +236,24 @@ class ScenePair:
         ride = self.carriage(key)
         low, high = _physical_range(self.current_parameters, key)
         if ride.blind:
-            able = "medium" not in ride.reason
-            return ParameterInfo(shape, False, False, ride.reason, low, high, perturbable=able)
+            return ParameterInfo(shape, False, False, ride.reason, low, high)
         return ParameterInfo(shape, True, not ride.reason, ride.reason, low, high)
+
+
+def media(scene: Any) -> list[Any]:
+    """All participating media of a scene, once for each place they are in, in an order that two loads share."""
+    found = [medium for shape in scene.shapes() for medium in (shape.interior_medium(), shape.exterior_medium())]
+    found += [sensor.get_medium() for sensor in scene.sensors()]
+    return [medium for medium in found if medium is not None]
+
+
+def _id(medium: Any) -> int:
+    """Its registry id, 0 for None."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium)).numpy()[0])
+
+
+def _media_ids(scene: Any) -> Any:
+    return mi.UInt32([0, *(_id(medium) for medium in media(scene))])
 
 
 def _table(current: Any, previous: Any) -> Any:
@@ -215,7 +282,8 @@ def carriage(parameters: Any, key: str) -> Carriage:
             return Carriage(True, None, "it moves an emitter")
         return Carriage(False, None, "")
     if any(isinstance(n, mi.Medium) for n in chain):
-        return Carriage(False, None, "it belongs to a medium, and media are not rendered yet", blind=True)
+        volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
+        return Carriage(False, None, "", medium=volume, phase=phase)
     if any(isinstance(n, mi.Sensor) for n in chain):
         return Carriage(True, None, "it moves the sensor")
     if any(isinstance(n, mi.Shape) for n in chain):
@@ -258,7 +326,7 @@ def _physical_range(parameters: Any, key: str) -> tuple[float | None, float | No
     node = parameters.properties[key][2]
     names = key.split(".")
     role = next((n for n in reversed(names) if n not in ("value", "data", "color0", "color1", "scale")), "")
-    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Medium)):
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
     if isinstance(node, mi.Emitter):
         return (
@@ -266,6 +334,9 @@ def _physical_range(parameters: Any, key: str) -> tuple[float | None, float | No
             if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data")
             else (None, None)
         )
+    if isinstance(node, mi.Medium):
+        ranges = {"sigma_t": (0.0, None), "albedo": (0.0, 1.0), "emission": (0.0, None), "g": (-0.99, 0.99)}
+        return ranges.get(role, (None, None))
     if not isinstance(node, mi.BSDF):
         return None, None
     if role in ("alpha", "alpha_u", "alpha_v", "roughness"):

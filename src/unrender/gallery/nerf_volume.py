@@ -1,0 +1,74 @@
+"""`nerf-volume`: a thing of surfaces, fitted by a volume that glows and absorbs. After Balint et al. 2023, Figs 7 and 8."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, parts, staging, volumes
+from unrender.gallery.recipe import reference
+from unrender.losses import L2, Loss
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.scene_pair import load
+
+
+@dataclass(frozen=True)
+class NerfVolume:
+    """A toy of coloured balls and blocks, seen from all around, fitted by a volume that emits and absorbs.
+
+    Several views; the unknowns are extinction (grid_resolution³, 1) and emitted radiance (grid_resolution³, 3), from a thin grey
+    glow. Their truth is unknown: the toy has surfaces, and what it shows depends on the direction.
+    """
+
+    resolution: int = fields.resolution(32)
+    grid_resolution: int = fields.whole(16, "voxels along a side of each unknown grid", at_least=2)
+    views: int = fields.whole(16, "cameras, evenly around the toy", at_least=1, at_most=64)
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(4, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The volume, in the cube [-1, 1]³, as the descent starts with it."""
+        size = (self.grid_resolution,) * 3
+        density, glow = volumes.grid(np.full((*size, 1), 0.5)), volumes.grid(np.full((*size, 3), 0.4))
+        return self._stage() | {"volume": volumes.cube({"type": "emissive", "sigma_t": density, "emission": glow})}
+
+    def target(self) -> dict[str, Any]:
+        """The toy in its place, in the sun."""
+        return self._stage() | _toy() | {"sun": staging.sun((0.5, 0.8, 0.4), 0.9)}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Both grids; extinction has the wider range, and the larger steps."""
+        return (
+            Parameter("volume.interior_medium.sigma_t.data", learning_rate=0.2),
+            Parameter("volume.interior_medium.emission.data"),
+        )
+
+    def problem(self, name: str) -> Problem:
+        """The problem: the volume's scene, whose light is seen directly, and the toy's pictures by Mitsuba's own `path` integrator."""
+        true = load(self.target)
+        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
+        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
+        return Problem(self.scene, self.parameters(), views, self.loss, 1, name=name)
+
+    def _stage(self) -> dict[str, Any]:
+        sky = {"type": "constant", "radiance": parts.colour(0.3, 0.35, 0.4)}
+        return {"type": "scene", **volumes.around(self.views, self.resolution), "sky": sky}
+
+
+def _toy() -> dict[str, Any]:
+    import mitsuba as mi
+
+    to = mi.ScalarTransform4f()
+    red, blue, gold, green = ([0.75, 0.15, 0.1], [0.1, 0.25, 0.7], [0.8, 0.6, 0.15], [0.15, 0.55, 0.2])
+    return {
+        "base": {"type": "cube", "to_world": to.translate([0, -0.55, 0]).scale([0.6, 0.12, 0.6]), "bsdf": parts.diffuse(*blue)},
+        "body": {"type": "sphere", "center": [0.0, -0.1, 0.0], "radius": 0.36, "bsdf": parts.diffuse(*red)},
+        "head": {"type": "sphere", "center": [0.1, 0.4, 0.05], "radius": 0.22, "bsdf": parts.diffuse(*gold)},
+        "arm": {"type": "cube", "to_world": to.translate([-0.35, 0.05, 0.2]).rotate([0, 0, 1], 35).scale([0.3, 0.08, 0.08]),
+                "bsdf": parts.diffuse(*green)},
+    }  # fmt: skip

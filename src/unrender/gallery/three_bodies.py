@@ -1,0 +1,65 @@
+"""`three-bodies`: the colour of one body, the roughness of the second, the density of the third. After Nicolet et al. 2023, Fig. 2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from unrender.gallery import fields, parts
+from unrender.losses import L1, Loss
+from unrender.problem.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class ThreeBodies:
+    """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.
+
+    One view; the unknowns are a reflectance (3,), a roughness () and an extinction (3,), a quarter of that in inverse units of length.
+    """
+
+    resolution: int = fields.resolution(48)
+    reference_spp: int = fields.reference_spp(2048)
+    max_depth: int = fields.max_depth(6, at_least=2)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Three balls of radius 0.6 on the floor y = -0.6, between two lamps."""
+        tiles = {"type": "checkerboard", "color0": parts.colour(0.15), "color1": parts.colour(0.6)}
+        tiles["to_uv"] = _scaled(24)
+        fog = {
+            "type": "homogeneous",
+            "scale": 4.0,  # Mitsuba takes colours up to 1 only
+            "sigma_t": parts.colour(0.9, 0.6, 0.35),
+            "albedo": parts.colour(0.6, 0.85, 0.95),
+        }
+        floor = parts.rectangle((0, -0.6, 0), (8, 0, 0), (0, 0, -8), {"type": "diffuse", "reflectance": tiles})
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 1.3, 5.2), (0, -0.1, 0), 40.0, self.resolution),
+            "floor": floor,
+            "lamp": parts.rectangle(
+                (-2.5, 3.5, 1), (0.8, -0.6, 0), (0, 0, 1), parts.diffuse(0), emitter=parts.light(9, 8, 6)
+            ),
+            "sky": {"type": "constant", "radiance": parts.colour(0.25, 0.3, 0.4)},
+            "paint": _ball(-1.35, {"type": "diffuse", "reflectance": parts.colour(0.75, 0.25, 0.12)}),
+            "metal": _ball(0.0, {"type": "roughconductor", "material": "Al", "alpha": 0.12}),
+            "fog": _ball(1.35, {"type": "null"}) | {"interior": fog},
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Grey paint, dull metal, thin grey fog."""
+        return (
+            Parameter("paint.bsdf.reflectance.value", initial=0.5),
+            Parameter("metal.bsdf.alpha.value", initial=0.4),
+            Parameter("fog.interior_medium.sigma_t.value.value", initial=0.2),
+        )
+
+
+def _ball(x: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "sphere", "center": [x, 0.0, 0.0], "radius": 0.6, "bsdf": bsdf}
+
+
+def _scaled(factor: float) -> Any:
+    import mitsuba as mi
+
+    return mi.ScalarTransform3f().scale([factor, factor])

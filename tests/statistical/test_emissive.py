@@ -1,0 +1,84 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""Media that emit and absorb: closed forms for constant ones, gradients against finite differences for the others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fog import DARK, KIND, LEVELS, fog, grid, scene
+from test_volume_gradients import limit, own, scores
+
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+
+SKY = np.array([0.2, 0.5, 0.8])
+
+
+def glow(extinction: np.ndarray, emission: np.ndarray, filter_type: str = "trilinear") -> dict[str, Any]:
+    return {"type": "emissive", "sigma_t": grid(extinction, filter_type), "emission": grid(emission, filter_type)}
+
+
+def before_the_sky(medium: dict[str, Any]) -> dict[str, Any]:
+    """A cube of the medium seen face on by parallel rays, before a sky of one colour."""
+    found = scene(medium, lights="sky")
+    found["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": SKY.tolist()}}
+    found["sensor"] = {
+        "type": "orthographic",
+        "to_world": mi.ScalarTransform4f().look_at([0, -5, 0], [0, 0, 0], [0, 0, 1]).scale(0.9),
+        "film": found["sensor"]["film"],
+    }
+    del found["floor"]
+    return found
+
+
+@pytest.mark.parametrize("depth", [1, 4])
+def test_a_constant_glow_is_what_its_closed_form_says(depth: int) -> None:
+    """e (1 - exp(-2 σ)) + sky exp(-2 σ), whatever the depth: emission is seen directly."""
+    extinction, emission = 0.6, np.array([1.5, 0.3, 0.0])
+    medium = glow(np.full((4, 4, 4, 1), extinction), np.broadcast_to(emission, (4, 4, 4, 3)))
+    renderer = MitsubaRenderer(before_the_sky(medium), depth)
+    images = np.array(renderer.image({}, Shot(0, 32 * 64, 1, 32)).images).astype(np.float64).mean(axis=(1, 2))
+    passed = np.exp(-2 * extinction)
+    expected = emission * (1 - passed) + SKY * passed
+    error = images.std(axis=0, ddof=1) / np.sqrt(len(images))
+    assert (np.abs(images.mean(axis=0) - expected) < 4 * error).all()
+    assert (error < 0.005).all()
+
+
+def test_gradients_of_glowing_voxels_agree_with_finite_differences() -> None:
+    """Emission where it is zero, and extinction where that is."""
+    light = np.where(DARK, 0, np.random.default_rng(1).uniform(0.3, 2, (*KIND.shape[:3], 3)))
+    medium = glow(np.array(list(LEVELS.values()))[KIND], light, "nearest")
+    renderer = MitsubaRenderer(scene(medium, lights="sky"), 3)
+    found = scores(renderer, own(renderer), 32)
+    assert len(found) == 8
+    assert max(map(abs, found.values())) < limit(len(found)), found
+
+
+def test_both_states_of_a_glow_agree_with_separate_renders() -> None:
+    rng = np.random.default_rng(4)
+    medium = glow(rng.uniform(0, 3, (4, 4, 4, 1)), rng.uniform(0, 2, (4, 4, 4, 3)))
+    found = scene(medium)
+    found["ball"] = {
+        "type": "sphere",
+        "center": [0, -1.9, 0.9],
+        "radius": 0.5,
+        "bsdf": {"type": "null"},
+        "interior": fog(),
+    }
+    renderer = MitsubaRenderer(found, 4)
+    keys = ["body.interior_medium.sigma_t.data", "body.interior_medium.emission.data"]
+    renderer.select(keys, "path")
+    current = renderer.values(keys)
+    previous = {key: value * 0.8 for key, value in current.items()}
+    pair = renderer.image_pair(current, previous, Shot(0, 24 * 64, 1, 24), "path")
+    for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
+        alone = renderer.image(state, Shot(0, 24 * 64, seed, 24))
+        a, b = (np.array(x).astype(np.float64).mean(axis=(1, 2)) for x in (images, alone.images))
+        error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 24)
+        assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4 * error).all()

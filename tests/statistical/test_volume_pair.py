@@ -1,0 +1,98 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""Media: our kernel against Mitsuba's `volpath`, both images of the pair against separate renders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fog import DEPTH, SCENES, cloud, media_keys, scene, two_media
+from zscores import agree
+
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+
+RUNS, SPP = 24, 64
+
+
+def runs(images: Any) -> np.ndarray:
+    return np.array(images).astype(np.float64)
+
+
+def volpath(renderer: MitsubaRenderer, depth: int = DEPTH, count: int = RUNS) -> np.ndarray:
+    integrator = mi.load_dict({"type": "volpath", "max_depth": depth})
+    render = [mi.render(renderer.pair.current, integrator=integrator, spp=SPP, seed=100 + run) for run in range(count)]
+    return np.stack([np.array(image) for image in render]).astype(np.float64)
+
+
+def changed(renderer: MitsubaRenderer, keys: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The scene's own values, and others: some voxels denser, some thinner."""
+    current = renderer.values(keys)
+    previous = {}
+    for number, (key, value) in enumerate(current.items()):
+        factor = np.random.default_rng(number).uniform(0.7, 1.1, np.shape(np.array(value)))
+        previous[key] = renderer.array(np.array(value) * factor)
+    return current, previous
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_kernel_agrees_with_volpath(name: str) -> None:
+    renderer = MitsubaRenderer(SCENES[name](), DEPTH)
+    ours = renderer.image({}, Shot(0, RUNS * SPP, 1, RUNS))
+    verdict, figures = agree(runs(ours.images), volpath(renderer))
+    assert verdict, figures
+
+
+@pytest.mark.parametrize("depth", [1, 2, 12])
+def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
+    """Roulette included: at 12 it has ended most paths."""
+    renderer = MitsubaRenderer(two_media(), depth)
+    ours = renderer.image({}, Shot(0, RUNS * SPP, 1, RUNS))
+    verdict, figures = agree(runs(ours.images), volpath(renderer, depth))
+    assert verdict, figures
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
+    renderer = MitsubaRenderer(SCENES[name](), DEPTH)
+    keys = [*media_keys(renderer), "floor.bsdf.reflectance.value"]
+    renderer.select(keys, "path")
+    current, previous = changed(renderer, keys)
+    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
+        alone = renderer.image(state, Shot(0, RUNS * SPP, seed, RUNS))
+        verdict, figures = agree(runs(images), runs(alone.images))
+        assert verdict, figures
+        verdict, figures = agree(1.03 * runs(images), runs(alone.images))
+        assert not verdict, f"a bias of 3 % went unseen: {figures}"
+
+
+@pytest.mark.parametrize("ending", ["sigma_t.data", "albedo.data"])
+def test_what_is_empty_or_black_now_but_was_not_before_is_not_lost(ending: str) -> None:
+    """The majorant bounds both states, and a path goes on while either is alive; the reverse as well."""
+    renderer = MitsubaRenderer(scene(cloud()), DEPTH)
+    key = next(key for key in renderer.parameters() if key.endswith(ending))
+    renderer.select([key], "path")
+    full = renderer.values([key])
+    none = {key: full[key] * 0.0}
+    for current, previous in ((none, full), (full, none)):
+        pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+        for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
+            alone = renderer.image(state, Shot(0, RUNS * SPP, seed, RUNS))
+            verdict, figures = agree(runs(images), runs(alone.images))
+            assert verdict, figures
+
+
+def test_the_difference_of_a_pair_is_far_less_noisy_than_that_of_two_renders() -> None:
+    renderer = MitsubaRenderer(scene(cloud()), DEPTH)
+    keys = media_keys(renderer)
+    renderer.select(keys, "path")
+    current = renderer.values(keys)
+    previous = {key: value * 0.98 for key, value in current.items()}
+    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    together = (runs(pair.images) - runs(pair.previous)).var(axis=0, ddof=1).sum()
+    assert together < 0.02 * runs(pair.images).var(axis=0, ddof=1).sum()
