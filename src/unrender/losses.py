@@ -1,9 +1,10 @@
-"""Losses per pixel and channel: value and derivative, and whether the derivative is linear in the image.
+"""Losses, all but one per pixel and channel: value and derivative, and whether the derivative is linear in the image.
 
 Why linearity matters: an image estimate I with E[I] = F gives E[∂ℓ(I)] = ∂ℓ(F) only where ∂ℓ is linear. Otherwise the
 gradient is biased by the image's noise, however many steps are averaged (Nicolet et al. 2023, section 4).
 
-The loss of a problem is the sum over views of weight · mean over pixels and channels of mask · value.
+The loss of a problem is the sum over views of weight · mean over pixels and channels of mask · value. A loss of whole
+images sees the reference where the mask is 0: mean of ℓ(R + mask · (I − R), R).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Protocol
 
 from unrender import arrays, checks
 from unrender.arrays import Array
+from unrender.perceptual import Perceptual as Perceptual
 
 
 class Loss(Protocol):
@@ -21,6 +23,15 @@ class Loss(Protocol):
     @property
     def linear(self) -> bool:
         """Whether `derivative` is linear (affine) in the image, so that image noise does not bias the gradient."""
+        ...
+
+    @property
+    def pixelwise(self) -> bool:
+        """Whether an element's loss depends on that element alone, so that some pixels may be had without the others.
+
+        A loss of whole images (..., H, W, 3) spreads its value evenly over each, so that the mean is the loss, and scales its derivative
+        alike.
+        """
         ...
 
     def value(self, image: Array, reference: Array) -> Array:
@@ -41,6 +52,11 @@ class L1:
         """False."""
         return False
 
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""
         return arrays.absolute(image - reference)
@@ -56,6 +72,11 @@ class L2:
 
     @property
     def linear(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def pixelwise(self) -> bool:
         """True."""
         return True
 
@@ -91,6 +112,11 @@ class RelativeL2:
         """True."""
         return True
 
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""
         difference = image - reference
@@ -118,6 +144,11 @@ class Huber:
     def linear(self) -> bool:
         """False."""
         return False
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
 
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""

@@ -16,8 +16,10 @@ import unrender as ur
 from unrender.images.base import ImageEstimate
 from unrender.keys import Key
 from unrender.problem.bounds import MARGIN
+from unrender.problem.frames import WholeView
 from unrender.rendering.analytic import AnalyticRenderer
 
+Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate
 ESTIMATORS: dict[str, Callable[[], Any]] = {
     "plain, crossed halves": lambda: ur.PathGradient(spp=2),
@@ -27,6 +29,23 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "control variate, path space": lambda: ur.PathGradient(CV(), spp=2),
     "control variate, primary space": lambda: ur.PathGradient(CV(space="primary"), spp=2),
     "control variate, own paths": lambda: ur.PathGradient(CV(), spp=1),
+    "plain, uniform pixels": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(24), spp=2),
+    "plain, independent pixels": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(24, stratified=False), spp=2),
+    "plain, pixels by loss": lambda: ur.PathGradient(pixels=ur.pixels.LossProportional(24, denoiser="none"), spp=2),
+    "plain, adaptive pixels": lambda: ur.PathGradient(
+        pixels=ur.pixels.Adaptive(24, denoiser="none", levels=2, refresh=3), spp=2
+    ),
+    "plain, adaptive pixels, own paths": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(24, denoiser="none"), spp=1),
+    "control variate, adaptive pixels": lambda: ur.PathGradient(
+        CV(whole_views=3), ur.pixels.Adaptive(24, denoiser="none"), spp=2
+    ),
+    "meta, adaptive pixels": lambda: ur.MetaEstimator(pixels=ur.pixels.Adaptive(24, denoiser="none")),
+    "meta, adaptive pixels, other statistics": lambda: ur.MetaEstimator(
+        pixels=ur.pixels.Adaptive(24, denoiser="none"), statistics="independent"
+    ),
+    "coupled, adaptive pixels": lambda: ur.MetaEstimator(
+        coupled=True, spp=2, pixels=ur.pixels.Adaptive(24, denoiser="none")
+    ),
     "meta": lambda: ur.MetaEstimator(),
     "meta, several of each": lambda: ur.MetaEstimator(4, 3, space="primary"),
     "meta, other statistics": lambda: ur.MetaEstimator(statistics="independent"),
@@ -40,10 +59,25 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
+    "denoised": lambda: ur.PathGradient(Denoised(by="variation"), spp=4),
+    "denoised control variate": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=6),
+    "denoised, own paths": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=1),
+    "coupled, denoised control variate": lambda: ur.MetaEstimator(
+        coupled=True, spp=2, image=Denoised(CV(), by="variation")
+    ),
 }
 # What the docstrings say of bias: a weight that knows its samples pulls toward zero.
-BIASED = {"meta", "meta, several of each", "coupled", "coupled, own paths", "coupled, control variate"}
+BIASED = {
+    "meta, adaptive pixels",
+    "coupled, adaptive pixels",
+    "meta",
+    "meta, several of each",
+    "coupled",
+    "coupled, own paths",
+    "coupled, control variate",
+}
 # A black box's loss is that of noisy images: a test of its own.
+BIASED |= {name for name in ESTIMATORS if "denoised" in name}
 BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),
@@ -59,6 +93,8 @@ FITTING = [
     (estimator, optimizer)
     for estimator, optimizer in itertools.product(ESTIMATORS, OPTIMIZERS)
     if OPTIMIZERS[optimizer]().requires <= ESTIMATORS[estimator]().provides
+    and "denoised"
+    not in estimator  # pictures without structure are noise to a denoiser: tests/unit/test_denoised.py has others
 ]
 
 
@@ -256,7 +292,7 @@ def test_the_control_variate_reduces_the_noise_of_the_image() -> None:
             state, found = image.init(asked, parameters), None
             for step in range(8):
                 parameters = {k: v - 0.02 for k, v in parameters.items()}
-                found, keep = image.estimate(asked, parameters, state, 0, 2, 2, Key(seed, step))
+                found, keep = image.estimate(asked, parameters, state, WholeView(asked, 0), 2, 2, Key(seed, step))
                 state = image.advance(parameters, state, (keep,))
             assert found is not None
             squares.append(np.mean((found.mean() - exact.exact(parameters)) ** 2))

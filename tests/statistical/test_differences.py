@@ -9,7 +9,7 @@ import pytest
 
 import unrender as ur
 from unrender import arrays, trees
-from unrender.gradients.views import gather
+from unrender.gradients.gather import gather
 from unrender.images.base import Beside
 from unrender.images.plain import PlainState
 from unrender.keys import Key

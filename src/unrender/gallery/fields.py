@@ -74,7 +74,7 @@ def _check_loss(owner: str, name: str, value: Any) -> Loss:
         raise InputError(f"{owner}: {name}: {error}") from error
 
 
-LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2 or Huber", "check": _check_loss}
+LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber or Perceptual", "check": _check_loss}
 """The metadata of the field `loss`."""
 
 

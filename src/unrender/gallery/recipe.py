@@ -13,6 +13,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.scene_pair import media
 from unrender.variant import ensure
 
 _LANES = 1 << 21
@@ -55,7 +56,7 @@ class Recipe(Protocol):
 
 
 def cook(name: str, recipe: Recipe) -> Problem:
-    """The problem: truth read off the scene, one view per sensor, references by Mitsuba's own `path` integrator.
+    """The problem: truth read off the scene, one view per sensor, references by Mitsuba's own integrators.
 
     Args:
         name: the problem's.
@@ -74,11 +75,11 @@ def cook(name: str, recipe: Recipe) -> Problem:
 
 
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
-    """A picture by Mitsuba's `path` integrator, in as many passes as memory asks for: (H, W, 3) float32. Unbiased.
+    """A picture by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    Equal arguments give equal pictures.
+    Takes as many passes as memory asks for. Equal arguments give equal pictures.
     """
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+    integrator = mi.load_dict({"type": "volpath" if media(scene) else "path", "max_depth": max_depth})
     width, height = scene.sensors()[sensor].film().crop_size()
     per_pass = max(1, _LANES // int(width * height))
     total, done = np.zeros((int(height), int(width), 3)), 0

@@ -9,20 +9,29 @@ from unrender.gallery import fields
 from unrender.gallery.ajar import Ajar
 from unrender.gallery.boxes import Box2, Box10
 from unrender.gallery.bunny import Bunny
+from unrender.gallery.caustic import Caustic
 from unrender.gallery.chalice import Chalice
 from unrender.gallery.exponential import Exponential
 from unrender.gallery.fields import Option
 from unrender.gallery.glossy_room import GlossyRoom
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.lamp import Lamp
+from unrender.gallery.mirror_trio import MirrorTrio
 from unrender.gallery.mug import Mug
+from unrender.gallery.nerf_volume import NerfVolume
+from unrender.gallery.plain_and_textured import PlainAndTextured
 from unrender.gallery.poster import Poster
 from unrender.gallery.quad import Quad
 from unrender.gallery.recipe import cook
 from unrender.gallery.shadow import Shadow
+from unrender.gallery.smoke import Smoke
 from unrender.gallery.sphere_to_mesh import SphereToMesh
 from unrender.gallery.spiral import Spiral
+from unrender.gallery.sun_glossy import SunGlossy
 from unrender.gallery.sunlit_vase import SunlitVase
+from unrender.gallery.tea import Tea
+from unrender.gallery.three_bodies import ThreeBodies
+from unrender.gallery.two_planets import TwoPlanets
 from unrender.names import did_you_mean
 from unrender.problem.problem import Problem
 
@@ -34,6 +43,11 @@ _RECIPES: dict[str, type] = {
     "spiral": Spiral,
     "ajar": Ajar,
     "chalice": Chalice,
+    "mirror-trio": MirrorTrio,
+    "sun-glossy": SunGlossy,
+    "plain-and-textured": PlainAndTextured,
+    "two-planets": TwoPlanets,
+    "caustic": Caustic,
     "exponential": Exponential,
     "quad": Quad,
     "box2": Box2,
@@ -43,9 +57,13 @@ _RECIPES: dict[str, type] = {
     "bunny": Bunny,
     "poster": Poster,
     "sphere-to-mesh": SphereToMesh,
+    "three-bodies": ThreeBodies,
+    "tea": Tea,
+    "smoke": Smoke,
+    "nerf-volume": NerfVolume,
 }
 
-_OWN = (Exponential, Quad, SphereToMesh)
+_OWN = (Exponential, Quad, SphereToMesh, NerfVolume)
 """Those that make their problem themselves: no renderer, or references of another scene."""
 
 
@@ -83,7 +101,9 @@ def problem(name: str, **options: Any) -> Problem:
         VariantError: Mitsuba cannot run on this machine.
     """
     recipe = fields.fill(name, _recipe(name), options)
-    return recipe.problem(name) if isinstance(recipe, _OWN) else cook(name, recipe)
+    made = recipe.problem(name) if isinstance(recipe, _OWN) else cook(name, recipe)
+    made.origin |= {"gallery": name, "options": options}
+    return made
 
 
 def _recipe(name: str) -> type:

@@ -9,17 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
-from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
 _SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
 """Direction to the sun."""
 _SUN_RADIUS = np.radians(2.5)
-_SKY_ROWS = 128
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class SunlitVase:
                 )
                 for number, a in enumerate(angles)
             },
-            "sky": {"type": "envmap", "bitmap": mi.Bitmap(_sky()), "to_world": mi.ScalarTransform4f()},
+            "sky": skies.environment(_sky()),
             "ground": parts.rectangle((0, 0, 0), (15, 0, 0), (0, 0, -15), {"type": "diffuse", "reflectance": gravel}),
             "vase": meshes.sheet("vase", _vase_points(96, 96), _glaze(self.texture_resolution), closed=True),
         }
@@ -59,20 +57,8 @@ class SunlitVase:
 
 
 def _sky() -> np.ndarray:
-    """A latitude-longitude picture of the sky, the zenith in its first row: (rows, 2 rows, 3) float32 radiance."""
-    rows, columns = _SKY_ROWS, 2 * _SKY_ROWS
-    theta = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
-    phi = 2 * np.pi * (np.arange(columns)[None, :] + 0.5) / columns
-    # Mitsuba's convention: u = atan2(x, -z) / 2 pi, v = acos(y) / pi.
-    direction = np.stack(
-        np.broadcast_arrays(np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)), -1
-    )
-    height = direction[..., 1:2]
-    zenith, horizon, below = np.array([0.12, 0.25, 0.6]), np.array([0.65, 0.7, 0.75]), np.array([0.2, 0.18, 0.15])
-    sky = horizon + (zenith - horizon) * np.clip(height, 0, 1) ** 0.5
-    sky = np.where(height < 0, below, sky)
-    sun = np.arccos(np.clip(direction @ _SUN, -1, 1)) < _SUN_RADIUS
-    return np.where(sun[..., None], np.array([620.0, 560.0, 460.0]), sky).astype(np.float32)
+    """The sky and its sun: see `skies.picture`."""
+    return skies.picture(_SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
 
 
 def _vase_points(rows: int, columns: int) -> np.ndarray:

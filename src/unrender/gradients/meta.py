@@ -9,10 +9,12 @@ from unrender import arrays, checks, trees
 from unrender.arrays import Array
 from unrender.errors import InputError
 from unrender.gradients.estimate import GRADIENT, VARIANCE, Estimate
-from unrender.gradients.views import Gathered, gather
+from unrender.gradients.gather import PIXELS, Gathered, check_pixels, gather
 from unrender.images.base import Beside, ImageEstimator
 from unrender.images.plain import Plain
 from unrender.keys import Key
+from unrender.pixels.all import All
+from unrender.pixels.base import PixelSampler
 from unrender.problem.problem import Problem
 from unrender.rendering.port import Space
 from unrender.statistics import meta
@@ -29,11 +31,13 @@ class MetaState:
         parameters: of the last step; None before the first.
         elements: {key: what is known of each element of its gradient}; empty before the first step.
         image: the image estimator's, in the coupled form.
+        pixels: the pixel sampler's.
     """
 
     parameters: Tree | None
     elements: dict[str, meta.State]
     image: Any
+    pixels: Any = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,7 @@ class MetaEstimator:
         coupled: take the coupled form.
         spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
         image: what the loss sees, in the coupled form; the independent one sees plain renderings.
+        pixels: which pixels a step looks at; F and ΔF of the independent form draw their own. Drawn ones go with plain images.
         space: "path", "primary", or "auto": path space where it carries all parameters.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
@@ -91,6 +96,7 @@ class MetaEstimator:
     centred: bool = False
     decouple: bool = True
     statistics: Literal["shared", "independent"] = "shared"
+    pixels: PixelSampler = field(default_factory=All)
 
     def __post_init__(self):
         for name, coupled, default in (
@@ -119,6 +125,11 @@ class MetaEstimator:
             raise InputError(
                 'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
             )
+        check_pixels("MetaEstimator", self.pixels, self.image)
+        if not isinstance(self.pixels, All) and not isinstance(self.image, Plain):
+            raise InputError(
+                "MetaEstimator: drawn pixels go with plain images; a control variate's snapshot is of another step"
+            )
         if self.image.space is not None and self.space not in ("auto", self.image.space):
             raise InputError(
                 f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'
@@ -132,7 +143,7 @@ class MetaEstimator:
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
         problem.renderer.select(list(parameters), self._space(problem, parameters))
-        return MetaState(None, {}, self.image.init(problem, parameters))
+        return MetaState(None, {}, self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space" and
@@ -148,10 +159,11 @@ class MetaEstimator:
         space = self._space(problem, parameters)
         beside = Beside(previous, space)
         take = self._coupled if self.coupled else self._independent
-        first, second, step = take(problem, parameters, state.image, beside, fresh, key)
+        first, second, step, pixels = take(problem, parameters, state, beside, fresh, key)
         observed, samples = None, step.samples
         if self.statistics == "independent":
-            *observed, more = take(problem, parameters, state.image, beside, fresh, key.fold(_OBSERVED))
+            again = replace(state, pixels=pixels)
+            *observed, more, pixels = take(problem, parameters, again, beside, fresh, key.fold(_OBSERVED))
             samples += more.samples
         rule = meta.update_coupled if self.coupled else meta.update
         found = {
@@ -170,7 +182,7 @@ class MetaEstimator:
             for name in parameters
         }
         gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
-        after = MetaState(parameters, {name: parts[3] for name, parts in found.items()}, step.image)
+        after = MetaState(parameters, {name: parts[3] for name, parts in found.items()}, step.image, pixels)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.told)
         info = {
             "samples": samples,
@@ -191,26 +203,34 @@ class MetaEstimator:
         return "path" if all(known[key].carried for key in parameters) else "primary"
 
     def _independent(
-        self, problem: Problem, parameters: Tree, image: Any, beside: Beside, fresh: bool, key: Key
-    ) -> tuple[Tree, Tree, Gathered]:
-        """F, ΔF from other samples, and what else the step brought."""
+        self, problem: Problem, parameters: Tree, state: MetaState, beside: Beside, fresh: bool, key: Key
+    ) -> tuple[Tree, Tree, Gathered, Any]:
+        """F, ΔF from other samples, what else the step brought, and the pixel sampler's next state."""
         assert self.proportional_spp is not None
         assert self.difference_spp is not None
-        step = gather(problem, parameters, self.image, image, self.proportional_spp, key.fold(_PROPORTIONAL))
+        step, pixels = self._gather(problem, parameters, state, self.proportional_spp, key.fold(_PROPORTIONAL))
         F = problem.precondition(step.gradient)
         if fresh:  # no change to be estimated
-            return F, trees.zeros_like(F), step
-        pair = gather(problem, parameters, self.image, image, self.difference_spp, key.fold(_DIFFERENCE), beside=beside)
+            return F, trees.zeros_like(F), step, pixels
+        again = replace(state, pixels=pixels)
+        pair, pixels = self._gather(problem, parameters, again, self.difference_spp, key.fold(_DIFFERENCE), beside)
         assert pair.previous is not None
         difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
-        return F, difference, replace(step, samples=step.samples + pair.samples)
+        return F, difference, replace(step, samples=step.samples + pair.samples), pixels
 
     def _coupled(
-        self, problem: Problem, parameters: Tree, image: Any, beside: Beside, fresh: bool, key: Key
-    ) -> tuple[Tree, Tree, Gathered]:
-        """F, H of the previous state from the same samples, and what else the step brought."""
+        self, problem: Problem, parameters: Tree, state: MetaState, beside: Beside, fresh: bool, key: Key
+    ) -> tuple[Tree, Tree, Gathered, Any]:
+        """F, H of the previous state from the same samples, and the rest as for `_independent`."""
         del fresh
         assert self.spp is not None
-        step = gather(problem, parameters, self.image, image, self.spp, key, beside=beside)
+        step, pixels = self._gather(problem, parameters, state, self.spp, key, beside)
         assert step.previous is not None
-        return problem.precondition(step.gradient), problem.precondition(step.previous), step
+        return problem.precondition(step.gradient), problem.precondition(step.previous), step, pixels
+
+    def _gather(
+        self, problem: Problem, parameters: Tree, state: MetaState, spp: int, key: Key, beside: Beside | None = None
+    ) -> tuple[Gathered, Any]:
+        pick, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
+        step = gather(problem, parameters, self.image, state.image, spp, key, beside=beside, pick=pick)
+        return step, self.pixels.observe(problem, pixels, step.gradient)

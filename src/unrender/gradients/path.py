@@ -8,20 +8,29 @@ from typing import Any
 from unrender import arrays
 from unrender.errors import InputError
 from unrender.gradients.estimate import GRADIENT, Estimate
-from unrender.gradients.views import crossed_groups, gather
+from unrender.gradients.gather import PIXELS, check_pixels, crossed_groups, gather
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.keys import Key
 from unrender.pixels.all import All
+from unrender.pixels.base import Pick, PixelSampler
 from unrender.problem.problem import Problem
 from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
 class PathGradientState:
-    """The image estimator's state."""
+    """State between steps.
+
+    Attributes:
+        image: the image estimator's.
+        pixels: the pixel sampler's.
+        batches: steps of drawn pixels since the last that looked at whole views.
+    """
 
     image: Any
+    pixels: Any
+    batches: int = 0
 
 
 @dataclass(frozen=True)
@@ -36,16 +45,19 @@ class PathGradient:
     Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image; otherwise biased by the noise of
     the image that the loss sees, which a control variate reduces step by step.
 
+    With drawn pixels (Eq. 4 of the paper of `pixels.Adaptive`) each draw brings its samples, weighted by 1 / (N p): unbiased as the
+    gradient of all pixels is, for whatever probabilities.
+
     Args:
         image: what the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
-        pixels: which pixels a step looks at.
-        spp: samples per pixel and view of the image, >= 1.
+        pixels: which pixels a step looks at: `pixels.All()`, or a number drawn by `Uniform`, `LossProportional` or `Adaptive`.
+        spp: samples per pixel and view of the image, or per drawn pixel, >= 1.
         adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for crossed groups, and for `spp` paths of
             its own where `spp` cannot be cut into groups: 1, and primes above 16.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
-    pixels: All = field(default_factory=All)
+    pixels: PixelSampler = field(default_factory=All)
     spp: int = 4
     adjoint_spp: int | None = None
 
@@ -53,8 +65,7 @@ class PathGradient:
         for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise InputError(f"PathGradient: {name} must be a whole number of at least 1, got {value!r}")
-        if not isinstance(self.pixels, All):
-            raise InputError(f"PathGradient: pixels must be unrender.pixels.All(), got {self.pixels!r}")
+        check_pixels("PathGradient", self.pixels, self.image)
 
     @property
     def provides(self) -> frozenset[str]:
@@ -69,15 +80,22 @@ class PathGradient:
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
         problem.renderer.select(list(parameters), self.image.space)
-        return PathGradientState(self.image.init(problem, parameters))
+        return PathGradientState(self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(
         self, problem: Problem, parameters: Tree, state: PathGradientState, key: Key
     ) -> tuple[Estimate, PathGradientState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, and what the
-        image estimator tells, per view."""
-        step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp)
-        next_state = PathGradientState(step.image)
+        """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and what the
+        image estimator tells, per view that was looked at whole, "pixel_probability" per view where pixels are drawn."""
+        pick, pixels = Pick(None), state.pixels
+        if not self.image.needs_whole_views(parameters, state.image, state.batches):
+            pick, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
+        step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp, pick=pick)
+        pixels = self.pixels.observe(problem, pixels, step.gradient)
+        next_state = PathGradientState(step.image, pixels, state.batches + 1)
+        if pick.draw is None:
+            image = step.image if isinstance(self.pixels, All) else self.image.prepare(problem, step.image)
+            next_state = PathGradientState(image, pixels)
         arrays.evaluate(step.gradient, step.losses, next_state, step.told)
         loss = sum(arrays.number(value) for value in step.losses)
         info = {"samples": step.samples, "images": step.images, **step.told}

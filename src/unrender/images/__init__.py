@@ -1,6 +1,7 @@
 """What the loss sees: the image as rendered, or one that remembers."""
 
+from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 
-__all__ = ["Plain", "RecursiveControlVariate"]
+__all__ = ["Denoised", "Plain", "RecursiveControlVariate"]

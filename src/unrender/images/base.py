@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from unrender import arrays
 from unrender.arrays import Array
 from unrender.keys import Key
+from unrender.problem.frames import Frame
 from unrender.problem.problem import Problem
 from unrender.rendering.port import Space
 from unrender.trees import Tree
@@ -16,31 +17,39 @@ from unrender.trees import Tree
 
 @dataclass(frozen=True)
 class ImageEstimate:
-    """The image of one view at one step.
+    """The image of one frame at one step: of a view, (H, W, 3), or of N drawn pixels, (N, 3).
 
     Attributes:
-        images: (groups, H, W, 3), one estimate per group of samples, made without the other groups' samples.
+        images: (groups, H, W, 3) or (groups, N, 3), one estimate per group of samples, made without the other groups' samples.
         paths: the renderer's own, to replay these samples.
         info: for people, e.g. {"control_weight": array}.
         previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
+        clean: what is done to an image (H, W, 3) before the loss sees it; None for nothing.
     """
 
     images: Array
     paths: Any
     info: Mapping[str, Any] = field(default_factory=dict)
     previous: Array | None = None
+    clean: Callable[[Array], Array] | None = None
 
     def mean(self) -> Array:
-        """The image of all samples together, (H, W, 3)."""
-        return arrays.mean_first(self.images)
+        """The image of all samples together, (H, W, 3) or (N, 3)."""
+        whole = arrays.mean_first(self.images)
+        return whole if self.clean is None else self.clean(whole)
 
     def others(self) -> Array:
-        """For each group, the image of all other groups' samples, (groups, H, W, 3); of its own where it is alone."""
-        return _others(self.images)
+        """For each group, the image of all other groups' samples; of its own where it is alone."""
+        return self._cleaned(_others(self.images))
 
     def previous_others(self) -> Array:
         """`others()` of the previous step's parameters."""
-        return _others(self.previous)
+        return self._cleaned(_others(self.previous))
+
+    def _cleaned(self, images: Array) -> Array:
+        if self.clean is None:
+            return images
+        return arrays.concatenated([arrays.stacked(self.clean(images[group])) for group in range(images.shape[0])])
 
 
 def _others(images: Array) -> Array:
@@ -69,6 +78,11 @@ class ImageEstimator(Protocol):
         """Where samples are shared between two states, or None if they are not."""
         ...
 
+    @property
+    def pixelwise(self) -> bool:
+        """Whether it can estimate drawn pixels without all others."""
+        ...
+
     def init(self, problem: Problem, parameters: Tree) -> Any:
         """The state before the first step."""
         ...
@@ -78,15 +92,23 @@ class ImageEstimator(Protocol):
         problem: Problem,
         parameters: Tree,
         state: Any,
-        view: int,
+        frame: Frame,
         spp: int,
         groups: int,
         key: Key,
         beside: Beside | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """The image of one view, and what is to be kept of it; with `beside`, that of the previous parameters too."""
+        """The image of one frame, and what is to be kept of it; with `beside`, that of the previous parameters too."""
+        ...
+
+    def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
+        """Whether the next step must look at whole views, where `batches` steps of drawn pixels came after the last that did."""
+        ...
+
+    def prepare(self, problem: Problem, state: Any) -> Any:
+        """The state after a step that looked at whole views, made ready for drawn pixels."""
         ...
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:
-        """The state after a step at `parameters`, from what was kept of each view."""
+        """The state after a step at `parameters` that looked at whole views, from what was kept of each."""
         ...

@@ -7,8 +7,9 @@ from typing import Any
 
 from unrender.images.base import Beside, ImageEstimate
 from unrender.keys import Key
+from unrender.problem.frames import Frame
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Shot, Space
+from unrender.rendering.port import Space
 from unrender.trees import Tree
 
 
@@ -26,6 +27,11 @@ class Plain:
         """No samples are shared."""
         return None
 
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
     def init(self, problem: Problem, parameters: Tree) -> PlainState:
         """See `ImageEstimator.init`."""
         del problem, parameters
@@ -36,7 +42,7 @@ class Plain:
         problem: Problem,
         parameters: Tree,
         state: PlainState,
-        view: int,
+        frame: Frame,
         spp: int,
         groups: int,
         key: Key,
@@ -44,12 +50,22 @@ class Plain:
     ) -> tuple[ImageEstimate, None]:
         """See `ImageEstimator.estimate`."""
         del state
-        shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
+        shot = frame.shot(spp, key.uint32(), groups)
         if beside is None:
             rendering = problem.renderer.image(parameters, shot)
         else:
             rendering = problem.renderer.image_pair(parameters, beside.previous, shot, beside.space)
         return ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous), None
+
+    def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
+        """Never."""
+        del parameters, state, batches
+        return False
+
+    def prepare(self, problem: Problem, state: PlainState) -> PlainState:
+        """See `ImageEstimator.prepare`."""
+        del problem
+        return state
 
     def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:
         """See `ImageEstimator.advance`."""

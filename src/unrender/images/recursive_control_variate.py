@@ -8,13 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from unrender import arrays, statistics, trees
+from unrender import arrays, checks, statistics, trees
 from unrender.arrays import Array
 from unrender.errors import InputError
 from unrender.images.base import Beside, ImageEstimate
 from unrender.keys import Key
+from unrender.problem.frames import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Shot, Space
+from unrender.rendering.port import Space
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 from unrender.trees import Tree
@@ -38,16 +39,31 @@ class ViewMemory:
 
 
 @dataclass(frozen=True)
+class Snapshot:
+    """What steps of drawn pixels look up: all views' pixels one behind the other, (P, 3) each.
+
+    Attributes:
+        image: the control variate.
+        weight: that a new sample gives it.
+    """
+
+    image: Array
+    weight: Array
+
+
+@dataclass(frozen=True)
 class RecursiveControlVariateState:
     """State between steps.
 
     Attributes:
-        parameters: of the last step; None before the first.
+        parameters: of the last step that looked at whole views; None before the first.
         views: what is kept of each view; empty before the first step.
+        snapshot: the same for drawn pixels; None where none are drawn.
     """
 
     parameters: Tree | None = None
     views: tuple[ViewMemory, ...] = ()
+    snapshot: Snapshot | None = None
 
 
 @dataclass(frozen=True)
@@ -63,7 +79,12 @@ class RecursiveControlVariate:
             numbers (two traces; any parameter, less correlation).
         alpha: decay of the running means, in [0, 1).
         beta: decay of the running (co)variances, in [0, 1).
+        whole_views: with drawn pixels, a step of whole views comes after that many steps of drawn ones, >= 1.
         update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
+
+    With drawn pixels the control variate is a snapshot, since a pixel that is not drawn is not carried along: a step of whole views
+    brings image and statistics to its parameters, and until the next one the drawn pixels take ⟨F_n⟩ + w (⟨F_s⟩_CV − ⟨F_s⟩_n) against
+    that step s. Whole steps cost what they do: few for large pictures.
 
     The state starts anew when a parameter changes its shape.
 
@@ -80,8 +101,10 @@ class RecursiveControlVariate:
     alpha: float = 0.9
     beta: float = 0.999
     update_before_use: bool = False
+    whole_views: int = 20
 
     def __post_init__(self):
+        checks.whole("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
         if self.space not in ("path", "primary"):
             raise InputError(f'RecursiveControlVariate: space must be "path" or "primary", got {self.space!r}')
         for name in ("alpha", "beta"):
@@ -93,41 +116,61 @@ class RecursiveControlVariate:
         del problem, parameters
         return RecursiveControlVariateState()
 
+    @property
+    def pixelwise(self) -> bool:
+        """True: from a snapshot."""
+        return True
+
+    def needs_whole_views(self, parameters: Tree, state: RecursiveControlVariateState, batches: int) -> bool:
+        """At first, when shapes change, and every so often."""
+        return batches >= self.whole_views or self._fresh(parameters, state)
+
+    def prepare(self, problem: Problem, state: RecursiveControlVariateState) -> RecursiveControlVariateState:
+        """See `ImageEstimator.prepare`."""
+        del problem
+        parts = [(memory.image, self._weight(memory)) for memory in state.views]
+        image, weight = (arrays.concatenated([arrays.rows(part[n]) for part in parts]) for n in range(2))
+        return replace(state, snapshot=Snapshot(image, weight))
+
     def estimate(
         self,
         problem: Problem,
         parameters: Tree,
         state: RecursiveControlVariateState,
-        view: int,
+        frame: Frame,
         spp: int,
         groups: int,
         key: Key,
         beside: Beside | None = None,
-    ) -> tuple[ImageEstimate, ViewMemory]:
+    ) -> tuple[ImageEstimate, ViewMemory | None]:
         """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone.
 
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
         one as far as the two can share it: they differ by F − H.
         """
-        shot = Shot(problem.views[view].sensor, spp, key.uint32(), groups)
-        fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
+        shot = frame.shot(spp, key.uint32(), groups)
+        fresh = self._fresh(parameters, state)
         previous = parameters if fresh or state.parameters is None else state.parameters
         # Two memories that are carried together must be of the same step.
         assert beside is None or all(previous[key] is value for key, value in beside.previous.items())
         rendering = problem.renderer.image_pair(parameters, previous, shot, self.space)
         assert rendering.previous is not None
+        if isinstance(frame, PixelBatch):
+            assert state.snapshot is not None
+            assert not fresh
+            row = problem.references.rows(frame.draw.views, frame.draw.pixels)
+            image, weight = (arrays.gather_rows(x, row) for x in (state.snapshot.image, state.snapshot.weight))
+            images = advance(image, rendering.images, rendering.previous, weight)
+            beside_it = advance(image, rendering.previous, rendering.previous, weight)
+            return ImageEstimate(images, rendering.paths, previous=beside_it), None
+        assert isinstance(frame, WholeView)
         if fresh:
             estimate = ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous)
             return estimate, self._start(estimate.mean())
-        memory = state.views[view]
+        memory = state.views[frame.view]
         F, H = arrays.mean_first(rendering.images), arrays.mean_first(rendering.previous)
         used = self._observe(memory, F, H) if self.update_before_use else memory
-        var_previous, past = welford.covariance(used.previous), memory.relative_variance
-        weight = arrays.where(
-            var_previous > 0,
-            statistics.control_weight(welford.covariance(used.joint), var_previous, past * var_previous),
-            1.0 / (1.0 + past),
-        )
+        past, weight = memory.relative_variance, self._weight(used)
         images = advance(memory.image, rendering.images, rendering.previous, weight)
         seen = used if self.update_before_use else self._observe(memory, F, H)
         var_current, var_previous = welford.covariance(seen.current), welford.covariance(seen.previous)
@@ -151,6 +194,17 @@ class RecursiveControlVariate:
         """See `ImageEstimator.advance`."""
         del state
         return RecursiveControlVariateState(parameters, kept)
+
+    def _fresh(self, parameters: Tree, state: RecursiveControlVariateState) -> bool:
+        return state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
+
+    def _weight(self, memory: ViewMemory) -> Array:
+        var_previous, past = welford.covariance(memory.previous), memory.relative_variance
+        return arrays.where(
+            var_previous > 0,
+            statistics.control_weight(welford.covariance(memory.joint), var_previous, past * var_previous),
+            1.0 / (1.0 + past),
+        )
 
     def _start(self, image: Array) -> ViewMemory:
         """Eq. 7: the first image is its own control variate."""

@@ -1,5 +1,8 @@
 """Which pixels a step looks at."""
 
+from unrender.pixels.adaptive import Adaptive
 from unrender.pixels.all import All
+from unrender.pixels.loss_proportional import LossProportional
+from unrender.pixels.uniform import Uniform
 
-__all__ = ["All"]
+__all__ = ["Adaptive", "All", "LossProportional", "Uniform"]

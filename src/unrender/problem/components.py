@@ -10,7 +10,13 @@ from unrender import losses, preconditioners
 from unrender.errors import InputError
 from unrender.names import did_you_mean
 
-LOSSES: dict[str, type] = {"L1": losses.L1, "L2": losses.L2, "RelativeL2": losses.RelativeL2, "Huber": losses.Huber}
+LOSSES: dict[str, type] = {
+    "L1": losses.L1,
+    "L2": losses.L2,
+    "RelativeL2": losses.RelativeL2,
+    "Huber": losses.Huber,
+    "Perceptual": losses.Perceptual,
+}
 PRECONDITIONERS: dict[str, type] = {"LargeSteps": preconditioners.LargeSteps}
 
 

@@ -3,7 +3,7 @@
     name = "wall"
     scene = "room.xml"
     max_depth = 6
-    loss = "L1"                                # or { type = "Huber", delta = 0.1 }
+    loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors" }
 
     [[parameters]]
     key = "wall.bsdf.reflectance.data"
@@ -90,7 +90,9 @@ def read(path: str | Path) -> Problem:
     text = files.read_text(file).replace("\r\n", "\n")
     try:
         model = _Problem.model_validate(_parse(file, text))
-        return _build(model, file)
+        problem = _build(model, file)
+        problem.origin["file"] = str(file.resolve())
+        return problem
     except pydantic.ValidationError as error:
         # An unknown field first: where its name is misspelt, the right one is missing too.
         details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
@@ -120,12 +122,14 @@ def _parse(file: Path, text: str) -> dict[str, Any]:
         raise InputError(where) from error
     except RecursionError as error:
         raise InputError(f"{file}: not valid TOML: nested too deeply") from error
+    except ValueError as error:
+        raise InputError(f"{file}: not valid TOML: {str(error)[:200]}") from error
 
 
 def _build(model: _Problem, file: Path) -> Problem:
     folder = file.parent
     try:
-        loss = components.make(components.LOSSES, model.loss)
+        loss = components.make(components.LOSSES, _located(model.loss, folder))
     except InputError as error:
         raise FieldError(("loss",), str(error)) from error
     return Problem(
@@ -150,6 +154,13 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
     return Parameter(model.key, _value(model.initial, folder), model.bounds, model.learning_rate, preconditioner)
+
+
+def _located(description: str | dict[str, Any], folder: Path) -> str | dict[str, Any]:
+    """A component's description, its file of weights relative to the problem's."""
+    if isinstance(description, dict) and isinstance(description.get("weights"), str):
+        return {**description, "weights": str(folder / description["weights"])}
+    return description
 
 
 def _value(value: Any, folder: Path) -> Any:

@@ -1,10 +1,11 @@
-"""In which line of a TOML file a field stands. (`tomllib` does not tell.)"""
+"""Reading TOML, and in which line of it a field stands. (`tomllib` does not tell.)"""
 
 from __future__ import annotations
 
 import sys
 from typing import Any
 
+from unrender.errors import InputError
 from unrender.problem.field import Place
 
 if sys.version_info >= (3, 11):
@@ -13,6 +14,16 @@ else:  # pragma: no cover
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 _LONGEST_STATEMENT = 2000
+
+
+def parse(text: str, where: str) -> dict[str, Any]:
+    """What TOML text says. Raises `InputError`."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{where}: not valid TOML: nested too deeply") from error
+    except ValueError as error:  # tomllib's own among them, and those of numbers without end
+        raise InputError(f"{where}: not valid TOML: {str(error)[:200]}") from error
 
 
 def find(text: str, place: Place) -> int:

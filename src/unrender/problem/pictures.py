@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from unrender import variant
+from unrender import files, variant
 from unrender.errors import InputError
+from unrender.problem import picture_size
 
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name endings that `read` knows."""
@@ -49,10 +50,10 @@ def read(source: Any, linearise: bool = True) -> Picture:
             raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
         try:
             numpy_file = path.suffix.lower() == ".npy"
-            picture = _from_array(_read_npy(path), linearise) if numpy_file else _read(path, linearise)
+            picture = _from_array(files.read_array(path), linearise) if numpy_file else _read(path, linearise)
             _check_finite(picture.values)
         except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
         return Picture(picture.values, f"{path.name}: {picture.notice}" if picture.notice else "")
     try:
         array = np.asarray(source)
@@ -83,17 +84,8 @@ def luminance(values: np.ndarray) -> np.ndarray:
     return (values @ np.array([0.212671, 0.715160, 0.072169], np.float32))[..., None]
 
 
-def _read_npy(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"not a readable NumPy array: {_one_line(error)}") from error
-    if not isinstance(array, np.ndarray):
-        raise InputError("not a single NumPy array")
-    return array
-
-
 def _read(path: Path, linearise: bool) -> Picture:
+    picture_size.check(path)
     variant.ensure()
     import mitsuba as mi
 

@@ -16,9 +16,10 @@ from unrender.errors import InputError
 from unrender.losses import L2, Loss
 from unrender.names import did_you_mean
 from unrender.preconditioners.base import Preconditioner
-from unrender.problem import pictures, values
+from unrender.problem import pictures, scene_files, values
 from unrender.problem.field import FieldError
 from unrender.problem.parameter import Parameter
+from unrender.problem.references import References
 from unrender.problem.view import View
 from unrender.rendering.port import ParameterInfo, Renderer
 from unrender.trees import Tree
@@ -58,10 +59,14 @@ class Problem:
         parameters: tuple of `Parameter`, as given.
         views: tuple of `View`, their reference a float32 array (H, W, 3), their mask (H, W) or None.
         renderer: what renders the scene.
+        given_views: tuple of `View`, as given.
+        origin: where it came from, to make it again: {"scene": path of the XML}, with "file", the path of the problem file, where there is
+            one; {"gallery": name, "options": {...}}; empty where only the program that made it can make it again.
         notices: one line for each thing done to the input that its giver should know of.
         bounds: {key: (low, high)}, the parameter's own or the physical range that the renderer knows; None is open.
         learning_rates: {key: rate} of the parameters that have their own.
         preconditioners: {key: preconditioner} of the parameters that have one.
+        references: the views' pictures, looked up pixel by pixel.
         truth: {key: array} of the parameters' shapes.
 
     Raises:
@@ -86,7 +91,8 @@ class Problem:
             raise FieldError(("loss",), f"expected one of unrender.losses, such as L2(), got {self.loss!r}")
         self.max_depth = max_depth
         self.parameters = _sequence(parameters, Parameter, "parameters")
-        given_views = _sequence(views, View, "views")
+        self.given_views = _sequence(views, View, "views")
+        self.origin: dict[str, Any] = {"scene": str(Path(scene).resolve())} if isinstance(scene, (str, Path)) else {}
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
         self.notices: list[str] = []
         self.renderer: Renderer = _open(scene, max_depth)
@@ -98,8 +104,9 @@ class Problem:
         self._initial: dict[str, np.ndarray] = {}
         for index, parameter in enumerate(self.parameters):
             self._take_parameter(index, parameter, known)
-        self.views = tuple(self._take_view(index, view) for index, view in enumerate(given_views))
+        self.views = tuple(self._take_view(index, view) for index, view in enumerate(self.given_views))
         self.truth = {key: self._take_truth(key, value) for key, value in (truth or {}).items()}
+        self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
 
@@ -131,20 +138,28 @@ class Problem:
 
     def loss_value(self, view: int, image: Array) -> Array:
         """The view's share of the loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
-        values, mask = self.loss.value(image, self.reference(view)), self.mask(view)
-        return arrays.mean(values if mask is None else values * mask) * self.views[view].weight
+        return arrays.mean(self._values(image, self.reference(view), self.mask(view))) * self.views[view].weight
 
     def loss_values(self, view: int, images: Array) -> Array:
         """`loss_value` of each of many images (B, H, W, 3): (B,), lazy."""
-        reference, mask = self.reference(view), self.mask(view)
-        values = self.loss.value(images, arrays.stacked(reference))
-        return arrays.mean_rest(values if mask is None else values * arrays.stacked(mask)) * self.views[view].weight
+        reference, mask = arrays.stacked(self.reference(view)), self.mask(view)
+        values = self._values(images, reference, None if mask is None else arrays.stacked(mask))
+        return arrays.mean_rest(values) * self.views[view].weight
 
     def loss_derivative(self, view: int, image: Array) -> Array:
         """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
-        slope, mask = self.loss.derivative(image, self.reference(view)), self.mask(view)
-        factor = self.views[view].weight / math.prod(arrays.shape(self.reference(view)))
+        reference, mask = self.reference(view), self.mask(view)
+        slope = self.loss.derivative(self._through(image, reference, mask), reference)
+        factor = self.views[view].weight / math.prod(arrays.shape(reference))
         return (slope if mask is None else slope * mask) * factor
+
+    def _values(self, image: Array, reference: Array, mask: Array | None) -> Array:
+        values = self.loss.value(self._through(image, reference, mask), reference)
+        return values if mask is None or not self.loss.pixelwise else values * mask
+
+    def _through(self, image: Array, reference: Array, mask: Array | None) -> Array:
+        """What a loss sees: where its pixels count for themselves, the image; else the reference where the mask is 0."""
+        return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
 
     def precondition(self, tree: Tree) -> Tree:
         """S x for each parameter that has a preconditioner S, x for the others."""
@@ -263,6 +278,11 @@ def _open(scene: Any, max_depth: int) -> Renderer:
         raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
     from unrender.variant import ensure
 
+    try:
+        if isinstance(scene, (str, Path)) and Path(scene).is_file() and Path(scene).suffix.lower() == ".xml":
+            scene_files.of(Path(scene))  # refuses what Mitsuba would include from elsewhere
+    except InputError as error:
+        raise FieldError(("scene",), str(error).removeprefix("scene ")) from error
     ensure()
     from unrender.rendering.mitsuba_renderer import MitsubaRenderer
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender import files
 from unrender.errors import InputError
 from unrender.problem import pictures
 
@@ -43,10 +44,7 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
 def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     if Path(path).suffix.lower() == ".npy" and Path(path).is_file():
-        try:
-            array = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path}: not a readable NumPy array") from error
+        array = files.read_array(Path(path))
         try:
             return fill(array, shape)
         except InputError as error:

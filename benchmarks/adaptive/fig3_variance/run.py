@@ -1,0 +1,116 @@
+"""Variance of the gradient of one parameter, the roughness of a mirror, by how pixels are drawn (Fig. 3 of the paper).
+
+    python benchmarks/adaptive/fig3_variance/run.py [--runs 1024] [--count 512] [--resolution 64]
+
+`mirror-trio` at its start, L2. Every scheme traces as many paths a step: `count` pixels with two paths each (image and adjoint,
+crossed); all pixels at once, at two paths each, has its variance scaled to that budget. The schemes that estimate probabilities do so
+once, from `--samples` paths, before the runs; these are left out, as the paper leaves them. Draws independent of one another, as in the
+paper, and stratified ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from common import read, write
+from schemes import SCHEMES, pixels
+
+import unrender as ur
+from unrender.gradients.path import PathGradient
+from unrender.keys import Key
+
+HERE = Path(__file__).resolve().parent
+ONE_LEVEL = "adaptive, one level"
+
+
+def gradients(problem: ur.Problem, estimator: PathGradient, runs: int) -> tuple[np.ndarray, int, dict[int, np.ndarray]]:
+    """(runs, n) independent estimates at the start, paths of one, and the probabilities that served them."""
+    at = problem.initial()
+    state = estimator.init(problem, at)
+    first, state = estimator.estimate(problem, at, state, Key(0))
+    rows, samples = [], 0
+    for run in range(runs):
+        found, state = estimator.estimate(problem, at, state, Key(1, run))
+        rows.append(np.concatenate([np.array(g).ravel() for g in found.gradient.values()]))
+        samples = found.info["samples"]
+    return np.array(rows), samples, first.info.get("pixel_probability", {})
+
+
+def spread(rows: np.ndarray) -> tuple[float, float]:
+    """The variance summed over parameters, and its standard error, from four parts."""
+    parts = [np.var(part, axis=0, ddof=1).sum() for part in np.array_split(rows, 4)]
+    return float(np.var(rows, axis=0, ddof=1).sum()), float(np.std(parts, ddof=1) / 2)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=1024)
+    parser.add_argument("--count", type=int, default=512)
+    parser.add_argument("--samples", type=int, default=1 << 15)
+    parser.add_argument("--resolution", type=int, default=64)
+    asked = parser.parse_args()
+    ur.use()
+    problem = ur.gallery.problem("mirror-trio", resolution=asked.resolution)
+    rows, samples, _ = gradients(problem, PathGradient(spp=2), asked.runs)
+    budget = 2 * asked.count
+    whole, error = spread(rows)
+    exact = rows.mean(axis=0)
+    found: dict[str, Any] = {"all": {"variance": whole * samples / budget, "error": error * samples / budget}}
+    maps = {}
+    for stratified in (False, True):
+        for label, levels in (*((scheme, {}) for scheme in SCHEMES), (ONE_LEVEL, {"levels": 0})):
+            scheme = "adaptive" if label == ONE_LEVEL else label
+            options: dict[str, Any] = {"stratified": stratified, "samples": asked.samples, "refresh": 10 * asked.runs}
+            rows, samples, probability = gradients(
+                problem, PathGradient(pixels=pixels(scheme, asked.count, **options, **levels), spp=2), asked.runs
+            )
+            assert samples == budget
+            variance, error = spread(rows)
+            name = f"{label}, stratified" if stratified else label
+            z = (rows.mean(axis=0) - exact) / np.sqrt(np.var(rows, axis=0, ddof=1) / asked.runs)
+            found[name] = {"variance": variance, "error": error, "z": float(np.abs(z).max())}
+            if probability:
+                maps[name] = probability[0]
+            print(name, found[name], flush=True)
+    ratios = {
+        f"{other}{end} / {ours}{end}": found[other + end]["variance"] / found[ours + end]["variance"]
+        for end in ("", ", stratified")
+        for ours in ("adaptive", ONE_LEVEL)
+        for other in ("uniform", "loss")
+    }
+    ratios["all / adaptive"] = found["all"]["variance"] / found["adaptive"]["variance"]
+    print(ratios)
+    np.savez_compressed(HERE / "maps.npz", reference=np.asarray(problem.views[0].reference), **maps)
+    write(HERE, {"settings": vars(asked), "schemes": found, "ratios": ratios})
+    plot(read(HERE))
+
+
+def plot(results: dict[str, Any]) -> None:
+    """The picture, where the schemes look, and what it brings."""
+    maps = np.load(HERE / "maps.npz")
+    figure, axes = plt.subplots(1, 4, figsize=(14, 3.6), layout="constrained")
+    axes[0].imshow(np.clip(maps["reference"], 0, 1) ** (1 / 2.2))
+    axes[0].set_title("reference")
+    for axis, name in zip(axes[1:3], ("loss", "adaptive"), strict=True):
+        shown = axis.imshow(maps[name], cmap="magma", norm="log", vmin=0.1)
+        axis.set_title(f"probability over uniform: {name}")
+        figure.colorbar(shown, ax=axis)
+    for axis in axes[:3]:
+        axis.axis("off")
+    entries = results["schemes"]
+    axes[3].barh(list(entries), [e["variance"] for e in entries.values()], xerr=[e["error"] for e in entries.values()])
+    axes[3].set(xscale="log", xlabel="variance of dL/d(roughness), equal paths")
+    figure.savefig(HERE / "figure.png", dpi=110)
+    print(f"wrote {HERE / 'figure.png'}")
+
+
+if __name__ == "__main__":
+    main()

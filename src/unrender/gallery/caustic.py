@@ -1,0 +1,98 @@
+"""`caustic`: the tiles of a floor under two lamps whose light comes out through balls of glass.
+
+Where the adaptive sampling of pixels fails (its Fig. 7). Emitter samples are lost at the glass, a path finds a lamp by chance and is bright
+when it does: a few samples per pixel say next to nothing of where gradients are large or noisy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from unrender.gallery import fields, meshes, parts, textures
+from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
+from unrender.problem.parameter import Parameter
+
+_RADIUS, _HEIGHT = 0.34, 0.85
+"""Of the balls, and of their middles above the floor."""
+
+_LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75, 0.9, 1.0))}
+"""x and z of their middles, and tint."""
+
+
+@dataclass(frozen=True)
+class Caustic:
+    """The texture of a floor that two lamps light through balls of glass, in caustics.
+
+    One view; one unknown reflectance (texture_resolution², 3), from grey, with LargeSteps. Paths of at least 4 segments reach the lamps,
+    few of those that set out; a panel that can be sampled lights the whole floor a little. What the gradient rests on are samples that
+    come seldom: the fewer there are of each pixel in a step, the smaller steps it takes.
+    """
+
+    resolution: int = fields.resolution(64)
+    texture_resolution: int = fields.texture_resolution(32)
+    reference_spp: int = fields.reference_spp(1024)
+    max_depth: int = fields.max_depth(5, at_least=4)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The floor: x in [-1.3, 1.3], z in [-0.9, 0.9] at y = 0; the lamps' tubes reach from their balls' equators up, out of sight."""
+        tiles = {"type": "diffuse", "reflectance": textures.bitmap(_mosaic(self.texture_resolution))}
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 1.8, 2.5), (0, 0.3, 0.0), 46.0, self.resolution),
+            "floor": parts.rectangle((0, 0, 0), (1.3, 0, 0), (0, 0, -0.9), tiles),
+            "around": parts.rectangle((0, -0.01, 0), (9, 0, 0), (0, 0, -9), parts.diffuse(0.15)),
+            "panel": parts.rectangle(
+                (0, 3.0, 1.5), (0.6, 0, 0), (0, 0, 0.6), parts.diffuse(0.0), emitter=parts.light(7.0, 8.0, 9.5)
+            ),
+            **{
+                f"{name}_{part}": piece
+                for name, (x, z, tint) in _LAMPS.items()
+                for part, piece in _lamp(np.array([x, _HEIGHT, z]), tint).items()
+            },
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The texture, grey at first."""
+        return (Parameter("floor.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(1.0)),)
+
+
+def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any]:
+    """A disc that shines down a black tube, which a ball of glass closes: all its light passes the glass."""
+    tube, length, disc = 1.01 * _RADIUS, 0.6, 0.3
+    points = meshes.lathe(np.full(2, tube), np.array([0, length]), 48) + middle
+    down = mi.ScalarTransform4f().translate((middle + [0, length, 0]).tolist()).rotate([1, 0, 0], 90)
+    return {
+        "ball": {
+            "type": "sphere",
+            "center": middle.tolist(),
+            "radius": _RADIUS,
+            "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+        },
+        "tube": meshes.sheet("tube", points, parts.twosided(parts.diffuse(0.05)), closed=True),
+        "lid": {
+            "type": "disk",
+            "to_world": down @ mi.ScalarTransform4f().translate([0, 0, -0.01]).scale(tube),
+            "bsdf": parts.diffuse(0.0),
+        },
+        "light": {
+            "type": "disk",
+            "to_world": down.scale(disc),
+            "bsdf": parts.diffuse(0.0),
+            "emitter": parts.light(*(11.0 * value for value in tint)),
+        },
+    }
+
+
+def _mosaic(resolution: int) -> np.ndarray:
+    """Rings of light and dark tiles in four colours: (resolution, resolution, 3)."""
+    u, v = textures.grid(resolution)
+    colours = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
+    x, y = np.floor(8 * u) - 3.5, np.floor(8 * v) - 3.5
+    tile = colours[(np.maximum(np.abs(x), np.abs(y)) + 2 * (np.abs(x) == np.abs(y))).astype(int) % 4]
+    return (tile * np.where((x + y) % 2 == 0, 1.1, 0.75)[..., None]).astype(np.float32)

@@ -1,0 +1,137 @@
+"""`two-planets`: the textures of two planets, one of them in a glass ball, from pictures all around them.
+
+The exchange of two planets' textures of the adaptive sampling of pixels (its Fig. 8). Light reaches the enclosed planet through two
+refractions and no emitter can be sampled from it: its pixels are many times as noisy as the other's, at the same derivative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.gallery import fields, meshes, parts, skies, textures
+from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
+from unrender.problem.parameter import Parameter
+
+_PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
+"""Radii of the planets and of the two sides of the glass."""
+
+_APART = 1.05
+"""Distance of each planet from the middle."""
+
+_DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
+"""Of zenith, horizon and nadir."""
+
+_SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
+
+
+@dataclass(frozen=True)
+class TwoPlanets:
+    """The textures of two planets, one within glass, each starting with the other's.
+
+    Many views; two unknown reflectances of texture_resolution² texels, with LargeSteps. Paths to the enclosed planet and on to the light
+    have at least 6 segments.
+    """
+
+    resolution: int = fields.resolution(48)
+    texture_resolution: int = fields.texture_resolution(32)
+    views: int = fields.whole(16, "cameras, around the planets, by turns lower and higher", at_least=1, at_most=32)
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(8, at_least=6)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The planets: at x = -1.05 the blue one, free, at x = 1.05 the red one, enclosed; nothing else but the sky."""
+        angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
+        heights = np.where(np.arange(self.views) % 2 == 0, 1.6, -0.5)
+        return {
+            "type": "scene",
+            **{
+                f"camera_{number}": parts.camera(
+                    (6.2 * np.sin(angle), height, 6.2 * np.cos(angle)), (0, 0, 0), 41.0, self.resolution
+                )
+                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
+            },
+            "sky": skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK)),
+            "free": _ball("free", -_APART, blue(self.texture_resolution)),
+            "enclosed": _ball("enclosed", _APART, red(self.texture_resolution)),
+            "glass": _shell(_OUTER, 1.5, 1.0),
+            "hollow": _shell(_INNER, 1.0, 1.5),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The textures, exchanged at first."""
+        smooth = LargeSteps(1.0)
+        return (
+            Parameter("free.bsdf.reflectance.data", initial=red(self.texture_resolution), preconditioner=smooth),
+            Parameter("enclosed.bsdf.reflectance.data", initial=blue(self.texture_resolution), preconditioner=smooth),
+        )
+
+
+def _ball(name: str, x: float, texture: np.ndarray) -> Any:
+    points = meshes.ellipsoid(_PLANET * np.eye(3), np.array([x, 0.0, 0.0]), 48, 96)
+    return meshes.sheet(name, points, {"type": "diffuse", "reflectance": textures.bitmap(texture)}, closed=True)
+
+
+def _shell(radius: float, inside: float, outside: float) -> dict[str, Any]:
+    """One side of the glass, with the indices of refraction there."""
+    return {
+        "type": "sphere",
+        "center": [_APART, 0.0, 0.0],
+        "radius": radius,
+        "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside},
+    }
+
+
+def blue(resolution: int) -> np.ndarray:
+    """Oceans, continents from green to brown, ice at the poles, clouds: (resolution, resolution, 3) float32, v = 1 first."""
+    x, land = _directions(resolution), _noise(resolution, 3, (1.6, 3.2, 6.0))
+    cloud = textures.ramp(_noise(resolution, 8, (2.5, 5.0, 7.0)), 0.35, 1.0)
+    deep, shelf, green, brown, ice = (
+        np.array(c) for c in ([0.05, 0.1, 0.4], [0.08, 0.3, 0.5], [0.12, 0.35, 0.08], [0.5, 0.36, 0.18], [0.85] * 3)
+    )
+    sea = _mix(deep, shelf, textures.ramp(land, -0.5, 0.1))
+    ground = _mix(green, brown, textures.ramp(land, 0.25, 0.9))
+    surface = _mix(sea, ground, textures.ramp(land, 0.08, 0.2))
+    surface = _mix(surface, ice, textures.ramp(np.abs(x[..., 1]) + 0.06 * land, 0.8, 0.88))
+    return _mix(surface, np.array([0.85] * 3), 0.8 * cloud).astype(np.float32)
+
+
+def red(resolution: int) -> np.ndarray:
+    """Rust with dark plains, craters and one white pole: (resolution, resolution, 3) float32, v = 1 first."""
+    x, rough = _directions(resolution), _noise(resolution, 21, (2.0, 4.0, 8.0))
+    dust, rust, dark, ice = (np.array(c) for c in ([0.75, 0.42, 0.2], [0.55, 0.2, 0.08], [0.2, 0.08, 0.06], [0.85] * 3))
+    surface = _mix(rust, dust, textures.ramp(rough, -0.6, 0.8))
+    surface = _mix(surface, dark, textures.ramp(_noise(resolution, 34, (1.5, 3.0)), 0.2, 0.7))
+    rng = np.random.default_rng(55)
+    for centre in rng.normal(size=(14, 3)):
+        distance = np.arccos(np.clip(x @ (centre / np.linalg.norm(centre)), -1, 1)) / rng.uniform(0.12, 0.3)
+        surface = _mix(surface, dust, 0.8 * np.exp(-(((distance - 1) / 0.25) ** 2)))
+        surface = _mix(surface, dark, 0.7 * (1 - textures.ramp(distance, 0.6, 0.95)))
+    return _mix(surface, ice, textures.ramp(x[..., 1] + 0.05 * rough, 0.82, 0.9)).astype(np.float32)
+
+
+def _directions(resolution: int) -> np.ndarray:
+    """Where on the unit sphere each texel lies: (resolution, resolution, 3), the north pole's row first."""
+    u, v = textures.grid(resolution)
+    longitude, latitude = 2 * np.pi * (u - 0.5), np.pi * (0.5 - v)
+    return np.stack(
+        [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], axis=-1
+    )
+
+
+def _noise(resolution: int, seed: int, frequencies: tuple[float, ...]) -> np.ndarray:
+    """Waves through the sphere in directions by chance, without a seam: (resolution, resolution), of variance 1 or so."""
+    rng, x = np.random.default_rng(seed), _directions(resolution)
+    total = np.zeros(x.shape[:2])
+    for octave, frequency in enumerate(frequencies):
+        for wave in rng.normal(size=(8, 3)):
+            total += 0.7**octave * np.sin(x @ (frequency * wave) + rng.uniform(0, 2 * np.pi)) / 2
+    return total / np.sqrt(sum(0.49**octave for octave in range(len(frequencies))))
+
+
+def _mix(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return low + (high - low) * share[..., None]

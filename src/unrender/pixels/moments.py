@@ -1,0 +1,142 @@
+"""What pixels bring to the gradient's variance, estimated from few paths on cells of pixels (Stage 1 of the method's algorithm)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender import arrays, trees
+from unrender.arrays import Array
+from unrender.keys import Key
+from unrender.pixels.cells import Cells, Table
+from unrender.problem.frames import PixelBatch
+from unrender.problem.problem import Problem
+from unrender.trees import Tree
+
+ROUNDS = 16
+"""Sign patterns of an estimate at most: the squares of single derivatives are what is left when their products average out."""
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """What a few paths in each cell tell; every map (cells, 3), float64, means over the cell's pixels.
+
+    Attributes:
+        sizes: per level, E|∂L/∂I|.
+        squares: per level, E[(∂L/∂I)²].
+        moments: Σ_k E[(∂I/∂θ_k)²]; None where not asked for.
+        samples: paths traced.
+    """
+
+    sizes: tuple[np.ndarray, ...]
+    squares: tuple[np.ndarray, ...]
+    moments: np.ndarray | None
+    samples: int
+
+
+def reference_means(problem: Problem, cells: Cells) -> np.ndarray:
+    """The mean reference of each cell, float32 (cells, 3)."""
+    found = []
+    for view, grid in zip(problem.views, cells.grids, strict=True):
+        picture = np.asarray(view.reference)
+        rows, columns = np.arange(grid.rows) * grid.side, np.arange(grid.columns) * grid.side
+        sums = np.add.reduceat(np.add.reduceat(picture, rows, axis=0), columns, axis=1)
+        sizes = np.outer(
+            np.diff([*rows, picture.shape[0]]),
+            np.diff([*columns, picture.shape[1]]),
+        )
+        found.append(sums / sizes[..., None])
+    return cells.join(found).astype(np.float32)
+
+
+def look(
+    problem: Problem,
+    parameters: Tree,
+    cells: Cells,
+    spots: Table,
+    spp: int,
+    key: Key,
+    references: list[Array],
+    scales: Tree,
+) -> Slopes:
+    """Trace `spp` paths in each cell, each through a pixel of its own.
+
+    Args:
+        problem, parameters: where.
+        cells: of all views.
+        spots: a table of these cells.
+        spp: paths per cell, >= 1.
+        key: of the random numbers.
+        references: per level from 1 on, what the cell's paths are compared with there, (cells, 3); at level 0 it is the pixel's own.
+        scales: of the tangents, in the coordinates of the descent; empty to carry none. They are carried in up to `ROUNDS` rounds, each
+            with signs of its own, since all paths of a launch share them.
+    """
+    rounds = max(n for n in range(1, min(spp, ROUNDS) + 1) if spp % n == 0) if scales else 1
+    parts = [
+        _round(problem, parameters, spots, spp // rounds, key.fold(index), references, scales)
+        for index in range(rounds)
+    ]
+
+    def means(index: int, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        values = [of(part[index].astype(np.float64)).reshape(len(cells.views), -1, 3).mean(axis=1) for part in parts]
+        return np.mean(values, axis=0)
+
+    levels = range(1 + len(references))
+    return Slopes(
+        tuple(means(level, np.abs) for level in levels),
+        tuple(means(level, np.square) for level in levels),
+        means(-1, np.asarray) if scales else None,
+        len(cells.views) * spp * (2 if scales else 1),
+    )
+
+
+def _round(
+    problem: Problem,
+    parameters: Tree,
+    spots: Table,
+    spp: int,
+    key: Key,
+    references: list[Array],
+    scales: Tree,
+) -> list[np.ndarray]:
+    """Per path (cells * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents."""
+    batch = PixelBatch(problem, spots.one_of_each(spp, key.fold(0)))
+    rendering = problem.renderer.image(parameters, batch.shot(1, key.fold(1).uint32()))
+    image = rendering.images[0]
+    _, factor = batch.targets
+    found = [batch.loss_derivative(image)]
+    for reference in references:
+        own = arrays.gather_rows(reference, arrays.count_up(image, batch.pixels) // spp)
+        found.append(problem.loss.derivative(image, own) * factor)
+    if scales:
+        signs = random_signs(parameters, key.fold(2))
+        tangents = problem.precondition(
+            {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
+        )
+        found.append(problem.renderer.tangent_moment(parameters, rendering.paths, tangents))
+    arrays.evaluate(found)
+    return [arrays.numpy(x) for x in found]
+
+
+def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
+    """±1 for every element of every parameter, all independent."""
+    rng = np.random.default_rng(key.uint32())
+    return {name: rng.choice(np.array([-1.0, 1.0]), size=shape) for name, shape in trees.shapes(like).items()}
+
+
+def scales(parameters: Tree, energy: Tree) -> Tree:
+    """What an element's derivative is multiplied by: one, or one over the root of its mean squared gradient where that is known.
+
+    Elements that hardly any path has met yet do not count as much as they might: a hundredth of the mean energy of their parameter is
+    added.
+    """
+    if not energy or trees.shapes(energy) != trees.shapes(parameters):
+        return trees.map(lambda x: x * 0.0 + 1.0, parameters)
+
+    def scale(x: Array) -> Array:
+        floor = arrays.mean(x) * 0.01 + 1e-30
+        return 1.0 / arrays.sqrt(x + floor)
+
+    return trees.map(scale, energy)

@@ -1,0 +1,200 @@
+"""Probabilities that follow the descent: estimated anew from few paths every so many steps, cleaned, mixed with equal ones."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from unrender import checks, denoising, trees
+from unrender.errors import InputError
+from unrender.keys import Key
+from unrender.pixels import moments
+from unrender.pixels.base import Pick, check_loss
+from unrender.pixels.cells import Cells, Table, cut
+from unrender.problem.problem import Problem
+from unrender.trees import Tree
+
+MapDenoiser = Literal["auto", "oidn", "optix", "variation", "none"]
+PATHS_PER_CELL = 2
+_MARGIN = 4
+"""Cells between maps that are denoised together."""
+
+_FEWEST_PATHS = 4096
+"""Fewer do not tell where in the pictures things are."""
+
+_OBSERVED, _DECAY = 4, 0.9
+"""Every how many steps the gradient's squares are looked at, and how much of what was seen stays."""
+
+_MEMORY = 0.5
+"""What a refresh keeps of the last one's maps: the scene changes little in between, and noise averages out."""
+
+Maps = tuple[np.ndarray, ...]
+"""Of each cell and channel, (cells, 3) each."""
+
+
+Clean = Callable[[np.ndarray], np.ndarray]
+"""A map without its noise."""
+
+
+@dataclass(frozen=True)
+class RefreshedState:
+    """State between steps.
+
+    Attributes:
+        age: draws since the maps were made.
+        maps: what the probabilities are made of; empty before the first draw.
+        spots: a table of all cells, equally likely per pixel.
+        table: of the draws; `spots` before the first.
+        shares: how likely a pixel of each cell is, relative to equal probabilities, (cells,).
+        references: mean references of the cells, (cells, 3).
+        energy: mean square of each element of the gradient, in the coordinates of the descent; empty where it was not observed.
+    """
+
+    age: int
+    maps: Maps
+    spots: Table
+    table: Table
+    shares: np.ndarray
+    references: np.ndarray
+    energy: Tree = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Refreshing:
+    """How a scheme keeps its probabilities.
+
+    Attributes:
+        owner: for messages.
+        count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.
+        levels: coarser levels that the loss is looked at on.
+        moments: whether the derivatives of pixels are looked at.
+        make: from what was seen to maps.
+        density: from cells, maps and what cleans a map, to what a pixel's probability is proportional to, (cells,), >= 0.
+    """
+
+    owner: str
+    count: int
+    refresh: int
+    samples: int | None
+    uniform: float
+    stratified: bool
+    denoiser: MapDenoiser
+    levels: int
+    moments: bool
+    make: Callable[[moments.Slopes], Maps]
+    density: Callable[[Cells, Maps, Clean], np.ndarray]
+
+    def check(self) -> None:
+        """Raise `InputError` for options that make no sense."""
+        for name, value in (("count", self.count), ("refresh", self.refresh)):
+            checks.whole(self.owner, name, value, at_least=1)
+        checks.whole(self.owner, "levels", self.levels, at_least=0)
+        if self.samples is not None:
+            checks.whole(self.owner, "samples", self.samples, at_least=1)
+        if not checks.number(self.owner, "uniform", self.uniform, above=0.0) <= 1:
+            raise InputError(f"{self.owner}: uniform must be a share in (0, 1], got {self.uniform!r}")
+        if self.denoiser not in ("auto", "oidn", "optix", "variation", "none"):
+            raise InputError(
+                f"{self.owner}: denoiser must be auto, oidn, optix, variation or none, got {self.denoiser!r}"
+            )
+
+    def init(self, problem: Problem) -> RefreshedState:
+        """See `PixelSampler.init`."""
+        check_loss(problem)
+        cells = self._cells(problem)
+        spots = Table.of(cells, cells.sizes, problem.renderer.array)
+        shares = np.ones(len(cells.views))
+        return RefreshedState(0, (), spots, spots, shares, moments.reference_means(problem, cells))
+
+    def draw(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[Pick, RefreshedState]:
+        """See `PixelSampler.draw`."""
+        traced = 0
+        if not state.maps or state.age >= self.refresh:
+            state, traced = self._renew(problem, parameters, state, key.fold(0))
+        draw = state.table.draw(self.count, key.fold(1), self.stratified)
+        maps = self._cells(problem).split(state.shares.astype(np.float32))
+        return Pick(draw, traced, dict(enumerate(maps))), replace(state, age=state.age + 1)
+
+    def observe(self, problem: Problem, state: RefreshedState, gradient: Tree) -> RefreshedState:
+        """Take a gradient's squares in, every few steps, since preconditioning costs something."""
+        if state.age % _OBSERVED:
+            return state
+        squares = trees.map(lambda g: g * g, problem.precondition(gradient))
+        if not state.energy or trees.shapes(state.energy) != trees.shapes(squares):
+            return replace(state, energy=squares)
+        return replace(
+            state, energy=trees.map(lambda old, new: old * _DECAY + new * (1 - _DECAY), state.energy, squares)
+        )
+
+    def _cells(self, problem: Problem) -> Cells:
+        return cut(problem, max(self._budget() // PATHS_PER_CELL, len(problem.views)))
+
+    def _budget(self) -> int:
+        """Paths of a refresh: by default half as many as a step's pixels, for each twenty steps that it serves; at least 4096, or for
+        small steps twice their pixels."""
+        if self.samples is not None:
+            return self.samples
+        return max(1, min(max(self.count // 2, _FEWEST_PATHS), 2 * self.count) * self.refresh // 20)
+
+    def _renew(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[RefreshedState, int]:
+        cells = self._cells(problem)
+        spp = max(PATHS_PER_CELL, self._budget() // len(cells.views))
+        references = [
+            problem.renderer.array(cells.coarser(state.references, level)) for level in range(1, self.levels + 1)
+        ]
+        scales = moments.scales(parameters, state.energy) if self.moments else {}
+        seen = moments.look(problem, parameters, cells, state.spots, spp, key, references, scales)
+        maps = self.make(seen)
+        if state.maps:
+            maps = tuple(_MEMORY * old + (1 - _MEMORY) * new for old, new in zip(state.maps, maps, strict=True))
+        shares = self._shares(cells, maps)
+        table = Table.of(cells, shares * cells.sizes, problem.renderer.array)
+        return replace(state, age=0, maps=maps, table=table, shares=shares), seen.samples
+
+    def _shares(self, cells: Cells, maps: Maps) -> np.ndarray:
+        """How likely a pixel of each cell is, relative to equal probabilities."""
+        density = self.density(cells, maps, lambda values: self._clean(cells, values))
+        total = float((density * cells.sizes).sum())
+        if not total > 0 or not np.isfinite(
+            total
+        ):  # nothing seen, or something that is not finite: as good as not knowing
+            return np.ones(len(density))
+        return (1 - self.uniform) * density * (cells.sizes.sum() / total) + self.uniform
+
+    def _clean(self, cells: Cells, values: np.ndarray) -> np.ndarray:
+        by = self.denoiser
+        if by == "none" or not np.isfinite(values).all():
+            return values
+        if by == "auto" and denoising.variant.current() != denoising.variant.CUDA:
+            by = "oidn" if importlib.util.find_spec("pyoidn") else "variation"
+        maps = cells.split(values)
+        found: list[np.ndarray] = [np.empty(0)] * len(maps)
+        for shape in {part.shape for part in maps}:
+            alike = [index for index, part in enumerate(maps) if part.shape == shape]
+            cleaned = _together(np.stack([maps[index] for index in alike]), lambda x: denoising.denoise(x, by=by))
+            for index, part in zip(alike, cleaned, strict=True):
+                found[index] = part
+        return cells.join(found).astype(np.float64)
+
+
+def _together(maps: np.ndarray, clean: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """`clean` applied to maps (n, rows, columns, 3) side by side in one picture, since each call has its price. Mirrored margins keep
+    them from seeing one another."""
+    count, rows, columns, _ = maps.shape
+    across = math.ceil(math.sqrt(count))
+    down = math.ceil(count / across)
+    margin = min(_MARGIN, rows, columns) if count > 1 else 0
+    padded = np.pad(maps, [(0, 0), (margin, margin), (margin, margin), (0, 0)], mode="symmetric")
+    padded = np.concatenate([padded, np.zeros((across * down - count, *padded.shape[1:]))])
+    height, width = padded.shape[1:3]
+    picture = padded.reshape(down, across, height, width, 3).swapaxes(1, 2).reshape(down * height, across * width, 3)
+    scale = float(picture.max()) or 1.0
+    cleaned = (
+        clean(picture / scale).reshape(down, height, across, width, 3).swapaxes(1, 2).reshape(-1, height, width, 3)
+    )
+    return cleaned[:count, margin : margin + rows, margin : margin + columns] * scale

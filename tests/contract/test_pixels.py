@@ -1,0 +1,403 @@
+"""Drawn pixels: cells, tables, references, and the schemes' own rules, on problems whose answers are known."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import exact_gradient, problem
+from scipy import stats
+
+import unrender as ur
+from unrender.keys import Key
+from unrender.pixels import cells as cells_module
+from unrender.pixels import moments, refreshed
+from unrender.pixels.cells import Cells, Grid, Table, cut
+from unrender.problem.frames import Draw, PixelBatch, WholeView
+from unrender.problem.references import References
+from unrender.rendering.analytic import AnalyticRenderer
+
+SCHEMES: dict[str, Any] = {
+    "uniform": ur.pixels.Uniform,
+    "loss": ur.pixels.LossProportional,
+    "adaptive": ur.pixels.Adaptive,
+}
+
+
+def two_views(shapes: list[tuple[int, int]], most: int) -> Cells:
+    return cells_module._cut(tuple(shapes), most)
+
+
+def array(values: np.ndarray) -> np.ndarray:
+    return np.array(values, np.float64)
+
+
+# ---------------------------------------------------------------- cells
+
+
+@pytest.mark.parametrize("most", [1, 2, 5, 17, 60, 10_000])
+def test_cells_cover_every_pixel_of_every_view_once(most: int) -> None:
+    shapes = [(5, 7), (3, 4), (1, 9)]
+    found = two_views(shapes, most)
+    seen: Counter[tuple[int, int]] = Counter()
+    for view, x, y, w, h, film in zip(
+        found.views, found.x, found.y, found.widths, found.heights, found.films, strict=True
+    ):
+        assert film == shapes[view][1]
+        for row in range(y, y + h):
+            seen.update((int(view), int(row * film + column)) for column in range(x, x + w))
+    assert set(seen.values()) == {1}
+    assert len(seen) == sum(h * w for h, w in shapes)
+    assert len(found.views) <= max(most, len(shapes))
+
+
+def test_cells_are_as_fine_as_they_may_be() -> None:
+    assert two_views([(8, 8)], 64).grids == (Grid(8, 8, 1),)
+    assert two_views([(8, 8)], 63).grids == (Grid(4, 4, 2),)
+    assert two_views([(4096, 4096)] * 16, 20_000).grids[0].rows == 35
+
+
+def test_maps_split_join_and_coarsen() -> None:
+    found = two_views([(5, 7), (4, 4)], 1000)
+    values = np.random.default_rng(0).random((len(found.views), 3))
+    assert np.array_equal(found.join(found.split(values)), values)
+    assert np.array_equal(found.coarser(values, 0), values)
+    level = found.split(found.coarser(values, 1))
+    first = found.split(values)[0]
+    np.testing.assert_allclose(level[0][2:4, 4:6], np.broadcast_to(first[2:4, 4:6].mean((0, 1)), (2, 2, 3)))
+    np.testing.assert_allclose(level[0][4, 6], first[4, 6])  # a block that the border cuts
+    whole = found.split(found.coarser(values, 10))[1]
+    np.testing.assert_allclose(whole, np.broadcast_to(found.split(values)[1].mean((0, 1)), (4, 4, 3)))
+
+
+def test_coarse_means_count_pixels_and_not_cells() -> None:
+    found = two_views([(5, 4)], 6)  # cells of 2 x 2, but for the last row
+    assert found.grids == (Grid(3, 2, 2),)
+    values = np.arange(6.0)[:, None] * np.ones(3)
+    expected = (np.array([0, 1, 2, 3]).sum() * 4 + (4 + 5) * 2) / 20
+    np.testing.assert_allclose(found.coarser(values, 2), expected)
+
+
+# ---------------------------------------------------------------- tables
+
+
+def run_lengths(table: Table) -> np.ndarray:
+    return np.diff([*np.asarray(table.starts, np.int64), 1 << 32])
+
+
+def test_a_table_never_forgets_a_cell_and_tells_its_exact_probability() -> None:
+    found = two_views([(6, 6)], 36)
+    probabilities = np.full(36, 1e-14)
+    probabilities[20] = 1.0
+    table = Table.of(found, probabilities, array)
+    runs = run_lengths(table)
+    assert runs.min() >= 1
+    assert runs.sum() == 1 << 32
+    np.testing.assert_allclose(table.weights[:, 0], found.sizes * (1 << 32) / runs)
+
+
+@pytest.mark.parametrize("stratified", [True, False])
+def test_draws_follow_the_table(stratified: bool) -> None:
+    found = two_views([(5, 7), (3, 4)], 20)
+    rng = np.random.default_rng(1)
+    probabilities = rng.random(len(found.views)) * found.sizes
+    table = Table.of(found, probabilities, array)
+    counts: Counter[tuple[int, int]] = Counter()
+    total = 0
+    for seed in range(400):
+        draw = table.draw(50, Key(seed), stratified)
+        counts.update(zip(draw.views.tolist(), draw.pixels.tolist(), strict=True))
+        total += 50
+    expected, observed = [], []
+    share = probabilities / probabilities.sum() / found.sizes
+    for cell in range(len(found.views)):
+        for row in range(found.heights[cell]):
+            for column in range(found.widths[cell]):
+                pixel = (found.y[cell] + row) * found.films[cell] + found.x[cell] + column
+                expected.append(share[cell] * total)
+                observed.append(counts[(int(found.views[cell]), int(pixel))])
+    assert sum(observed) == total
+    assert stats.chisquare(observed, expected).pvalue > 1e-3
+    wrong = np.array(expected) * np.where(np.arange(len(expected)) % 2, 1.15, 0.85)
+    assert stats.chisquare(observed, wrong / wrong.sum() * total).pvalue < 1e-3, "a planted error went unseen"
+
+
+def test_weighted_sums_over_draws_are_unbiased_and_stratified_ones_quieter() -> None:
+    found = two_views([(6, 6)], 36)
+    rng = np.random.default_rng(2)
+    values, probabilities = rng.random(36), rng.random(36) + 0.1
+    table = Table.of(found, probabilities, array)
+    spread = []
+    for stratified in (True, False):
+        sums = []
+        for seed in range(600):
+            draw = table.draw(72, Key(seed), stratified)
+            sums.append((values[draw.pixels] * draw.weights[:, 0]).sum())
+        error = np.std(sums, ddof=1) / np.sqrt(len(sums))
+        assert abs(np.mean(sums) - values.sum()) < 3.5 * error
+        spread.append(np.std(sums))
+    assert spread[0] < 0.7 * spread[1]
+
+
+def test_the_device_draws_as_numpy_does() -> None:
+    """Other random numbers, the same probabilities: weights of equal pixels are equal, indices in range, sums right."""
+    ur.use("llvm_ad_rgb")
+    import mitsuba as mi
+
+    found = two_views([(30, 40), (10, 10)], 200)
+    probabilities = np.random.default_rng(3).random(len(found.views)) + 0.1
+    on_host = Table.of(found, probabilities, array)
+
+    def on_device(values: np.ndarray) -> Any:
+        return mi.TensorXf(mi.Float(np.float32(values).ravel()) + 0, values.shape)
+
+    table = Table.of(found, probabilities, on_device)
+    np.testing.assert_array_equal(table.starts.numpy(), on_host.starts)
+    np.testing.assert_allclose(table.weights.numpy(), on_host.weights, rtol=1e-6)
+    for stratified in (True, False):
+        means = []
+        for seed in range(40):
+            draw = table.draw(1000, Key(seed), stratified)
+            views, pixels = draw.views.numpy(), draw.pixels.numpy()
+            assert set(views) == {0, 1}
+            assert pixels[views == 0].max() < 1200
+            assert pixels[views == 1].max() < 100
+            means.append(draw.weights.numpy().sum())
+        error = np.std(means, ddof=1) / np.sqrt(len(means))
+        assert abs(np.mean(means) - 1300) < 3.5 * error + 1e-2
+
+
+# ---------------------------------------------------------------- references
+
+
+@pytest.mark.parametrize("on_device", [0, 1 << 20])
+def test_references_are_looked_up_pixel_by_pixel_wherever_they_live(on_device: int) -> None:
+    rng = np.random.default_rng(4)
+    views = [
+        ur.View(rng.random((3, 5, 3)).astype(np.float32), weight=2.0),
+        ur.View(rng.random((2, 2, 3)).astype(np.float32), mask=rng.random((2, 2))),
+    ]
+    found = References(views, array, on_device)
+    assert found.in_host_memory == (on_device == 0)
+    which, pixels = np.array([1, 0, 0, 1], np.uint32), np.array([3, 14, 0, 3], np.uint32)
+    values, factors = found.at(which, pixels)
+    pictures = [np.asarray(view.reference).reshape(-1, 3) for view in views]
+    np.testing.assert_allclose(values, [pictures[v][p] for v, p in zip(which, pixels, strict=True)])
+    masks = [np.ones(15), np.asarray(views[1].mask).ravel()]
+    expected = [masks[v][p] * views[v].weight / pictures[v].size for v, p in zip(which, pixels, strict=True)]
+    np.testing.assert_allclose(factors[:, 0], expected, rtol=1e-6)
+
+
+def test_a_batch_of_all_pixels_is_the_whole_problem() -> None:
+    asked = problem(ur.losses.Huber(), views=2)
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    image = renderer.exact(asked.initial())
+    flat = np.concatenate([image.reshape(-1, 3)] * 2)
+    draw = Draw(np.repeat([0, 1], 16).astype(np.uint32), np.tile(np.arange(16), 2).astype(np.uint32), np.ones((32, 1)))
+    batch = PixelBatch(asked, draw)
+    views = [WholeView(asked, 0), WholeView(asked, 1)]
+    assert batch.loss_value(flat) == pytest.approx(sum(view.loss_value(image) for view in views))
+    whole = np.concatenate([view.loss_derivative(image).reshape(-1, 3) for view in views])
+    np.testing.assert_allclose(batch.loss_derivative(flat), whole)
+
+
+# ---------------------------------------------------------------- schemes
+
+
+def exact_density(asked: ur.Problem, spp: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """|∂L/∂I| and sqrt(Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²]) per pixel of view 0, L2 loss, `spp` samples, noise of one sample."""
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    image = renderer.exact(asked.initial())
+    reference = np.asarray(asked.views[0].reference)
+    linear = image - renderer.offset.reshape(image.shape)
+    variance = (renderer.noise * linear) ** 2 / 3 / spp  # of noise (2u - 1)
+    squares = 4 * ((image - reference) ** 2 + variance)
+    moments_ = (renderer.matrix**2).sum(axis=1).reshape(image.shape) * (1 + renderer.noise**2 / 3)
+    return np.abs(image - reference).sum(2), np.sqrt((squares * moments_).sum(2))
+
+
+def test_adaptive_probabilities_are_those_of_equation_12(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moments, "ROUNDS", 4000)
+    asked = problem(views=1, noise=0.8)
+    scheme = ur.pixels.Adaptive(16, levels=0, samples=16 * 4000, uniform=1e-6, denoiser="none")
+    parameters = asked.initial()
+    pick, _ = scheme.draw(asked, parameters, scheme.init(asked, parameters), Key(0))
+    density = exact_density(asked)[1]
+    np.testing.assert_allclose(pick.probability[0], density / density.mean(), rtol=0.05)
+
+
+def test_probabilities_of_the_loss_are_those_of_equation_5() -> None:
+    asked = problem(views=1, noise=0.0)
+    scheme = ur.pixels.LossProportional(16, samples=32, uniform=1e-6, denoiser="none")
+    parameters = asked.initial()
+    pick, _ = scheme.draw(asked, parameters, scheme.init(asked, parameters), Key(0))
+    density = exact_density(asked)[0]
+    np.testing.assert_allclose(pick.probability[0], density / density.mean(), rtol=1e-5)
+
+
+def test_a_uniform_share_is_kept() -> None:
+    asked = problem(views=2)
+    options: dict[str, Any] = {"uniform": 0.3, "samples": 1000, "denoiser": "none"}
+    for scheme in (ur.pixels.Adaptive(64, **options), ur.pixels.LossProportional(64, **options)):
+        parameters = asked.initial()
+        pick, _ = scheme.draw(asked, parameters, scheme.init(asked, parameters), Key(0))
+        maps = np.stack([pick.probability[view] for view in (0, 1)])
+        assert maps.min() >= 0.3 - 1e-6
+        assert maps.mean() == pytest.approx(1.0, rel=1e-5)
+        assert maps.std() > 0.02
+
+
+def test_the_adaptive_gradient_has_less_variance_than_the_others() -> None:
+    """On a picture most of whose pixels tell nothing, and some of which are noisy."""
+    rng = np.random.default_rng(5)
+    matrix = rng.random((16 * 3, 4)) * np.repeat(rng.random(16) < 0.3, 3)[:, None]
+    renderer = AnalyticRenderer({"x": np.full(4, 0.6)}, matrix, 0.1, 0.5, shape=(4, 4))
+    reference = renderer.exact({"x": np.full(4, 0.9)}) + rng.normal(0, 0.3, (4, 4, 3)) ** 2
+    asked = ur.Problem(renderer, [ur.Parameter("x", 0.5)], [ur.View(reference)])
+    variances = {}
+    for name, scheme in SCHEMES.items():
+        options = {} if name == "uniform" else {"samples": 1600, "denoiser": "none", "uniform": 0.05}
+        levels = {"levels": 0} if name == "adaptive" else {}
+        estimator = ur.PathGradient(pixels=scheme(8, stratified=False, **options, **levels), spp=2)
+        state = estimator.init(asked, asked.initial())
+        rows = []
+        for step in range(400):
+            found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
+            rows.append(found.gradient["x"])
+        variances[name] = np.var(rows, axis=0).sum()
+    assert variances["adaptive"] < 0.85 * variances["loss"]
+    assert variances["adaptive"] < 0.6 * variances["uniform"]
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 5])
+def test_maps_are_cleaned_side_by_side_and_come_back_in_their_places(count: int) -> None:
+    maps = np.random.default_rng(6).random((count, 5, 7, 3)) * 1e-9
+    seen: list[tuple[int, ...]] = []
+
+    def clean(picture: np.ndarray) -> np.ndarray:
+        seen.append(picture.shape)
+        return picture
+
+    np.testing.assert_allclose(refreshed._together(maps, clean), maps)
+    assert len(seen) == 1
+
+
+def test_maps_are_made_anew_every_so_often() -> None:
+    asked = problem()
+    estimator = ur.PathGradient(pixels=ur.pixels.Adaptive(10, refresh=4, samples=32), spp=2)
+    state = estimator.init(asked, asked.initial())
+    samples = []
+    for step in range(9):
+        found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
+        samples.append(found.info["samples"])
+    assert samples == [20 + 64, 20, 20, 20, 20 + 64, 20, 20, 20, 20 + 64]
+
+
+def test_probabilities_that_cannot_be_estimated_are_equal() -> None:
+    """Nothing to learn (no error, no noise), or values that are not finite."""
+    exact = problem(noise=0.0)
+    renderer = exact.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    solved = ur.Problem(
+        renderer, [ur.Parameter(k, v) for k, v in exact.truth.items()], [ur.View(np.asarray(exact.views[0].reference))]
+    )
+    parameters = {k: np.asarray(v, np.float64) for k, v in exact.truth.items()}
+    scheme = ur.pixels.Adaptive(16, denoiser="none")
+    pick, _ = scheme.draw(solved, parameters, scheme.init(solved, parameters), Key(0))
+    assert np.isfinite(pick.probability[0]).all()
+    broken = {k: v * np.nan for k, v in parameters.items()}
+    pick, _ = scheme.draw(solved, broken, scheme.init(solved, broken), Key(0))
+    np.testing.assert_allclose(pick.probability[0], 1.0)
+
+
+def test_tangents_go_through_preconditioners() -> None:
+    """In the coordinates of the descent, x = S u, the sum is over u."""
+    asked = problem()
+
+    class Halve:
+        def check(self, key: str, shape: tuple[int, ...]) -> None: ...
+        def apply(self, x: Any) -> Any:
+            return x * 0.5
+
+    eased = ur.Problem(
+        asked.renderer, [dataclasses.replace(p, preconditioner=Halve()) for p in asked.parameters], asked.views
+    )
+    looks = []
+    for one in (asked, eased):
+        whole = cut(one, 16)
+        spots = Table.of(whole, whole.sizes, one.renderer.array)
+        seen = moments.look(one, one.initial(), whole, spots, 4, Key(0), [], moments.scales(one.initial(), {}))
+        looks.append(seen.moments)
+    np.testing.assert_allclose(looks[1], looks[0] * 0.25)
+
+
+def test_a_control_variate_looks_at_whole_views_now_and_then() -> None:
+    asked = problem(views=2, noise=0.9)
+    image = ur.images.RecursiveControlVariate(whole_views=4)
+    estimator = ur.PathGradient(image, ur.pixels.Uniform(16), spp=2)
+    state = estimator.init(asked, asked.initial())
+    whole = []
+    for step in range(11):
+        found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
+        whole.append(bool(found.info["images"]))
+    assert whole == [True, False, False, False, False] * 2 + [True]
+    rendered = np.concatenate([memory.image.reshape(-1, 3) for memory in state.image.views])
+    np.testing.assert_array_equal(state.image.snapshot.image, rendered)
+
+
+def test_a_snapshot_makes_batches_quieter() -> None:
+    asked = problem(noise=0.9)
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    at = asked.initial()
+    exact = np.concatenate([g.ravel() for g in exact_gradient(asked, at).values()])
+    errors = []
+    for image in (ur.images.Plain(), ur.images.RecursiveControlVariate(whole_views=10)):
+        estimator = ur.PathGradient(image, ur.pixels.Uniform(16), spp=2)
+        squares = []
+        for seed in range(30):
+            state = estimator.init(asked, at)
+            for step in range(40):
+                found, state = estimator.estimate(asked, at, state, Key(seed, step))
+                if step > 30 and not found.info["images"]:
+                    squares.append((np.concatenate([g.ravel() for g in found.gradient.values()]) - exact) ** 2)
+        errors.append(np.mean(squares))
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    refused: list[tuple[Any, dict[str, Any], str]] = [
+        (ur.pixels.Uniform, {"count": 0}, "count"),
+        (ur.pixels.Uniform, {"count": 2.5}, "count"),
+        (ur.pixels.Adaptive, {"count": -1}, "count"),
+        (ur.pixels.Adaptive, {"count": 8, "levels": -1}, "levels"),
+        (ur.pixels.Adaptive, {"count": 8, "refresh": 0}, "refresh"),
+        (ur.pixels.Adaptive, {"count": 8, "uniform": 0.0}, "uniform"),
+        (ur.pixels.Adaptive, {"count": 8, "uniform": 1.5}, "uniform"),
+        (ur.pixels.Adaptive, {"count": 8, "samples": 0}, "samples"),
+        (ur.pixels.LossProportional, {"count": 8, "denoiser": "median"}, "denoiser"),
+    ]
+    for kind, options, name in refused:
+        with pytest.raises(ur.InputError, match=f"{kind.__name__}: {name}"):
+            kind(**options)
+    for pixels in (ur.pixels.All, "all", None, 100):
+        with pytest.raises(ur.InputError, match="PathGradient: pixels"):
+            ur.PathGradient(pixels=pixels)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ur.InputError, match="MetaEstimator: drawn pixels go with plain images"):
+        ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate(), pixels=ur.pixels.Uniform(8))
+    with pytest.raises(ur.InputError, match="whole_views"):
+        ur.images.RecursiveControlVariate(whole_views=0)
+
+    @dataclasses.dataclass(frozen=True)
+    class Blurred(ur.losses.L2):
+        @property
+        def pixelwise(self) -> bool:
+            return False
+
+    with pytest.raises(ur.InputError, match=r"Blurred looks at whole pictures"):
+        ur.optimize(problem(Blurred()), ur.PathGradient(pixels=ur.pixels.Uniform(8)), ur.optimizers.Adam(), steps=1)

@@ -1,0 +1,107 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""Gradients of drawn pixels on a path tracer: the mean of two thousand mini-batches is the gradient of all pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from zoo import scene
+from zscores import z_scores
+
+import unrender as ur
+from unrender.keys import Key
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+
+RUNS, COUNT = 2000, 48
+SCHEMES: dict[str, Any] = {
+    "uniform": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(COUNT), spp=2),
+    "loss": lambda: ur.PathGradient(pixels=ur.pixels.LossProportional(COUNT), spp=2),
+    "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(COUNT), spp=2),
+    "adaptive, as in the paper": lambda: ur.PathGradient(
+        pixels=ur.pixels.Adaptive(COUNT, stratified=False, levels=0), spp=1
+    ),
+}
+
+
+def two_cameras() -> dict[str, Any]:
+    """The zoo's scene, seen by two sensors whose films differ in size and shape."""
+    description = scene({"type": "roughconductor", "alpha": 0.2}, environment=False)
+    film = dict(description["sensor"]["film"], width=12, height=10)
+    description["sensor"] = dict(description["sensor"], film=film)
+    second = dict(description["sensor"], fov=25, film=dict(film, width=7, height=14))
+    return {**description, "second": second}
+
+
+def problem() -> ur.Problem:
+    rng = np.random.default_rng(0)
+    mask = rng.random((14, 7)) < 0.8
+    references = [rng.uniform(0.0, 0.8, (10, 12, 3)), rng.uniform(0.0, 0.8, (14, 7, 3))]
+    return ur.Problem(
+        two_cameras(),
+        [ur.Parameter("floor.bsdf.reflectance.data"), ur.Parameter("lamp.emitter.radiance.value")],
+        [ur.View(references[0]), ur.View(references[1], sensor=1, weight=2.0, mask=mask)],
+        max_depth=3,
+    )
+
+
+def flat(gradient: dict[str, Any]) -> np.ndarray:
+    """Blocks of the texture, and the light's colour."""
+    texture = np.array(gradient["floor.bsdf.reflectance.data"]).astype(np.float64)
+    parts = texture.reshape(2, 4, 2, 4, 3).sum(axis=(1, 3)).ravel()
+    return np.concatenate([parts, np.array(gradient["lamp.emitter.radiance.value"])])
+
+
+def gradients(asked: ur.Problem, estimator: Any, runs: int) -> np.ndarray:
+    state, at = estimator.init(asked, asked.initial()), asked.initial()
+    rows = []
+    for step in range(runs):
+        found, state = estimator.estimate(asked, at, state, Key(1, step))
+        rows.append(flat(found.gradient))
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def whole() -> tuple[ur.Problem, np.ndarray]:
+    asked = problem()
+    return asked, gradients(asked, ur.PathGradient(spp=16), 400)
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_mini_batches_are_unbiased(name: str, whole: tuple[ur.Problem, np.ndarray]) -> None:
+    asked, expected = whole
+    rows = gradients(asked, SCHEMES[name](), RUNS)
+    limit = stats.norm.isf((1 - (1 - 1e-3) ** (1 / rows.shape[1])) / 2)
+    assert np.abs(z_scores(rows, expected)).max() < limit
+    assert np.abs(z_scores(rows * 1.2, expected)).max() > limit, "a planted weight error went unseen"
+
+
+def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
+    """In one launch: the same pixels as renders of each sensor alone."""
+    renderer = MitsubaRenderer(two_cameras(), 3)
+    key = "floor.bsdf.reflectance.data"
+    renderer.select([key], None)
+    at = renderer.values([key])
+    sizes = renderer.resolutions()
+    assert sizes == [(10, 12), (14, 7)]
+    rng = np.random.default_rng(1)
+    sensors = rng.integers(0, 2, 60)
+    pixels = np.array([rng.integers(0, sizes[s][0] * sizes[s][1]) for s in sensors])
+    from unrender import arrays
+
+    like = renderer.array(np.zeros(1))
+    chosen = arrays.like_integers(pixels, like), arrays.like_integers(sensors, like)
+    drawn = np.array([np.array(renderer.image(at, Shot(0, 64, seed, 1, *chosen)).images)[0] for seed in range(30)])
+    apart = np.zeros_like(drawn)
+    for sensor in (0, 1):
+        film = np.array([np.array(renderer.image(at, Shot(sensor, 64, 100 + seed)).images)[0] for seed in range(30)])
+        here = sensors == sensor
+        apart[:, here] = film.reshape(30, -1, 3)[:, pixels[here]]
+    z = np.abs(z_scores(drawn, apart))
+    assert z.max() < stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2)
+    assert np.abs(z_scores(drawn[:, ::-1], apart)).max() > 10

@@ -1,0 +1,108 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""Squared derivatives of single paths: against finite differences on the same paths, and against one pass per parameter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
+
+from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.port import Shot
+
+STEP = 4e-3
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
+    """One sample per pixel, so that an image is its paths; all parameters grow together."""
+    material, changes = MATERIALS[name]
+    renderer = MitsubaRenderer(scene(material()), DEPTH)
+    current, _ = two_states(renderer, {**changes, **LIGHTS})
+    renderer.select(list(current), "path")
+    shot = Shot(0, 1, 11)
+    sides = []
+    for scale in (1 + STEP, 1 - STEP):
+        pair = renderer.image_pair(current, {key: x * scale for key, x in current.items()}, shot, "path")
+        assert pair.previous is not None
+        sides.append(np.array(pair.previous[0]).astype(np.float64))
+    expected = ((sides[0] - sides[1]) / (2 * STEP)) ** 2
+    found = np.array(renderer.tangent_moment(current, renderer.image(current, shot).paths, current))
+    assert found.shape == (SIZE, SIZE, 3)
+    assert expected.sum() > 0
+    close = np.abs(found - expected) < 0.05 * expected + 1e-3 * expected.mean()
+    assert close.mean() > 0.99
+    assert found.sum() == pytest.approx(expected.sum(), rel=0.03)
+
+
+def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
+    """Four colours of three channels: a material's, a floor's, two lights'."""
+    description = scene(
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.3]}}, environment=False
+    )
+    description["floor"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.3, 0.7]}}
+    description["second"] = {"type": "point", "position": [-1, -1, 2], "intensity": {"type": "rgb", "value": [1, 2, 1]}}
+    renderer = MitsubaRenderer(description, DEPTH)
+    keys = [
+        key
+        for key, info in renderer.parameters().items()
+        if info.differentiable and info.shape == (3,) and key.endswith(".value")
+    ]
+    renderer.select(keys, None)
+    values = renderer.values(keys)
+    assert sum(np.array(x).size for x in values.values()) == 12
+    return renderer, values
+
+
+def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
+    """On the same paths: the mean over sign patterns against one pass per parameter, per block of pixels and channel."""
+    renderer, values = twelve()
+    paths = renderer.image(values, Shot(0, 16, 3)).paths
+
+    def blocks(moment: Any) -> np.ndarray:
+        return np.array(moment).astype(np.float64).reshape(6, SIZE // 6, 6, SIZE // 6, 3).mean(axis=(1, 3))
+
+    single = np.zeros((6, 6, 3))
+    for key in values:
+        for channel in range(3):
+            unit = {k: np.zeros(3) for k in values}
+            unit[key][channel] = 1.0
+            single += blocks(renderer.tangent_moment(values, paths, {k: renderer.array(v) for k, v in unit.items()}))
+    rng = np.random.default_rng(0)
+    signed = []
+    for _ in range(200):
+        signs = {k: renderer.array(rng.choice([-1.0, 1.0], 3)) for k in values}
+        signed.append(blocks(renderer.tangent_moment(values, paths, signs)))
+    signed = np.array(signed)
+    error = signed.std(axis=0, ddof=1) / np.sqrt(len(signed))
+    known = error > 1e-6 * single
+    assert known.mean() > 0.8
+    limit = stats.norm.isf((1 - (1 - 1e-3) ** (1 / known.sum())) / 2)
+    z = (signed.mean(axis=0) - single)[known] / error[known]
+    assert np.abs(z).max() < limit
+    # What forgets the cross terms' averaging out, one pattern for all, is seen.
+    same = {k: renderer.array(np.ones(3)) for k in values}
+    wrong = blocks(renderer.tangent_moment(values, paths, same))
+    assert np.abs((wrong - single)[known] / error[known]).max() > limit
+
+
+def test_gradients_after_a_tangent_pass_are_what_they_were() -> None:
+    """The pass cuts what ties the scenes to their parameters; the next rendering ties them anew, in every scene of the process."""
+    renderer, values = twelve()
+    other, others = twelve()
+
+    def gradients(asked: MitsubaRenderer, at: dict[str, Any]) -> np.ndarray:
+        rendering = asked.image_pair(at, at, Shot(0, 4, 5), "path")
+        found = asked.adjoint_pair(at, at, rendering.paths, rendering.images, rendering.images)
+        return np.stack([np.concatenate([np.array(g) for g in tree.values()]) for tree in found])
+
+    before = gradients(renderer, values), gradients(other, others)
+    renderer.tangent_moment(values, renderer.image(values, Shot(0, 4, 6)).paths, values)
+    after = gradients(renderer, values), gradients(other, others)
+    assert np.abs(np.array(before)).min() > 0
+    np.testing.assert_allclose(np.array(after), np.array(before), rtol=1e-5)
