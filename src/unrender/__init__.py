@@ -21,6 +21,8 @@ from unrender.variant import use
 if TYPE_CHECKING:
     from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, smoothed, statistics
     from unrender import grey_box as grey_box
+    from unrender import metrics as metrics
+    from unrender.exporting.folder import export
     from unrender.gradients.black_box import LossValues
     from unrender.gradients.estimate import Estimate
     from unrender.gradients.meta import MetaEstimator
@@ -31,15 +33,19 @@ if TYPE_CHECKING:
     from unrender.problem.problem import Problem
     from unrender.problem.render import render, render_pair
     from unrender.problem.view import View
+    from unrender.reopen import resume
     from unrender.training.callbacks import Callback
+    from unrender.training.live import Live
     from unrender.training.loop import estimate, optimize
     from unrender.training.result import Result
+    from unrender.training.tensorboard import TensorBoard
 
 _MODULES = (
     "gallery",
     "grey_box",
     "images",
     "losses",
+    "metrics",
     "optimizers",
     "pixels",
     "preconditioners",
@@ -51,6 +57,7 @@ _HOMES = {
     "Callback": "training.callbacks",
     "Estimate": "gradients.estimate",
     "Key": "keys",
+    "Live": "training.live",
     "LossValues": "gradients.black_box",
     "MetaEstimator": "gradients.meta",
     "Parameter": "problem.parameter",
@@ -58,11 +65,14 @@ _HOMES = {
     "Problem": "problem.problem",
     "Result": "training.result",
     "SmoothedDerivatives": "gradients.smoothed",
+    "TensorBoard": "training.tensorboard",
     "View": "problem.view",
     "estimate": "training.loop",
+    "export": "exporting.folder",
     "optimize": "training.loop",
     "render": "problem.render",
     "render_pair": "problem.render",
+    "resume": "reopen",
 }
 
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
@@ -74,6 +84,7 @@ __all__ = [
     "Estimate",
     "InputError",
     "Key",
+    "Live",
     "LossValues",
     "MetaEstimator",
     "Parameter",
@@ -81,13 +92,16 @@ __all__ = [
     "Problem",
     "Result",
     "SmoothedDerivatives",
+    "TensorBoard",
     "UnrenderError",
     "VariantError",
     "View",
     "estimate",
+    "export",
     "gallery",
     "images",
     "losses",
+    "metrics",
     "optimize",
     "optimizers",
     "pixels",
@@ -95,6 +109,7 @@ __all__ = [
     "render",
     "render_pair",
     "report",
+    "resume",
     "smoothed",
     "statistics",
     "use",

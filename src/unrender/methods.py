@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from unrender import optimizers
+from unrender import optimizers, pixels
 from unrender.errors import InputError
 from unrender.gradients.black_box import LossValues
 from unrender.gradients.estimate import Estimator
@@ -23,11 +23,13 @@ from unrender.gradients.meta import MetaEstimator
 from unrender.gradients.path import PathGradient
 from unrender.gradients.smoothed import SmoothedDerivatives
 from unrender.images.base import ImageEstimator
+from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.names import did_you_mean
 from unrender.optimizers import schedules
 from unrender.optimizers.base import Optimizer
+from unrender.pixels.base import PixelSampler
 from unrender.statistics import meta
 
 SCHEDULES: dict[str, type] = {
@@ -68,10 +70,11 @@ class PathOptions(AdamOptions):
 
     spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
     adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
+    denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
-        return PathGradient(image, spp=self.spp, adjoint_spp=self.adjoint_spp)
+        return PathGradient(Denoised(image) if self.denoise else image, spp=self.spp, adjoint_spp=self.adjoint_spp)
 
 
 class RecursiveControlVariateOptions(PathOptions):
@@ -83,6 +86,35 @@ class RecursiveControlVariateOptions(PathOptions):
     )
     alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
     beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")
+
+
+class AdaptiveOptions(AdamOptions):
+    """Options of `adaptive`."""
+
+    pixels: PositiveInt = Field(4096, description="pixels a step, drawn from all pixels of all views")
+    scheme: Literal["adaptive", "loss", "uniform"] = Field(
+        "adaptive",
+        description="pixels where the gradient's variance is, or in proportion to the loss derivative, or all alike",
+    )
+    spp: PositiveInt = Field(2, description="samples per drawn pixel; from 2 on, the adjoint shares their paths")
+    levels: NonNegativeInt = Field(4, description="coarser resolutions that the probabilities look at, of adaptive")
+    refresh: PositiveInt = Field(20, description="steps between estimates of the probabilities")
+    uniform: PositiveFloat = Field(0.1, le=1, description="share of the draws that all pixels have equally")
+    image: Literal["plain", "rcv"] = Field(
+        "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
+    )
+    whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
+
+    def estimator(self) -> Estimator:
+        """The path gradient of these pixels."""
+        refreshed: dict[str, Any] = {"refresh": self.refresh, "uniform": self.uniform}
+        made: dict[str, Callable[[], PixelSampler]] = {
+            "adaptive": lambda: pixels.Adaptive(self.pixels, self.levels, **refreshed),
+            "loss": lambda: pixels.LossProportional(self.pixels, **refreshed),
+            "uniform": lambda: pixels.Uniform(self.pixels),
+        }
+        image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
+        return PathGradient(image, made[self.scheme](), self.spp)
 
 
 class MetaCommonOptions(Options):
@@ -248,6 +280,10 @@ def _smoothed(options: SmoothedOptions) -> tuple[Estimator, Optimizer]:
     return options.start()
 
 
+def _adaptive(options: AdaptiveOptions) -> tuple[Estimator, Optimizer]:
+    return options.estimator(), options.optimizer()
+
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -269,6 +305,12 @@ METHODS: dict[str, Method] = {
             "the same recursion, every sample in both of its terms, MetaAdam",
             CoupledOptions,
             _coupled,
+        ),
+        Method(
+            "adaptive",
+            "mini-batches of pixels drawn where the gradient's variance is, from all views at once, Adam",
+            AdaptiveOptions,
+            _adaptive,
         ),
         Method(
             "smoothed",

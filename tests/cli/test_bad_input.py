@@ -106,7 +106,7 @@ SPOILT = [
     (lambda folder: (folder / "photo.exr").write_bytes(b"v/1\x01"), "photo.exr: cannot be read as a picture"),
     (lambda folder: (folder / "photo.exr").unlink(), "problem.toml:8: views[0].reference: photo.exr: no such file"),
     (lambda folder: (folder / "wall.xml").unlink(), "problem.toml:1: scene: wall.xml: no such file"),
-    (_edit("wall.xml", "</film>", ""), "problem.toml:1: scene: wall.xml: Mitsuba could not load it"),
+    (_edit("wall.xml", "</film>", ""), "problem.toml:1: scene: wall.xml:7: not XML: mismatched tag"),
     (_edit("wall.xml", "diffuse", "difuse"), "problem.toml:1: scene: wall.xml: Mitsuba could not load it"),
     (_edit("problem.toml", "reflectance", "reflectence"), "did you mean wall.bsdf.reflectance.value?"),
     (

@@ -18,7 +18,8 @@ from unrender.cli import execute
 from unrender.training.pictures import pictures
 
 KEY = "wall.bsdf.reflectance.value"
-FILES = ["history.jsonl", "initial.npz", "parameters.npz", "pictures.npz", "report.html", "run.json", "truth.npz"]
+FILES = ["checkpoints", "history.jsonl", "initial.npz", "method.toml", "parameters.npz", "pictures.npz", "problem.toml"]
+FILES += ["report.html", "run.json", "truth.npz"]
 QUICK = ["--final-spp", "4"]
 
 
@@ -149,11 +150,17 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
         assert record["settings"]["options"]["learning_rate"] == 0.02
         assert record["settings"]["options"]["spp"] == (4 if record["method"] == "rcv" else 8)
     rows = [line.split() for line in answer.out.splitlines()]
-    assert [row[:2] for row in rows if row and row[0] in ("plain", "rcv")] == [["plain", "2"], ["rcv", "2"]]
+    told = [row for row in rows if row and row[0] in ("plain", "rcv")]
+    assert [row[:2] for row in told[:2]] == [["plain", "2"], ["rcv", "2"]]
+    assert [row[0] for row in told[2:]] == ["plain", "rcv"]  # once more, with the measures of their pictures
+    assert all(
+        part in answer.out for part in (f"Parameter error (RMSE): {KEY}", "paths", "PSNR", "SSIM", "relative MSE")
+    )
     assert f"page: {Path('both', 'compare.html')}" in answer.out
 
     again = unrender("compare", Path("both", "plain-seed0"), Path("both", "rcv-seed1"))
     assert again.status == 0
+    assert "PSNR" in again.out
     assert names(problem.parent / "out" / "compare") == ["compare.html", "compare.json", "compare.png"]
     (folder / "plain-seed0" / "report.html").unlink(missing_ok=True)
     assert unrender("report", Path("both", "plain-seed0")).out.strip() == str(
@@ -185,6 +192,7 @@ def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
     assert process.returncode == 130, error
     assert error == "unrender: interrupted\n"
     assert "interrupted: what was reached is saved" in out
+    assert "to go on: unrender resume result" in out
     folder = problem.parent / "result"
     assert names(folder) == FILES
     record = json.loads((folder / "run.json").read_text())

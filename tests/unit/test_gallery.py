@@ -55,6 +55,8 @@ POSES = {
 }
 PLATEAUS = ["box2", "box10", "mug", "shadow"]
 WITHOUT_RENDERER = ["exponential", "quad"]
+DRAWN = ["mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caustic"]  # see test_gallery_adaptive.py
+VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 
 @pytest.fixture(scope="module", params=RENDERED)
@@ -100,7 +102,7 @@ def limit(count: int, level: float = 1e-4) -> float:
 
 def test_the_first_problem_is_the_one_to_begin_with():
     assert NAMES[0] == "indirect-room"
-    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, "sphere-to-mesh"} == set(NAMES)
+    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, "sphere-to-mesh"} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -115,7 +117,7 @@ def test_a_summary_is_one_line(name):
 def test_options_say_kind_and_default(name):
     options = {option.name: option for option in ur.gallery.options(name)}
     rendered = {"resolution", "reference_spp", "max_depth"} if name not in WITHOUT_RENDERER else set()
-    textured = {"texture_resolution"} if name in RENDERED else set()
+    textured = {"texture_resolution"} if name in {*RENDERED, *DRAWN} - {"mirror-trio"} else set()
     assert {"loss", *rendered, *textured} <= set(options)
     assert all(isinstance(option.default, int) for option in options.values() if option.kind is int)
     assert all(option.about for option in options.values())
@@ -145,7 +147,10 @@ def test_an_unknown_name_is_told_the_nearest(ask):
         ({"max_depth": 1}, "max_depth must be a whole number of at least 2, got 1"),
         ({"views": 0}, "views must be a whole number of at least 1, got 0"),
         ({"views": 99}, "views must be at most 16, got 99"),
-        ({"loss": "l1"}, 'loss: expected "L1" or "L2" or "RelativeL2" or "Huber", got "l1"; did you mean L1?'),
+        (
+            {"loss": "l1"},
+            'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual", got "l1"; did you mean L1?',
+        ),
         ({"loss": ur.losses.L1}, "loss must be one of unrender.losses or its name"),
         ({"loss": 1}, "loss must be one of unrender.losses or its name, got 1"),
     ],

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from unrender import pixels
 from unrender.errors import InputError
 from unrender.gradients.black_box import LossValues
 from unrender.gradients.meta import MetaEstimator
@@ -52,6 +53,19 @@ def test_meta_and_coupled_take_their_options():
     )
     assert estimator == MetaEstimator(coupled=True, spp=6, image=RecursiveControlVariate("primary"), space="primary")
     assert optimizer == Adam(0.1)
+
+
+def test_adaptive_takes_its_options():
+    estimator, optimizer = method("adaptive").start(
+        {"pixels": "512", "levels": 0, "refresh": "10", "learning_rate": 0.1}
+    )
+    assert estimator == PathGradient(pixels=pixels.Adaptive(512, 0, 10), spp=2)
+    assert optimizer == Adam(0.1)
+    estimator, _ = method("adaptive").start({"scheme": "loss", "uniform": 0.5, "image": "rcv", "whole_views": 7})
+    image = RecursiveControlVariate(whole_views=7)
+    assert estimator == PathGradient(image, pixels.LossProportional(4096, uniform=0.5), spp=2)
+    estimator, _ = method("adaptive").start({"scheme": "uniform", "spp": 3})
+    assert estimator == PathGradient(pixels=pixels.Uniform(4096), spp=3)
 
 
 def test_smoothed_takes_its_options():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from report_folders import KEY, Page, write_run
 
-from unrender import report
+from unrender import metrics, report
 from unrender.errors import InputError
 from unrender.report import groups
 from unrender.report.folder import read
@@ -155,3 +155,78 @@ def test_compare_refuses_nothing_twice_and_a_file_in_its_place(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         report.compare([run], tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_equal_samples_have_their_closed_form(tmp_path):
+    """Errors fall as exp(-n / 400) by samples, at 100 and 200 of them a step: the places of a step's end are known."""
+    times = np.arange(1, 9) * 1.0
+    runs = []
+    for method, samples in (("plain", 100), ("rcv", 200)):
+        errors = 0.5 * np.exp(-samples * np.arange(1, 9) / 400)
+        runs.append(write_run(tmp_path / method, method, 0, times, errors, samples_per_step=samples))
+    found = compared(tmp_path, runs)
+    assert found["samples"] == 800
+    for method in ("plain", "rcv"):
+        moments = found["metrics"][0]["methods"][method]["at_samples"]
+        assert [moment["samples"] for moment in moments] == [200, 400, 800]
+        assert [moment["seconds"] for moment in moments] == [None] * 3
+        for moment in moments:
+            assert moment["error"]["median"] == pytest.approx(0.5 * np.exp(-moment["samples"] / 400), rel=1e-5)
+            assert moment["ratio"] == pytest.approx(1.0)
+    words = Page(tmp_path / "out" / "compare.html").words
+    assert "after 800 paths" in words
+    assert "At equal samples" in words
+
+
+def test_pictures_are_measured(tmp_path):
+    """The medians over seeds of measures that are known by themselves."""
+    reference = np.linspace(0.05, 0.6, 12 * 16 * 3).reshape(12, 16, 3).astype(np.float32)
+    runs, wanted = [], {"plain": (1.1, 1.2, 1.3), "rcv": (1.02, 1.03, 1.04)}
+    for method, factors in wanted.items():
+        for seed, factor in enumerate(factors):
+            views = {"view0/reference": reference, "view0/result": reference * np.float32(factor)}
+            runs.append(write_run(tmp_path / f"{method}{seed}", method, seed, views=views))
+    found = {of["label"]: of["images"] for of in compared(tmp_path, runs)["methods"]}
+    for method, factors in wanted.items():
+        for name, of in {"RMSE": metrics.rmse, "relative MSE": metrics.relative_mse, "PSNR": metrics.psnr}.items():
+            values = [of(reference * np.float32(factor), reference) for factor in factors]
+            assert found[method][name]["median"] == pytest.approx(values[1], rel=1e-5)
+            assert found[method][name]["low"] == pytest.approx(min(values), rel=1e-5)
+    page = Page(tmp_path / "out" / "compare.html").words
+    assert "PSNR ↑" in page
+    assert "SSIM ↑" in page
+    assert ("FLIP ↓" in page) == metrics.has_flip()
+
+
+def test_equal_pictures_are_infinitely_good_and_still_a_page(tmp_path):
+    one = np.full((8, 8, 3), 0.5)
+    views = {f"view0/{kind}": one for kind in ("reference", "result")}
+    found = compared(tmp_path, [write_run(tmp_path / m, m, views=views) for m in ("x", "y")])
+    assert found["methods"][0]["images"]["PSNR"]["median"] is None  # infinity has no JSON
+    assert "∞" in Page(tmp_path / "out" / "compare.html").words
+
+
+def test_without_its_package_flip_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(metrics, "has_flip", lambda: False)
+    found = compared(tmp_path, [write_run(tmp_path / m, m) for m in ("x", "y")])
+    assert "FLIP" not in found["methods"][0]["images"]
+
+
+@pytest.mark.parametrize("kind", ["reference", "truth"])
+def test_another_reference_or_truth_is_another_problem_and_rounding_is_not(tmp_path, kind):
+    def run(name: str, factor: float) -> Path:
+        value = np.linspace(0.1, 0.6, 4 * 5 * 3).reshape(4, 5, 3)
+        views = {"view0/reference": value, "view0/result": value}
+        if kind == "truth":
+            return write_run(tmp_path / name, name, truth={KEY: value * factor})
+        return write_run(tmp_path / name, name, views=views | {"view0/reference": value * factor})
+
+    first, rounded, other = run("first", 1.0), run("rounded", 1 + 1e-6), run("other", 1.1)
+    notices = compared(tmp_path, [first, rounded])["notices"]
+    assert [line for line in notices if "differs" in line] == [line for line in notices if kind == "reference"]
+    with pytest.raises(
+        InputError, match=r"other: another problem than .*first: .*another (reference|true value)"
+    ) as raised:
+        report.compare([first, other], tmp_path / "refused")
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "refused").exists()

@@ -8,10 +8,13 @@ import typer
 
 from unrender.cli.compare import compare
 from unrender.cli.doctor import doctor
+from unrender.cli.export import export
 from unrender.cli.gallery import gallery
 from unrender.cli.methods import methods
 from unrender.cli.report import report
+from unrender.cli.resume import resume
 from unrender.cli.run import run
+from unrender.cli.watch import watch
 from unrender.training.result import versions
 
 app = typer.Typer(
@@ -21,8 +24,11 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(run)
+app.command()(resume)
+app.command()(watch)
 app.command()(compare)
 app.command()(report)
+app.command()(export)
 app.command()(gallery)
 app.command()(methods)
 

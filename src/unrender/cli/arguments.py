@@ -33,6 +33,13 @@ ProblemSettings = Annotated[
 ]
 Variant = Annotated[str, typer.Option(help="Mitsuba's variant: auto, cuda_ad_rgb or llvm_ad_rgb.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, help="Threads of the processor. With 1, runs repeat bit for bit.", show_default=False),
+]
+CheckpointEvery = Annotated[
+    int | None, typer.Option(min=1, help="Steps between checkpoints. Default: 50 or so.", show_default=False)
+]
 FinalSpp = Annotated[
     int | None, typer.Option(min=1, help="Samples per pixel of the final pictures. Default: as many as take seconds.")
 ]
@@ -61,12 +68,18 @@ def literal(text: str) -> Any:
     return {"true": True, "false": False}.get(text.lower(), text)
 
 
-def use_variant(name: str) -> str:
-    """Choose the variant. A name that does not exist is wrong input; one that cannot run here is not."""
+def use_variant(name: str, threads: int | None = None) -> str:
+    """Choose the variant and, on the processor, the number of threads (None for one per core). Before anything is rendered.
+
+    A name that does not exist is wrong input; one that cannot run here is not.
+    """
     known = ("auto", *variant.VARIANTS)
     if name not in known:
         raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
-    return variant.use(name)
+    chosen = variant.use(name)
+    if threads is not None:
+        variant.use_threads(threads)
+    return chosen
 
 
 def check_problem(name: str, options: Mapping[str, str]) -> None:

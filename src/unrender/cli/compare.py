@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -17,11 +16,12 @@ from rich.table import Table
 from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
-from unrender.cli.execute import Plan, execute, image_errors, introduce
+from unrender.cli.execute import Plan, execute, introduce
 from unrender.errors import InputError
 from unrender.methods import METHODS, Method, method
-from unrender.problem.problem import Problem
-from unrender.training.result import Result
+from unrender.metrics import has_flip
+from unrender.report import words
+from unrender.report.equal_time import Comparison, Spread
 
 INTERRUPTED = 130
 DEFAULT_SECONDS = 20.0
@@ -62,10 +62,14 @@ def compare(
             raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
         folder = arguments.folder(out, "compare", overwrite, *_MARKS)
         try:
-            page = report.compare([Path(name) for name in what], folder)
+            comparison, notices = report.examine([Path(name) for name in what])
+            page = report.publish(comparison, notices, folder)
         finally:
             arguments.remove_if_empty(folder)
-        console.print(f"page: {escape(str(page))}", soft_wrap=True)
+        _tell(console, comparison)
+        for notice in notices:
+            console.print(f"note: {_plain(notice)}", soft_wrap=True)
+        console.print(f"page: {_plain(str(page))}", soft_wrap=True)
         return
     if len(what) > 1:
         missing = next(name for name in what if not Path(name).is_dir())
@@ -79,7 +83,6 @@ def compare(
     _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
     name = Path(what[0]).stem if what[0].endswith(".toml") else what[0]
     folder = arguments.folder(out, f"{name}-compare", overwrite, *_MARKS)
-    results: list[Result] = []
     directories: list[Path] = []
     interrupted = False
     try:
@@ -95,16 +98,16 @@ def compare(
             result = execute(plan, directory, console)
             interrupted = result.stopped == "interrupted"
             if result.steps:
-                results.append(result)
                 directories.append(directory)
             if interrupted:
                 break
     finally:
         arguments.remove_if_empty(folder)
     if directories:
-        console.print(_table(problem, results))
+        comparison, notices = report.examine(directories)
+        _tell(console, comparison)
         console.print("Time of compilation is left out for every method alike.")
-        console.print(f"page: {escape(str(report.compare(directories, folder)))}", soft_wrap=True)
+        console.print(f"page: {_plain(str(report.publish(comparison, notices, folder)))}", soft_wrap=True)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
@@ -137,24 +140,44 @@ def _settings_by_method(chosen: Sequence[Method], given: Mapping[str, str]) -> d
     return found
 
 
-def _table(problem: Problem, results: Sequence[Result]) -> Table:
-    """One row per method: the median over its runs, and the range."""
+def _tell(console: Console, comparison: Comparison) -> None:
+    """The median over each method's runs, and the range: of every metric, and of the last pictures."""
+    parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
+    for metric in parameters or comparison.metrics:
+        console.print(f"[bold]{_plain(metric.title)}[/]", soft_wrap=True)
+        first = metric.standings[comparison.groups[0].label]
+        times = [f"at {words.duration(moment.seconds)}" for moment in first.moments]
+        table = _table("method", "runs", *times, f"after {words.count(comparison.samples)} paths")
+        for group in comparison.groups:
+            standing = metric.standings[group.label]
+            cells = [moment.error for moment in (*standing.moments, standing.at_samples[-1])]
+            table.add_row(_plain(group.label), str(len(group.runs)), *map(_spread, cells))
+        console.print(table)
+    if comparison.image_error[comparison.groups[0].label].median is not None:
+        console.print("[bold]Last pictures, each run's at its own end[/]")
+        table = _table("method", *comparison.images)
+        for group in comparison.groups:
+            table.add_row(_plain(group.label), *(_spread(of[group.label]) for of in comparison.images.values()))
+        console.print(table)
+        if not has_flip():
+            console.print("FLIP is left out: its package is missing (pip install 'unrender[flip]')", markup=False)
+
+
+def _plain(text: str) -> str:
+    """Text of a run folder, without marks for rich and without what a terminal would obey."""
+    return escape("".join(letter if letter.isprintable() else "\ufffd" for letter in text))
+
+
+def _table(*headings: str) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in ("method", "runs", "steps", "image error", *(f"error of {key}" for key in problem.truth)):
-        table.add_column(escape(heading), overflow="fold")
-    for name in dict.fromkeys(result.method for result in results):
-        runs = [result for result in results if result.method == name]
-        errors = [problem.parameter_error(result.parameters) for result in runs]
-        table.add_row(
-            name,
-            str(len(runs)),
-            f"{np.median([run.steps for run in runs]):.0f}",
-            _spread([float(np.mean(image_errors(run))) for run in runs]),
-            *(_spread([error[key] for error in errors]) for key in problem.truth),
-        )
+    for heading in headings:
+        table.add_column(_plain(heading), overflow="fold")
     return table
 
 
-def _spread(values: Sequence[float]) -> str:
-    middle = f"{np.median(values):.4g}"
-    return f"{middle} ({min(values):.4g} to {max(values):.4g})" if len(values) > 1 else middle
+def _spread(of: Spread) -> str:
+    if of.median is None:
+        return "–"
+    middle = words.number(of.median)
+    low, high = words.number(of.low), words.number(of.high)
+    return middle if low == high else f"{middle} ({low}–{high})"

@@ -1,9 +1,9 @@
-"""One run from start to folder: descend, save, render the final pictures, save again."""
+"""One run from start to folder, and how it is told."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,9 @@ from rich.table import Table
 from unrender.cli.progress import Progress
 from unrender.methods import Method
 from unrender.problem.problem import Problem
-from unrender.training.loop import optimize
-from unrender.training.pictures import pictures
+from unrender.training.live import Live
+from unrender.training.loop import About, optimize
 from unrender.training.result import Result
-
-_FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz", "report.html")
 
 
 @dataclass(frozen=True)
@@ -33,6 +31,7 @@ class Plan:
         final_spp: of the final pictures; None chooses.
         command: what was typed, to be kept with the results.
         problem_settings: of a gallery problem, to be kept with the results.
+        checkpoint_every: see `optimize`.
     """
 
     problem: Problem
@@ -44,23 +43,31 @@ class Plan:
     final_spp: int | None
     command: str
     problem_settings: Mapping[str, Any]
+    checkpoint_every: int | None = None
 
 
 def execute(plan: Plan, directory: Path, console: Console) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came."""
-    problem = plan.problem
     estimator, optimizer = plan.method.start(plan.settings)
-    with Progress(console) as progress:
-        result = optimize(problem, estimator, optimizer, plan.steps, plan.seconds, plan.seed, [progress])
     options = plan.method.configure(plan.settings).model_dump()
     kept = {"options": options, "problem_options": dict(plan.problem_settings)}
     kept = {name: value for name, value in kept.items() if value}
-    result = replace(result, method=plan.method.name, settings={**kept, **result.settings}, command=plan.command)
-    for name in _FILES:  # of an earlier run, which may have had more of them
-        (directory / name).unlink(missing_ok=True)
-    result.save(directory)  # what took long is safe before what takes seconds more
-    result = replace(result, pictures=pictures(problem, result, plan.final_spp))
-    result.save(directory)
+    about = About(plan.method.name, kept, plan.command, plan.final_spp)
+    live = Live(directory, plan.problem.name, plan.method.name, plan.command)
+    with Progress(console) as progress:
+        result = optimize(
+            plan.problem,
+            estimator,
+            optimizer,
+            plan.steps,
+            plan.seconds,
+            plan.seed,
+            [progress, live],
+            directory,
+            plan.checkpoint_every,
+            about,
+        )
+    live.clear()
     return result
 
 
@@ -92,6 +99,8 @@ def summarise(console: Console, problem: Problem, result: Result) -> None:
     table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s (and {result.warmup_seconds:.1f} s to compile)")
     if result.skipped:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
+    if result.resumed:
+        table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
     before, after = (np.mean(image_errors(result, which)) for which in ("initial", "result"))
     table.add_row("image error", f"{before:.4g} before, {after:.4g} after (root mean square)")
     start = problem.parameter_error(result.initial)

@@ -33,7 +33,7 @@ class Progress(Callback):
     def __init__(self, console: Console | None = None):
         self._console = console or Console()
         self._bar: Bar | None = None
-        self._started = self._shown = 0.0
+        self._started = self._shown = self._before = 0.0
         self._loss: float | None = None
         self._error: dict[str, float] = {}
         self._skipped = 0
@@ -46,8 +46,7 @@ class Progress(Callback):
 
     def on_start(self, run: Run) -> None:
         """See `Callback.on_start`."""
-        del run
-        self._started = time.perf_counter()
+        self._started, self._before = time.perf_counter(), run.progress()
         if self._console.is_terminal:
             columns = BarColumn(bar_width=20), TextColumn("{task.description}", markup=False)
             self._bar = Bar(*columns, console=self._console, transient=True, auto_refresh=False)
@@ -94,8 +93,8 @@ class Progress(Callback):
         if run.skipped:
             parts.append(f"{run.skipped} skipped")
         done = run.progress()
-        if done > 0 and not run.stopped:
-            left = (time.perf_counter() - self._started) * (1 - done) / done
+        if done > self._before and not run.stopped:
+            left = (time.perf_counter() - self._started) * (1 - done) / (done - self._before)
             parts.append(f"{int(left) // 60}:{int(left) % 60:02d} left")
         return "  ".join(parts)
 

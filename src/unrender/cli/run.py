@@ -12,10 +12,12 @@ from rich.markup import escape
 
 from unrender import report
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, Overwrite, ProblemName, ProblemSettings, Variant
+from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
 from unrender.cli.execute import Plan, execute, introduce, summarise
 from unrender.errors import InputError
 from unrender.methods import method
+from unrender.problem.problem import Problem
+from unrender.training.result import Result
 
 INTERRUPTED = 130
 
@@ -36,10 +38,12 @@ def run(
     variant: Variant = "auto",
     final_spp: FinalSpp = None,
     overwrite: Overwrite = False,
+    checkpoint_every: CheckpointEvery = None,
+    threads: Threads = None,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
-    Ctrl-C stops after the present step and keeps what was reached.
+    Ctrl-C stops after the present step and keeps what was reached; `unrender resume` goes on from there.
     """
     console = Console(highlight=False)
     chosen = method(method_name)
@@ -49,20 +53,26 @@ def run(
     options = arguments.settings(problem_settings, "--problem-set")
     arguments.check_problem(problem, options)
     name = Path(problem).stem if problem.endswith(".toml") else problem
-    folder = arguments.folder(out, f"{name}-{chosen.name}", overwrite, "run.json")
+    folder = arguments.folder(out, f"{name}-{chosen.name}", overwrite, "run.json", "lock")
     try:
-        running = arguments.use_variant(variant)
+        running = arguments.use_variant(variant, threads)
         opened = arguments.open_problem(problem, options)
         introduce(console, opened, running)
         command = shlex.join(context.find_root().obj or ["unrender"])
-        plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options)
+        plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
         result = execute(plan, folder, console)
     finally:
         arguments.remove_if_empty(folder)
-    summarise(console, opened, result)
+    conclude(console, opened, result, folder)
+
+
+def conclude(console: Console, problem: Problem, result: Result, folder: Path) -> None:
+    """Say what came out, write the page, and leave with the status of an interrupted run where it is one."""
+    summarise(console, problem, result)
     if result.steps:
         console.print(f"page: {escape(str(report.page(folder)))}", soft_wrap=True)
     if result.stopped == "interrupted":
+        console.print(f"to go on: unrender resume {escape(shlex.quote(str(folder)))}", soft_wrap=True)
         raise typer.Exit(INTERRUPTED)
 
 

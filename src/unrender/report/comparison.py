@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.files import write
-from unrender.report import curves, html, panels, plots
+from unrender.report import curves, html, measures, panels, plots
 from unrender.report import groups as grouping
 from unrender.report.equal_time import Comparison, measure
 from unrender.report.folder import RunFolder, read
@@ -36,13 +36,24 @@ def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
     Raises:
         InputError: no folders, one that is malformed or of another problem, or `out` cannot be written to.
     """
+    return publish(*examine(directories), out)
+
+
+def examine(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
+    """The numbers of a comparison, and what makes it weaker, one line each. Raises `InputError`."""
     runs = [read(directory) for directory in directories]
-    notices = grouping.check(runs)
-    comparison = measure(grouping.group(runs))
+    with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
+        notices = grouping.check(runs)
+        return measure(grouping.group(runs)), notices
+
+
+def publish(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
+    """Write the page, its picture and its numbers; returns the page's path. Raises `InputError`."""
     folder = Path(out)
     write(folder / "compare.json", _numbers(comparison, notices))
-    write(folder / "compare.png", poster(comparison))
-    return write(folder / "compare.html", _page(comparison, notices))
+    with np.errstate(over="ignore", invalid="ignore"):
+        write(folder / "compare.png", poster(comparison))
+        return write(folder / "compare.html", _page(comparison, notices))
 
 
 def _page(comparison: Comparison, notices: list[str]) -> bytes:
@@ -55,6 +66,7 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         comparison=comparison,
         notices=notices,
         first=comparison.groups[0].label,
+        measures=measures.known(),
         name=first.record.name,
         facts=html.facts(first.record),
         commands={str(run.path): html.command(run.record) for group in comparison.groups for run in group.runs},
@@ -88,6 +100,7 @@ def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
         "problem": comparison.groups[0].runs[0].record.name,
         "first": comparison.groups[0].label,
         "seconds": comparison.seconds,
+        "samples": comparison.samples,
         "notices": notices,
         "methods": [
             {
@@ -96,6 +109,7 @@ def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
                 "settings": group.runs[0].record.settings,
                 "runs": [_run(run) for run in group.runs],
                 "image_error": comparison.image_error[group.label],
+                "images": {name: of[group.label] for name, of in comparison.images.items()},
             }
             for group in comparison.groups
         ],

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import pictures
-from unrender.report.folder import RunFolder
+from unrender.report.folder import RunFolder, root_mean_square
 
 _BUCKETS = 200
 _SMOOTHED_POINTS = 500
@@ -62,8 +61,7 @@ def parameter_error(run: RunFolder, key: str) -> Series | None:
     seconds = history.seconds[records]
     samples = history.samples[records]
     values = recorded.values if recorded is not None else np.array([])
-    first = pictures.root_mean_square(run.initial[key], run.truth[key])
-    last = pictures.root_mean_square(run.parameters[key], run.truth[key])
+    first, last = run.error_before.get(key), run.error_after.get(key)
     if first is not None:
         seconds, samples, values = np.r_[0.0, seconds], np.r_[0.0, samples], np.r_[first, values]
     if last is not None and len(history) and (len(records) == 0 or records[-1] < len(history) - 1):
@@ -85,7 +83,7 @@ def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
 
 def image_error(run: RunFolder) -> float | None:
     """Of the result's pictures: root mean square over pixels and channels, mean over views; None without pictures."""
-    errors = [pictures.root_mean_square(view.result, view.reference) for view in run.views.values()]
+    errors = [root_mean_square(view.result, view.reference) for view in run.views.values()]
     known = [error for error in errors if error is not None]
     return float(np.mean(known)) if known else None
 
@@ -122,7 +120,9 @@ def bucketed(x: np.ndarray, y: np.ndarray) -> Band:
         return Band(x, y, y, y)
     bucket = np.minimum((x / (x[-1] or 1.0) * _BUCKETS).astype(int), _BUCKETS - 1)
     starts = np.flatnonzero(np.r_[True, np.diff(bucket) > 0])
-    parts = np.split(y, starts[1:])
-    middle = [np.median(part) for part in np.split(x, starts[1:])]
-    median, low, high = ([f(part) for part in parts] for f in (np.median, np.min, np.max))
-    return Band(np.array(middle), np.array(median), np.array(low), np.array(high))
+    ends = np.r_[starts[1:], len(y)]
+    # All buckets at once, since a page that follows a run draws these every second: sorted within each, the middle is the median.
+    ordered = y[np.lexsort((y, bucket))]
+    left, right = (starts + ends - 1) // 2, (starts + ends) // 2
+    middle, median = (x[left] + x[right]) / 2, (ordered[left] + ordered[right]) / 2
+    return Band(middle, median, ordered[starts], ordered[ends - 1])

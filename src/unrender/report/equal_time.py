@@ -1,4 +1,4 @@
-"""What several methods reached at equal time, as numbers: tables, ratios, times to a level, curves."""
+"""What several methods reached at equal time and at equal samples: tables, ratios, times to a level, curves."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from statistics import median
 import numpy as np
 
 from unrender.errors import InputError
-from unrender.report import curves
+from unrender.report import curves, measures
 from unrender.report.curves import Band, Series
 from unrender.report.folder import RunFolder
 from unrender.report.groups import Group
+from unrender.report.measures import Measure
+from unrender.report.plots import AXES
 
 SHARES = (0.25, 0.5, 1.0)
-"""Of the shortest run's time: where methods are compared."""
+"""Of the shortest run's time, or of the fewest samples: where methods are compared."""
 LOSS_WINDOW = 0.05
 """Of the shortest run's time: over how long a loss is a median."""
 _POINTS = 200
@@ -33,16 +35,18 @@ class Spread:
 
 @dataclass(frozen=True)
 class Moment:
-    """One method at one time.
+    """One method at one time, or after so many samples.
 
     Attributes:
-        share, seconds: when, as a share of the shortest run's time and in seconds.
+        share: of the shortest run's time, or of the fewest samples.
+        seconds, samples: when; one of the two, the other one is None.
         error: of the metric.
         ratio: of the median to the first method's, None where that is 0 or not finite.
     """
 
     share: float
-    seconds: float
+    seconds: float | None
+    samples: float | None
     error: Spread
     ratio: float | None
 
@@ -68,9 +72,10 @@ class Reached:
 
 @dataclass(frozen=True)
 class Standing:
-    """One method by one metric."""
+    """One method by one metric: at equal time, at equal samples, until a level, and all along."""
 
     moments: tuple[Moment, ...]
+    at_samples: tuple[Moment, ...]
     reached: Reached
     over_seconds: Band
     over_samples: Band
@@ -94,9 +99,10 @@ class Metric:
     improves: bool
     standings: dict[str, Standing]
 
-    def least(self, moment: int) -> str | None:
-        """Whose median is least at one of `SHARES`; None where there is but one method."""
-        medians = {label: of.moments[moment].error.median for label, of in self.standings.items()}
+    def least(self, moment: int, over: str = "seconds") -> str | None:
+        """Whose median is least at one of `SHARES` of the time or of the samples; None where there is but one method."""
+        moments = {label: of.moments if over == "seconds" else of.at_samples for label, of in self.standings.items()}
+        medians = {label: of[moment].error.median for label, of in moments.items()}
         known = {label: value for label, value in medians.items() if value is not None}
         return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
 
@@ -108,21 +114,33 @@ class Comparison:
     Attributes:
         groups: the methods; the first one is the measure of the others.
         seconds: of the shortest run.
+        samples: of the run that traced the fewest paths.
         metrics: the first one counts most.
         image_error: {label: root mean square error of the result's pictures}, each run at its own end.
+        images: {measure's name: {label: value}} of the same pictures.
         chosen: {label: the run whose last value of the first metric is the (lower) median}.
     """
 
     groups: tuple[Group, ...]
     seconds: float
+    samples: float
     metrics: tuple[Metric, ...]
     image_error: dict[str, Spread]
+    images: dict[str, dict[str, Spread]]
     chosen: dict[str, RunFolder]
+
+    def best_image(self, measure: Measure) -> str | None:
+        """Whose median is best by a measure of pictures; None where there is but one method, or nothing is known."""
+        medians = {label: of.median for label, of in self.images[measure.name].items()}
+        known = {label: value for label, value in medians.items() if value is not None}
+        best = max if measure.larger else min
+        return best(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
 
 
 def measure(groups: tuple[Group, ...]) -> Comparison:
-    """Compare methods up to the shortest run's time."""
-    end = min(float(run.history.seconds[-1]) for group in groups for run in group.runs)
+    """Compare methods up to the shortest run's time, and up to the fewest samples."""
+    ends = {over: min(float(getattr(run.history, over)[-1]) for group in groups for run in group.runs) for over in AXES}
+    end = ends["seconds"]
     first_run = groups[0].runs[0]
     keys = [key for key in first_run.parameters if all(key in run.truth for group in groups for run in group.runs)]
     found = []
@@ -133,13 +151,13 @@ def measure(groups: tuple[Group, ...]) -> Comparison:
                 "Parameter error, relative to the start (mean over parameters)",
                 lambda run: curves.relative_error(run, keys),
                 groups,
-                end,
+                ends,
             )
         )
     for key in keys:
         title = f"Parameter error (RMSE): {key}"
-        found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, end))
-    found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, end))
+        found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, ends))
+    found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, ends))
     # With several parameters the mean over them comes first, then the loss, then each on its own.
     order = [found[0], found[-1], *found[1:-1]] if len(found) > 1 else found
     metrics = tuple(metric for metric in order if metric is not None)
@@ -148,11 +166,17 @@ def measure(groups: tuple[Group, ...]) -> Comparison:
             f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
         )
     images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
-    return Comparison(groups, end, metrics, images, {g.label: _chosen(g, keys) for g in groups})
+    found_images = {g.label: [measures.of_run(run) for run in g.runs] for g in groups}
+    by_measure = {
+        measure.name: {label: _spread([run[measure.name] for run in runs]) for label, runs in found_images.items()}
+        for measure in measures.known()
+    }
+    chosen = {g.label: _chosen(g, keys) for g in groups}
+    return Comparison(groups, end, ends["samples"], metrics, images, by_measure, chosen)
 
 
 def _metric(
-    name: str, title: str, series: Callable[[RunFolder], Series | None], groups: Sequence[Group], end: float
+    name: str, title: str, series: Callable[[RunFolder], Series | None], groups: Sequence[Group], ends: dict[str, float]
 ) -> Metric | None:
     """None where some method has no value of it."""
     found = {group.label: [s for run in group.runs if (s := series(run)) is not None] for group in groups}
@@ -165,19 +189,25 @@ def _metric(
     at_first = first.reached(level)
     standings = {}
     for label, of in found.items():
-        moments = tuple(_moment(share, end, of, next(iter(found.values()))) for share in SHARES)
+        moments, at_samples = (
+            tuple(_moment(share, over, ends[over], of, next(iter(found.values()))) for share in SHARES) for over in AXES
+        )
         reached = _reached(of, full[label], level, at_first if improves else None)
         longest = min(float(s.samples[-1]) for s in of)
         over_seconds = curves.band(of, "seconds", float(full[label].x[-1]), _POINTS)
-        standings[label] = Standing(moments, reached, over_seconds, curves.band(of, "samples", longest, _POINTS))
+        standings[label] = Standing(
+            moments, at_samples, reached, over_seconds, curves.band(of, "samples", longest, _POINTS)
+        )
     return Metric(name, title, level, improves, standings)
 
 
-def _moment(share: float, end: float, of: Sequence[Series], first: Sequence[Series]) -> Moment:
-    when = np.array([share * end])
-    own, measure_of = ([float(s.at(when)[0]) for s in runs] for runs in (of, first))
+def _moment(share: float, over: str, end: float, of: Sequence[Series], first: Sequence[Series]) -> Moment:
+    place = share * end
+    own, measure_of = ([float(s.at(np.array([place]), over)[0]) for s in runs] for runs in (of, first))
     a, b = median(own), median(measure_of)
-    return Moment(share, share * end, _spread(own), a / b if b > 0 and math.isfinite(a) and math.isfinite(b) else None)
+    ratio = a / b if b > 0 and math.isfinite(a) and math.isfinite(b) else None
+    seconds, samples = (place, None) if over == "seconds" else (None, place)
+    return Moment(share, seconds, samples, _spread(own), ratio)
 
 
 def _reached(of: Sequence[Series], whole: Band, level: float, at_first: float | None) -> Reached:

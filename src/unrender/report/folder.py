@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import math
 import re
-import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from unrender import files
 from unrender.errors import InputError
 from unrender.names import did_you_mean
+from unrender.report import reading
+from unrender.report.history import History, Reader
 
 _FinitePositive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_PICTURE = re.compile(r"view(\d+)/(reference|initial|result|control_weight)")
+_Count = Annotated[int, Field(ge=0, lt=2**63)]
+_PICTURE = re.compile(r"view([0-9]{1,6})/(reference|initial|result|control_weight|pixel_probability)")
 
 
 class RunRecord(BaseModel):
@@ -28,62 +27,30 @@ class RunRecord(BaseModel):
 
     name: str
     method: str
-    seed: int = 0
+    seed: Annotated[int, Field(ge=-(2**63), lt=2**63)] = 0
     settings: dict[str, Any] = {}
     command: str | list[str] = ""
     versions: dict[str, Any] = {}
     hardware: dict[str, Any] | str = {}
     variant: str = ""
     stopped: str = ""
-    steps: Annotated[int, Field(ge=0)] = 0
+    steps: _Count = 0
     seconds: _FinitePositive = 0.0
     warmup_seconds: _FinitePositive = 0.0
-    skipped: Annotated[int, Field(ge=0)] = 0
+    skipped: _Count = 0
     warnings: list[str] = []
     problem: dict[str, Any] = {}
 
 
 @dataclass(frozen=True)
-class ErrorHistory:
-    """One parameter's root mean square error where it was recorded; arrays of equal length.
-
-    Attributes:
-        records: which of the history's records, ascending.
-        values: >= 0; infinite where the record holds no number.
-    """
-
-    records: np.ndarray
-    values: np.ndarray
-
-
-@dataclass(frozen=True)
-class History:
-    """history.jsonl, by columns of one length.
-
-    Attributes:
-        seconds, samples: since the start, ascending.
-        loss, gradient_noise: NaN where the record holds no number.
-        parameter_error: {key: where and what}.
-    """
-
-    seconds: np.ndarray
-    samples: np.ndarray
-    loss: np.ndarray
-    gradient_noise: np.ndarray
-    parameter_error: dict[str, ErrorHistory]
-
-    def __len__(self) -> int:
-        return len(self.seconds)
-
-
-@dataclass(frozen=True)
 class ViewPictures:
-    """Of one view, each (H, W, 3), linear."""
+    """Of one view, each (H, W, 3), linear; the probability with which a pixel is drawn (H, W)."""
 
     reference: np.ndarray
     result: np.ndarray
-    initial: np.ndarray | None
-    control_weight: np.ndarray | None
+    initial: np.ndarray | None = None
+    control_weight: np.ndarray | None = None
+    pixel_probability: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +63,8 @@ class RunFolder:
         history: history.jsonl.
         parameters, initial, truth: {key: array}; `truth` holds the keys whose truth is known.
         views: {view index: pictures}, ascending; empty where the run kept none.
+        error_before, error_after: {key: root mean square error} at the start and at the end, where they are known.
+        shapes: {key: shape} of parameters whose arrays here are smaller than those of the run.
     """
 
     path: Path
@@ -105,27 +74,52 @@ class RunFolder:
     initial: dict[str, np.ndarray]
     truth: dict[str, np.ndarray]
     views: dict[int, ViewPictures]
+    error_before: dict[str, float] = field(default_factory=dict)
+    error_after: dict[str, float] = field(default_factory=dict)
+    shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def shape(self, key: str) -> tuple[int, ...]:
+        """Of a parameter, as it is in the run."""
+        return self.shapes.get(key, self.parameters[key].shape)
 
 
 def read(directory: str | Path) -> RunFolder:
     """Read and check a run folder.
 
     Raises:
-        InputError: there is none, or a file or field of it is missing or malformed.
+        InputError: there is none, or a file or field of it is missing or malformed, or leads out of the folder.
     """
     path = Path(directory)
     _check_place(path)
-    record = _read_record(path / "run.json")
-    history = _read_history(path / "history.jsonl")
-    parameters = _read_arrays(path / "parameters.npz")
-    initial = _read_arrays(path / "initial.npz")
+    record = read_record(path / "run.json", path)
+    history = Reader(path / "history.jsonl", path).read()
+    parameters = reading.arrays(path / "parameters.npz", path)
+    initial = reading.arrays(path / "initial.npz", path)
     for key in parameters:
         if key not in initial:
-            raise InputError(f"{path / 'initial.npz'}: {key} is missing{did_you_mean(key, initial)}")
-    truth = _read_arrays(path / "truth.npz") if (path / "truth.npz").exists() else {}
-    views = _read_pictures(path / "pictures.npz") if (path / "pictures.npz").exists() else {}
+            raise InputError(
+                f"{path / 'initial.npz'}: {reading.shown(key)} is missing{did_you_mean(key, map(reading.shown, initial))}"
+            )
+    truth = _optional(path / "truth.npz", path)
     known = {key: value for key, value in truth.items() if key in parameters}
-    return RunFolder(path, record, history, parameters, initial, known, views)
+    before, after = (
+        {k: e for k, wanted in known.items() if (e := root_mean_square(of[k], wanted)) is not None}
+        for of in (initial, parameters)
+    )
+    views = pictures_by_view(_optional(path / "pictures.npz", path), path / "pictures.npz")
+    return RunFolder(path, record, history, parameters, initial, known, views, before, after)
+
+
+def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
+    """The root mean square difference, or None where the shapes differ (a parameter that was refined on the way)."""
+    if a.shape != b.shape or not a.size:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64)))
+
+
+def _optional(path: Path, folder: Path) -> dict[str, np.ndarray]:
+    return reading.arrays(path, folder) if reading.exists(path) else {}
 
 
 def _check_place(path: Path) -> None:
@@ -143,113 +137,32 @@ def _check_place(path: Path) -> None:
         raise InputError(f"{path}: not a run folder: run.json is missing{hint}")
 
 
-def _parse(text: str, where: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except json.JSONDecodeError as error:
-        line = f":{error.lineno}" if error.lineno > 1 else ""
-        raise InputError(f"{where}{line}: not JSON: {error.msg} at column {error.colno}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{where}: not JSON that can be read: {error}") from error
-    if not isinstance(found, dict):
-        raise InputError(f"{where}: expected an object {{...}}, got {type(found).__name__}")
-    return found
-
-
-def _read_record(path: Path) -> RunRecord:
-    found = _parse(files.read_text(path), str(path))
+def read_record(path: Path, folder: Path) -> RunRecord:
+    """The record of a run folder. Raises `InputError`."""
+    found = reading.parse(reading.text(path, folder), str(path))
     try:
         return RunRecord.model_validate(found)
     except ValidationError as error:
         first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
+        name = reading.shown(".".join(str(part) for part in first["loc"]))
         if first["type"] == "missing":
-            raise InputError(f"{path}: {field} is missing{did_you_mean(field, found)}") from error
+            raise InputError(f"{path}: {name} is missing{did_you_mean(name, map(reading.shown, found))}") from error
         message = first["msg"].removeprefix("Input should be ")
-        raise InputError(f"{path}: {field}: expected {message}, got {_short(first['input'])}") from error
+        raise InputError(f"{path}: {name}: expected {message}, got {reading.shown(repr(first['input']))}") from error
 
 
-def _read_history(path: Path) -> History:
-    columns: dict[str, list[float]] = {"seconds": [], "samples": [], "loss": [], "gradient_noise": []}
-    errors: dict[str, tuple[list[int], list[float]]] = {}
-    last = {"seconds": 0.0, "samples": 0.0}
-    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
-        if not line.strip():
-            continue
-        where = f"{path}:{number}"
-        record = _parse(line, where)
-        for name, column in columns.items():
-            required = name in last
-            value = _number(record.get(name), f"{where}: {name}", required)
-            if required:
-                if value < last[name]:
-                    raise InputError(f"{where}: {name}: expected no less than {last[name]:g} before it, got {value:g}")
-                last[name] = value
-            column.append(value)
-        found = record.get("parameter_error", {})
-        if not isinstance(found, dict):
-            raise InputError(f"{where}: parameter_error: expected an object {{key: number}}, got {_short(found)}")
-        for key, value in found.items():
-            records, values = errors.setdefault(key, ([], []))
-            records.append(len(columns["seconds"]) - 1)
-            error = _number(value, f"{where}: parameter_error.{key}", False)
-            values.append(error if math.isfinite(error) else math.inf)
-    return History(
-        **{name: np.array(column, float) for name, column in columns.items()},
-        parameter_error={key: ErrorHistory(np.array(r, int), np.array(v, float)) for key, (r, v) in errors.items()},
-    )
-
-
-def _number(value: Any, where: str, required: bool) -> float:
-    if value is None and not required:
-        return math.nan
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where}: expected a number, got {_short(value)}")
-    try:
-        found = float(value)
-    except OverflowError:
-        found = math.inf
-    if required and not math.isfinite(found):
-        raise InputError(f"{where}: expected a finite number, got {value}")
-    return found if math.isfinite(found) else math.nan
-
-
-def _short(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file, real numbers only, as floats. Pickled objects are refused."""
-    if not path.exists():
-        raise InputError(f"{path}: the file is missing")
-    name = ""
-    try:
-        with path.open("rb") as opened:
-            file = np.load(opened, allow_pickle=False)
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise InputError(f"{path}: expected an .npz archive of arrays")
-            found = {}
-            for name in file.files:
-                array = file[name]
-                if array.dtype.kind not in "fiub":
-                    raise InputError(f"{path}: {name}: expected real numbers, got {array.dtype}")
-                found[name] = array.astype(np.result_type(array, np.float32))
-            return found
-    except (InputError, MemoryError):
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile, RuntimeError) as error:
-        field = f" {name}:" if name else ""
-        raise InputError(f"{path}:{field} not an .npz archive that can be read ({type(error).__name__})") from error
-
-
-def _read_pictures(path: Path) -> dict[int, ViewPictures]:
+def pictures_by_view(arrays: dict[str, np.ndarray], path: Path) -> dict[int, ViewPictures]:
+    """{"view0/reference": array, ...} by view. Raises `InputError` naming `path`, where they came from."""
     found: dict[int, dict[str, np.ndarray]] = {}
-    for name, array in _read_arrays(path).items():
+    for name, array in arrays.items():
         match = _PICTURE.fullmatch(name)
         if match is None:
             continue
-        if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+        if match[2] == "pixel_probability":
+            array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+            if array.ndim != 2 or 0 in array.shape:
+                raise InputError(f"{path}: {name}: expected shape (height, width), got {array.shape}")
+        elif array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
             raise InputError(f"{path}: {name}: expected shape (height, width, 3), got {array.shape}")
         found.setdefault(int(match[1]), {})[match[2]] = array
     views = {}
@@ -259,11 +172,9 @@ def _read_pictures(path: Path) -> dict[int, ViewPictures]:
                 raise InputError(f"{path}: view{view}/{kind} is missing")
         shape = pictures["reference"].shape
         for kind, array in pictures.items():
-            if array.shape != shape:
+            if array.shape[:2] != shape[:2]:
                 raise InputError(
                     f"{path}: view{view}/{kind}: expected the reference's shape {shape}, got {array.shape}"
                 )
-        views[view] = ViewPictures(
-            pictures["reference"], pictures["result"], pictures.get("initial"), pictures.get("control_weight")
-        )
+        views[view] = ViewPictures(**pictures)
     return views

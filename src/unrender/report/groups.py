@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from unrender.errors import InputError
+from unrender.report import reading
 from unrender.report.folder import RunFolder
 from unrender.report.html import flattened
 
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
+_ALIKE = 0.01
 _ARGUMENT = re.compile(r"(\w+)=([^=(),]+)(?=[,)])")
 
 
@@ -55,17 +60,27 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
         if not len(run.history):
             raise InputError(f"{run.path / 'history.jsonl'}: no step was taken, there is nothing to compare")
         for key in run.parameters.keys() ^ first.parameters.keys():
-            raise InputError(f"{run.path}: another problem than {first.path}: only one of them recovers {key}")
+            raise InputError(
+                f"{run.path}: another problem than {first.path}: only one of them recovers {reading.shown(key)}"
+            )
         for view in run.views.keys() | first.views.keys():
             sizes = [of.views[view].reference.shape[:2] if view in of.views else None for of in (first, run)]
             if sizes[0] != sizes[1]:
                 what = f"view {view} is {_size(sizes[1])}, not {_size(sizes[0])}"
                 raise InputError(f"{run.path}: another problem than {first.path}: {what}")
-        if any((run.views[view].reference != first.views[view].reference).any() for view in run.views):
-            notices.append(f"The reference pictures of {run.path.name} are not those of {first.path.name}.")
+        for view in run.views:
+            apart = _apart(run.views[view].reference, first.views[view].reference)
+            if apart > _ALIKE:
+                raise InputError(f"{run.path}: another problem than {first.path}: view {view} has another reference")
+            if apart > 0:
+                notices.append(
+                    f"View {view} of {run.path.name} differs from that of {first.path.name} by {apart:.1g} of its values."
+                )
         for key in run.truth.keys() & first.truth.keys():
-            if run.truth[key].shape != first.truth[key].shape or (run.truth[key] != first.truth[key]).any():
-                notices.append(f"The truth of {key} in {run.path.name} is not that of {first.path.name}.")
+            if _apart(run.truth[key], first.truth[key]) > _ALIKE:
+                raise InputError(
+                    f"{run.path}: another problem than {first.path}: {reading.shown(key)} has another true value"
+                )
     records = [run.record for run in runs]
     for what, values in {
         "problems": [of.name for of in records],
@@ -85,6 +100,19 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
         if run.record.stopped == "interrupted":
             notices.append(f"{who}: interrupted after {run.record.seconds:.3g} s.")
     return list(dict.fromkeys(notices))
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """The root mean square difference, relative to `b`; infinite for other shapes.
+
+    References that a gallery renders differ by rounding between machines, and in single paths between backends.
+    """
+    if a.shape != b.shape:
+        return math.inf
+    if np.array_equal(a, b, equal_nan=True):
+        return 0.0
+    found = float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64) / (np.mean(b**2, dtype=np.float64) or 1e-30)))
+    return found if math.isfinite(found) else math.inf
 
 
 def _size(size: tuple[int, ...] | None) -> str:

@@ -10,21 +10,31 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from unrender.report import words
 from unrender.report.folder import RunRecord
 
+_SCRIPT = "viewer.js"
+
 
 def render(template: str, **context: Any) -> bytes:
-    """The page as UTF-8. Its content security policy lets no script run but the one of `slider.js`."""
-    environment = _environment()
-    source, _, _ = PackageLoader("unrender.report", "templates").get_source(environment, "slider.js")
-    digest = base64.b64encode(hashlib.sha256(source.encode()).digest()).decode("ascii")
+    """The page as UTF-8. Its content security policy lets no script run but the one of `viewer.js`."""
+    script = source(_SCRIPT)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    page = environment.get_template(template)
-    return page.render(policy=policy, script=Markup(source), **context).encode()
+    page = _environment().get_template(template)
+    return page.render(policy=policy, script=Markup(script), **context).encode()
+
+
+def source(name: str) -> str:
+    """The text of a style sheet or script among the templates."""
+    return _loader().get_source(_environment(), name)[0]
+
+
+_FOR_RESUMING = ("fingerprint", "origin")
+"""What run.json says of the problem to resuming alone."""
 
 
 def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -50,7 +60,7 @@ def facts(record: RunRecord) -> dict[str, str]:
     hardware = record.hardware if isinstance(record.hardware, dict) else {"hardware": record.hardware}
     return flattened(
         {
-            "problem": {"name": record.name, **record.problem},
+            "problem": {"name": record.name, **{k: v for k, v in record.problem.items() if k not in _FOR_RESUMING}},
             "method": record.method,
             "settings": record.settings,
             "seed": record.seed,
@@ -61,14 +71,24 @@ def facts(record: RunRecord) -> dict[str, str]:
     )
 
 
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("unrender.report", "templates"),
+def environment(*further: BaseLoader) -> Environment:
+    """The templates, and those of `further` loaders; everything that is put into them is escaped."""
+    found = Environment(
+        loader=ChoiceLoader([*further, _loader()]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(number=words.number, duration=words.duration, count=words.count)
-    return environment
+    found.filters.update(number=words.number, duration=words.duration, count=words.count)
+    return found
+
+
+@cache
+def _loader() -> PackageLoader:
+    return PackageLoader("unrender.report", "templates")
+
+
+@cache
+def _environment() -> Environment:
+    return environment()

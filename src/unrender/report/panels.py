@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.report import pictures, words
 from unrender.report.folder import ViewPictures
-from unrender.report.pictures import ColourBar, Picture
+from unrender.report.pictures import INLINE, ColourBar, Painter, Picture
 
 _VALUES_IN_A_TABLE = 16
 
@@ -45,54 +45,72 @@ class Panel:
         note: on their exposure or scale.
         stacks: each from top to bottom.
         led: whether the first stack is the large one.
+        apart: whether pictures of different stacks show different places.
     """
 
     title: str
     note: str
     stacks: tuple[tuple[Slider | Figure, ...], ...]
     led: bool
+    apart: bool = False
 
 
 def is_map(array: np.ndarray) -> bool:
     """Whether a parameter is shown as a picture: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
+    if array.size == 0:
+        return False
     if array.ndim == 2:
         return array.size > _VALUES_IN_A_TABLE and min(array.shape) > 1
     return array.ndim in (3, 4) and array.shape[-1] in (1, 3, 4) and sum(n > 1 for n in array.shape[:-1]) >= 2
 
 
-def view_of_run(view: int, shown: ViewPictures) -> Panel:
-    """Reference against result, the start, what is left of the error, and the control weight where there is one."""
+def view_of_run(view: int, shown: ViewPictures, paint: Painter = INLINE, name: str = "Result") -> Panel:
+    """Reference against result, the start, what is left of the error, and where the method looks or what it keeps.
+
+    Args:
+        view: its index.
+        shown: its pictures.
+        paint: makes them.
+        name: of the result, "Current" while the run goes on.
+    """
     factor = pictures.exposure(shown.reference)
+    what = name.lower()
     error = pictures.absolute_error(shown.result, shown.reference)
     before = None if shown.initial is None else pictures.absolute_error(shown.initial, shown.reference)
     high = pictures.top(error if before is None else before)
+    result = paint.colour(shown.result, factor, f"View {view}: the {what}")
     stacks: list[tuple[Slider | Figure, ...]] = [
-        (
-            Slider(
-                pictures.colour(shown.reference, factor, f"View {view}: the reference"),
-                pictures.colour(shown.result, factor, f"View {view}: the result"),
-                "Reference",
-                "Result",
-            ),
-        )
+        (Slider(paint.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
     ]
     if shown.initial is not None and before is not None:
-        picture = pictures.colour(shown.initial, factor, f"View {view}: before the first step")
+        picture = paint.colour(shown.initial, factor, f"View {view}: before the first step")
         stacks.append((Figure(picture, "Start"),))
-        stacks.append((_error(before, high, "Error at the start", f"View {view}: error before the first step"),))
-    if shown.control_weight is None:
-        stacks.append((Figure(pictures.colour(shown.result, factor, f"View {view}: the result"), "Result"),))
-    else:
-        weight = np.mean(shown.control_weight, axis=-1)
-        picture = pictures.false_colour(weight, 0.0, 1.0, pictures.VALUES, f"View {view}: control weight per pixel")
-        bar = pictures.colour_bar(0.0, 1.0, pictures.VALUES, "Control weight")
-        note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
-        stacks.append((Figure(picture, "Control weight", note, bar),))
-    stacks.append((_error(error, high, "Error of the result", f"View {view}: error of the result"),))
+        stacks.append((_error(paint, before, high, "Error at the start", f"View {view}: error before the first step"),))
+    maps = _maps_of_view(view, shown, paint)
+    stacks += [(figure,) for figure in maps or [Figure(result, name)]]
+    stacks.append((_error(paint, error, high, f"Error of the {what}", f"View {view}: error of the {what}"),))
     return Panel(f"View {view}", _exposure_note(factor), tuple(stacks), True)
 
 
-def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
+def _maps_of_view(view: int, shown: ViewPictures, paint: Painter) -> list[Figure]:
+    """What the method keeps of the past, and where it looks."""
+    found = []
+    if shown.control_weight is not None:
+        weight = np.mean(shown.control_weight, axis=-1)
+        picture = paint.false_colour(weight, 0.0, 1.0, pictures.VALUES, f"View {view}: control weight per pixel")
+        bar = pictures.colour_bar(0.0, 1.0, pictures.VALUES, "Control weight")
+        note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
+        found.append(Figure(picture, "Control weight", note, bar))
+    if shown.pixel_probability is not None:
+        density = shown.pixel_probability
+        high = pictures.top(density)
+        picture = paint.false_colour(density, 0.0, high, pictures.VALUES, f"View {view}: probability of each pixel")
+        bar = pictures.colour_bar(0.0, high, pictures.VALUES, "Probability that a pixel is drawn")
+        found.append(Figure(picture, "Pixel probability", f"mean {words.number(_finite_mean(density))}", bar))
+    return found
+
+
+def view_of_methods(view: int, shown: Mapping[str, ViewPictures], paint: Painter = INLINE) -> Panel:
     """Each method's result against the reference, and its error, all on one exposure and one scale."""
     reference = next(iter(shown.values())).reference
     factor = pictures.exposure(reference)
@@ -101,19 +119,21 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
     stacks = tuple(
         (
             Slider(
-                pictures.colour(reference, factor, f"View {view}: the reference"),
-                pictures.colour(of.result, factor, f"View {view}: the result of {label}"),
+                paint.colour(reference, factor, f"View {view}: the reference"),
+                paint.colour(of.result, factor, f"View {view}: the result of {label}"),
                 "Reference",
                 label,
             ),
-            _error(errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
+            _error(paint, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
         )
         for label, of in shown.items()
     )
     return Panel(f"View {view}", _exposure_note(factor), stacks, False)
 
 
-def map_of_run(key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None) -> Panel:
+def map_of_run(
+    key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None, paint: Painter = INLINE
+) -> Panel:
     """A recovered texture or volume against its truth, or against its start where the truth is unknown."""
     scale = Scale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
@@ -126,21 +146,25 @@ def map_of_run(key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndar
             if one is not None and wanted is not None and one.shape == wanted.shape
         }
         high = pictures.top(next(iter(errors.values()))) if errors else 1.0
-        column: list[Slider | Figure] = [_against(scale, key, label, plane, start, wanted)]
+        column: list[Slider | Figure] = [_against(paint, scale, key, label, plane, start, wanted)]
         if wanted is not None and start is not None:
-            column.append(Figure(scale.picture(start, f"{key} {label}: before the first step"), "Start", "", scale.bar))
+            column.append(
+                Figure(scale.picture(paint, start, f"{key} {label}: before the first step"), "Start", "", scale.bar)
+            )
         for what, error in errors.items():
             if what == "Error":
-                column.append(Figure(scale.picture(plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar))
-            column.append(_error(error, high, what, f"{key} {label}: {what.lower()}"))
+                column.append(
+                    Figure(scale.picture(paint, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
+                )
+            column.append(_error(paint, error, high, what, f"{key} {label}: {what.lower()}"))
         if len(planes) == 1:
             stacks += [(item,) for item in column]
         else:
             stacks.append(tuple(column))
-    return Panel(key, _map_note(result, scale), tuple(stacks), len(planes) == 1)
+    return Panel(key, _map_note(result, scale), tuple(stacks), len(planes) == 1, len(planes) > 1)
 
 
-def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray) -> Panel:
+def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, paint: Painter = INLINE) -> Panel:
     """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
     scale = Scale(truth)
     label, wanted = next(iter(_planes(truth).items()))
@@ -155,9 +179,9 @@ def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarra
     for name, plane in found.items():
         if plane is None:
             continue
-        column: list[Slider | Figure] = [_against(scale, key, label, plane, None, wanted, name)]
+        column: list[Slider | Figure] = [_against(paint, scale, key, label, plane, None, wanted, name)]
         if name in errors:
-            column.append(_error(errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
+            column.append(_error(paint, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
         stacks.append(tuple(column))
     return Panel(key, _map_note(truth, scale), tuple(stacks), False)
 
@@ -182,11 +206,11 @@ class Scale:
             return pictures.mapped(plane[..., 0], self.low, self.high, pictures.VALUES)
         return pictures.srgb(plane[..., :3] * self.factor)
 
-    def picture(self, plane: np.ndarray, alt: str) -> Picture:
+    def picture(self, paint: Painter, plane: np.ndarray, alt: str) -> Picture:
         """The same as a picture of the page."""
         if plane.shape[-1] == 1:
-            return pictures.false_colour(plane[..., 0], self.low, self.high, pictures.VALUES, alt)
-        return pictures.colour(plane[..., :3], self.factor, alt)
+            return paint.false_colour(plane[..., 0], self.low, self.high, pictures.VALUES, alt)
+        return paint.colour(plane[..., :3], self.factor, alt)
 
     @property
     def bar(self) -> ColourBar | None:
@@ -216,6 +240,7 @@ def _planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
 
 
 def _against(
+    paint: Painter,
     scale: Scale,
     key: str,
     label: str,
@@ -224,18 +249,18 @@ def _against(
     wanted: np.ndarray | None,
     name: str = "Recovered",
 ) -> Slider | Figure:
-    found = scale.picture(plane, f"{key} {label}: {name}")
+    found = scale.picture(paint, plane, f"{key} {label}: {name}")
     caption = label.capitalize()
     if wanted is not None:
-        return Slider(scale.picture(wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
+        return Slider(scale.picture(paint, wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
     if start is not None:
-        return Slider(scale.picture(start, f"{key} {label}: start"), found, "Start", name, caption)
+        return Slider(scale.picture(paint, start, f"{key} {label}: start"), found, "Start", name, caption)
     return Figure(found, caption or name, "", scale.bar)
 
 
-def _error(error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
+def _error(paint: Painter, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
     note = f"mean {words.number(_finite_mean(error))}"
-    return Figure(pictures.false_colour_error(error, high, alt), caption, note, pictures.error_bar(high))
+    return Figure(paint.error(error, high, alt), caption, note, pictures.error_bar(high))
 
 
 def _finite_mean(values: np.ndarray) -> float:

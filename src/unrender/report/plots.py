@@ -10,10 +10,13 @@ import numpy as np
 
 from unrender.report import words
 
+AXES = ("seconds", "samples")
+"""What a curve may run over."""
 WIDTH, HEIGHT = 420, 270
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
 _LOGARITHMIC_FROM = 4.0
 _COLOURS = 6
+_LARGEST = 1e280
 
 
 @dataclass(frozen=True)
@@ -131,8 +134,9 @@ def is_logarithmic(values: np.ndarray) -> bool:
 
 def _vertical(lines: Sequence[Line]) -> Axis:
     parts = [line.y for line in lines] + [b for line in lines for b in (line.low, line.high) if b is not None]
-    values = np.concatenate([part[np.isfinite(part)] for part in parts])
-    middle = np.concatenate([line.y[np.isfinite(line.y)] for line in lines])
+    # Beyond what doubles hold with a margin, marks on the axis would overflow.
+    values = np.clip(np.concatenate([part[np.isfinite(part)] for part in parts]), -_LARGEST, _LARGEST)
+    middle = np.clip(np.concatenate([line.y[np.isfinite(line.y)] for line in lines]), -_LARGEST, _LARGEST)
     if is_logarithmic(middle):
         # A band that touches zero must not stretch the axis without end.
         low, high = max(values[values > 0].min(), middle.min() / 10), values.max()

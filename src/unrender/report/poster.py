@@ -98,6 +98,8 @@ def _draw(axes: Axes, metric: Metric, over: str) -> None:
 
 
 def _plain(text: str) -> str:
-    """Untrusted text without matplotlib's mathematics, and without a leading underscore, which hides from legends."""
-    short = text if len(text) <= 60 else text[:57] + "…"
+    """Untrusted text without matplotlib's mathematics, without what has no glyph, and without a leading underscore, which hides from
+    legends."""
+    printable = "".join(letter if letter.isprintable() and ord(letter) < 0x2000 else "?" for letter in text)
+    short = printable if len(printable) <= 60 else printable[:57] + "…"
     return short.lstrip("_").replace("$", r"\$")

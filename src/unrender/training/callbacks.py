@@ -10,10 +10,14 @@ if TYPE_CHECKING:
 
 
 class Callback:
-    """Listens to a run. Override what is of interest; time spent here is not counted as the run's."""
+    """Listens to a run. Override what is of interest; time spent here is not counted as the run's.
+
+    One that waits, to pause the run, should look at `run.stopped` meanwhile, which Ctrl-C sets. The history of the steps so far is on
+    the disk (`run.folder`, None where the run keeps none).
+    """
 
     def on_start(self, run: Run) -> None:
-        """Before the first step."""
+        """Before the first step, or the first after the run was taken up again (`run.step`)."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """After each step, with its line of the history. `run.stop()` ends the run."""

@@ -2,73 +2,55 @@
 
 from __future__ import annotations
 
-import signal
-import threading
+import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unrender import arrays, trees
+from unrender import arrays, checks, trees
 from unrender.errors import InputError
 from unrender.gradients.estimate import Estimate, Estimator
 from unrender.keys import Key
 from unrender.optimizers.base import Optimizer
 from unrender.problem.bounds import project
+from unrender.problem.fingerprint import fingerprint
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
+from unrender.problem.stored import origin
+from unrender.training import method_file
 from unrender.training.callbacks import Callback
+from unrender.training.folder import Keeper
 from unrender.training.noise import GradientNoise
 from unrender.training.pictures import pictures
 from unrender.training.result import Result
+from unrender.training.run import Memory, Run, interruptible, snapshot
 from unrender.trees import Tree
 
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _INFLUENCE_STEPS = 5
 _HOPELESS_STEPS = 20
 _ERRORS_PER_SECOND = 10.0
 
 
-@dataclass
-class Run:
-    """A run as callbacks see it.
+@dataclass(frozen=True)
+class About:
+    """What else a run folder should say of its run.
 
     Attributes:
-        problem, estimator, optimizer, seed: what runs.
-        steps, seconds: the budget; None where there is none.
-        step: how many steps are done.
-        clock: seconds of optimization so far.
-        parameters: the current ones (the renderer's arrays).
-        estimate: the last one.
-        skipped: steps not applied so far.
-        warnings: one line each.
+        method: its name; "" for the estimator's.
+        settings: of the method, in words that JSON has.
+        command: what was typed.
+        final_spp: samples per pixel of the final pictures; None chooses.
     """
 
-    problem: Problem
-    estimator: Estimator
-    optimizer: Optimizer
-    seed: int
-    steps: int | None
-    seconds: float | None
-    parameters: Tree
-    step: int = 0
-    clock: float = 0.0
-    estimate: Estimate | None = None
-    skipped: int = 0
-    warnings: list[str] = field(default_factory=list)
-    stopped: str = ""
-
-    def stop(self, reason: str = "callback") -> None:
-        """End the run after the present step."""
-        self.stopped = self.stopped or reason
-
-    def progress(self) -> float:
-        """The share of the budget used, in [0, 1]."""
-        shares = [self.step / self.steps if self.steps else 0.0, self.clock / self.seconds if self.seconds else 0.0]
-        return min(max(shares), 1.0)
+    method: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    final_spp: int | None = None
 
 
 def optimize(
@@ -80,6 +62,8 @@ def optimize(
     seed: int = 0,
     callbacks: Sequence[Callback] = (),
     run_directory: str | Path | None = None,
+    checkpoint_every: int | None = None,
+    about: About | None = None,
 ) -> Result:
     """Recover the problem's parameters by descent.
 
@@ -88,89 +72,182 @@ def optimize(
         estimator: where gradients come from.
         optimizer: what becomes of them.
         steps: how many steps at most, >= 1.
-        seconds: how much time at most, > 0, without warm-up and callbacks. One of the two must be given.
+        seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
             threads add to a gradient in the order they finish, and results agree to rounding.
         callbacks: listeners.
-        run_directory: where to save the result, with final pictures of every view for the report; None for nowhere.
+        run_directory: the run folder: history and checkpoints as the run goes, the result with final pictures of every view at its end; in
+            place of an earlier run's. `resume` takes up a run that ended early. None for nowhere.
+        checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a fiftieth of the time. There
+            is one at the end, too.
+        about: what else the run folder should say.
 
     Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. A step whose loss or
     gradient is not finite is not applied, nor remembered by the estimator; it is counted in `Result.skipped`.
 
+    What goes wrong with the run folder while the run goes is a line among the warnings (and in the log), and the run goes on.
+
     Raises:
-        InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense.
+        InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
+            cannot be begun, or cannot be written in the end.
     """
-    _check(estimator, optimizer, steps, seconds)
+    check(estimator, optimizer, steps, seconds)
+    if checkpoint_every is not None:
+        checks.whole("optimize", "checkpoint_every", checkpoint_every, at_least=1)
+    about = about or About()
+    run, memory = prepare(problem, estimator, optimizer, steps, seconds, seed)
+    labels = Labels(describe_run(run, about), trees.numpy(run.parameters), about.final_spp)
+    if run_directory is None:
+        return descend(run, memory, callbacks, labels)
+    run.folder = Path(run_directory)
+    method = method_file.said(run, about.method, checkpoint_every, about.final_spp)
+    labels.facts["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
+    keeper = Keeper(run.folder, problem, method, checkpoint_every, lambda line: run.warnings.append(line))
+    keeper.take()
+    try:
+        keeper.begin(labels.result(run))
+        return descend(run, memory, callbacks, labels, keeper)
+    finally:
+        keeper.close()
+
+
+@dataclass
+class Labels:
+    """What a result says of its run beside what the run found.
+
+    Attributes:
+        facts: fields of `Result`.
+        initial: {key: array}, where the descent began.
+        final_spp: of the final pictures.
+        history: one record per step.
+        warmup: seconds of tracing and compiling.
+    """
+
+    facts: dict[str, Any]
+    initial: dict[str, np.ndarray]
+    final_spp: int | None = None
+    history: list[dict[str, Any]] = field(default_factory=list)
+    warmup: float = 0.0
+
+    def result(self, run: Run, info: bool = False) -> Result:
+        """What the run has reached so far; with `info`, what the last estimate tells besides."""
+        return Result(
+            parameters=trees.numpy(run.parameters),
+            initial=self.initial,
+            history=self.history,
+            seconds=run.clock,
+            warmup_seconds=self.warmup,
+            stopped=run.stopped,
+            skipped=run.skipped,
+            warnings=run.warnings,
+            info=_as_numpy(run.estimate.info) if info and run.estimate else {},
+            **self.facts,
+        )
+
+
+def prepare(
+    problem: Problem,
+    estimator: Estimator,
+    optimizer: Optimizer,
+    steps: int | None,
+    seconds: float | None,
+    seed: int,
+) -> tuple[Run, Memory]:
+    """A run before its first step."""
     parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.initial().items()}
     state = estimator.init(problem, parameters)
-    memory = optimizer.init(parameters, problem.learning_rates)
-    run = Run(problem, estimator, optimizer, seed, steps, seconds, parameters)
-    history: list[dict[str, Any]] = []
-    noise = GradientNoise()
-    silent = dict.fromkeys(parameters, True)
-    samples, in_a_row, next_error = 0, 0, 0.0
-
-    warmup = _warm_up(run, state, memory)
-    with _interruptible(run):
-        for callback in callbacks:
-            callback.on_start(run)
-        while not run.stopped:
-            started = time.perf_counter()
-            key = Key(seed, run.step)
-            estimate, next_state = estimator.estimate(problem, run.parameters, state, key)
-            finite = np.isfinite(estimate.loss) and trees.all_finite(estimate.gradient)
-            finite = finite and (estimate.variance is None or trees.all_finite(estimate.variance))
-            if finite:
-                run.parameters, memory = _apply(problem, estimate, memory, optimizer, run.parameters)
-                state = next_state
-            run.clock += time.perf_counter() - started
-
-            run.step += 1
-            run.estimate = estimate
-            samples += int(estimate.info.get("samples", 0))
-            in_a_row = 0 if finite else in_a_row + 1
-            run.skipped += not finite
-            if finite and run.step <= _INFLUENCE_STEPS:
-                _watch_influence(run, estimate, silent)
-            _budget(run, in_a_row)
-            record: dict[str, Any] = {
-                "step": run.step - 1,
-                "seconds": run.clock,
-                "loss": estimate.loss,
-                "samples": samples,
-                "gradient_noise": noise.update(estimate.gradient, estimate.variance) if finite else None,
-            }
-            if problem.truth and (run.stopped or run.clock >= next_error):
-                record["parameter_error"] = problem.parameter_error(run.parameters)
-                next_error = run.clock + 1 / _ERRORS_PER_SECOND
-            history.append(record)
-            for callback in callbacks:
-                callback.on_step(run, record)
-
-    result = Result(
-        parameters=trees.numpy(run.parameters),
-        initial=trees.numpy(parameters),
-        history=history,
-        seconds=run.clock,
-        warmup_seconds=warmup,
-        stopped=run.stopped,
-        skipped=run.skipped,
-        warnings=run.warnings,
-        info=_as_numpy(run.estimate.info) if run.estimate else {},
-        name=problem.name,
-        method=describe(estimator),
-        settings={"estimator": repr(estimator), "optimizer": repr(optimizer), "steps": steps, "seconds": seconds},
-        seed=seed,
-        problem=_describe_problem(problem),
-        truth=problem.truth,
+    memory = Memory(
+        state,
+        optimizer.init(parameters, problem.learning_rates),
+        GradientNoise(),
+        dict.fromkeys(parameters, True),
     )
-    if run_directory is not None:
-        result.save(run_directory)  # what took long is safe before what takes seconds more
-        result = replace(result, pictures=pictures(problem, result))
-        result.save(run_directory)
+    return Run(problem, estimator, optimizer, seed, steps, seconds, parameters), memory
+
+
+def descend(
+    run: Run,
+    memory: Memory,
+    callbacks: Sequence[Callback],
+    labels: Labels,
+    keeper: Keeper | None = None,
+    take_up: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
+) -> Result:
+    """Run until the budget is used up.
+
+    Args:
+        run, memory: from `prepare`.
+        callbacks: listeners.
+        labels: for the result; its history goes on.
+        keeper: of the run folder, already begun.
+        take_up: brings the run to where it goes on from, called after the warm-up; it is shown the snapshots of a fresh run and of one
+            after two steps, which tell the form of states.
+    """
+    try:
+        fresh = snapshot(run, memory)
+        seconds, warm = _warm_up(run, memory)
+        labels.warmup += seconds
+        if take_up is not None:
+            take_up(fresh, warm)
+        with interruptible(run):
+            _budget(run, memory.in_a_row)
+            for callback in callbacks:
+                callback.on_start(run)
+            while not run.stopped:
+                record = _step(run, memory)
+                labels.history.append(record)
+                if keeper is not None:
+                    keeper.step(record)
+                    if keeper.is_due(run.step):
+                        keeper.checkpoint(labels.result(run), run.seed, snapshot(run, memory))
+                for callback in callbacks:
+                    callback.on_step(run, record)
+        result = labels.result(run, info=True)
+        if keeper is not None:
+            keeper.checkpoint(result, run.seed, snapshot(run, memory))
+            keeper.save(result, "running")  # what took long is safe before what takes seconds more
+            result = replace(result, pictures=pictures(run.problem, result, labels.final_spp))
+            keeper.save(result, result.status)
+    except BaseException as error:
+        if keeper is not None:
+            keeper.fail(labels.result(run), error)
+        raise
     for callback in callbacks:
         callback.on_end(run, result)
     return result
+
+
+def _step(run: Run, memory: Memory) -> dict[str, Any]:
+    """One step. Returns its line of the history."""
+    problem = run.problem
+    started = time.perf_counter()
+    estimate, after = run.estimator.estimate(problem, run.parameters, memory.estimator, Key(run.seed, run.step))
+    finite = bool(np.isfinite(estimate.loss)) and trees.all_finite(estimate.gradient)
+    finite = finite and (estimate.variance is None or trees.all_finite(estimate.variance))
+    if finite:
+        run.parameters, memory.optimizer = _apply(problem, estimate, memory.optimizer, run.optimizer, run.parameters)
+        memory.estimator = after
+    run.clock += time.perf_counter() - started
+
+    run.step += 1
+    run.estimate = estimate
+    memory.samples += int(estimate.info.get("samples", 0))
+    memory.in_a_row = 0 if finite else memory.in_a_row + 1
+    run.skipped += not finite
+    if finite and run.step <= _INFLUENCE_STEPS:
+        _watch_influence(run, estimate, memory.silent)
+    _budget(run, memory.in_a_row)
+    record: dict[str, Any] = {
+        "step": run.step - 1,
+        "seconds": run.clock,
+        "loss": estimate.loss,
+        "samples": memory.samples,
+        "gradient_noise": memory.noise.update(estimate.gradient, estimate.variance) if finite else None,
+    }
+    if problem.truth and (run.stopped or run.clock >= memory.next_error):
+        record["parameter_error"] = problem.parameter_error(run.parameters)
+        memory.next_error = run.clock + 1 / _ERRORS_PER_SECOND
+    return record
 
 
 def estimate(
@@ -204,7 +281,8 @@ def describe(estimator: Estimator) -> str:
     return type(estimator).__name__ + (f"({', '.join(words)})" if words else "")
 
 
-def _check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:
+def check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:
+    """Raise `InputError` where the two do not go together, or the budget makes no sense."""
     missing = optimizer.requires - estimator.provides
     if missing:
         raise InputError(
@@ -212,6 +290,11 @@ def _check(estimator: Estimator, optimizer: Optimizer, steps: int | None, second
             f"(it provides {_list(estimator.provides)}); choose an estimator that does, or an optimizer that requires "
             "the gradient alone, such as Adam"
         )
+    check_budget(steps, seconds)
+
+
+def check_budget(steps: int | None, seconds: float | None) -> None:
+    """Raise `InputError` unless a run can have this budget."""
     if steps is None and seconds is None:
         raise InputError("optimize: give a budget, steps= or seconds=")
     if steps is not None and (not isinstance(steps, int) or steps < 1):
@@ -224,15 +307,17 @@ def _list(names: frozenset[str]) -> str:
     return ", ".join(f'"{name}"' for name in sorted(names)) or "nothing"
 
 
-def _warm_up(run: Run, state: Any, memory: Any) -> float:
-    """Trace and compile every kernel of a step by taking two that are thrown away. Returns the seconds it took."""
+def _warm_up(run: Run, memory: Memory) -> tuple[float, dict[str, Any]]:
+    """Trace and compile every kernel of a step by taking two that are thrown away. Returns the seconds it took, and the snapshot after."""
     started = time.perf_counter()
-    parameters = run.parameters
+    there = replace(run, warnings=[])
+    away = replace(memory, noise=GradientNoise())
     for _ in range(2):
         key = Key(run.seed, 0, stream=1)
-        found, state = run.estimator.estimate(run.problem, parameters, state, key)
-        parameters, memory = _apply(run.problem, found, memory, run.optimizer, parameters)
-    return time.perf_counter() - started
+        found, away.estimator = run.estimator.estimate(run.problem, there.parameters, away.estimator, key)
+        there.parameters, away.optimizer = _apply(run.problem, found, away.optimizer, run.optimizer, there.parameters)
+        away.noise.update(found.gradient, found.variance)
+    return time.perf_counter() - started, snapshot(there, away)
 
 
 def _apply(
@@ -267,36 +352,34 @@ def _budget(run: Run, non_finite_in_a_row: int) -> None:
         run.warnings.append(f"the last {_HOPELESS_STEPS} gradients were not finite: the run was given up")
 
 
-@contextmanager
-def _interruptible(run: Run) -> Iterator[None]:
-    """Let the first Ctrl-C end the run after the present step; the second one interrupts at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def ask(number: int, frame: Any) -> None:
-        del number, frame
-        run.stop("interrupted")
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _as_numpy(info: Any) -> Any:
     if isinstance(info, Mapping):
         return {key: _as_numpy(value) for key, value in info.items()}
     return arrays.numpy(info) if arrays.is_drjit(info) else info
 
 
-def _describe_problem(problem: Problem) -> dict[str, Any]:
+def fingerprint_of(run: Run) -> dict[str, str]:
+    """The problem's fingerprint, and what works on it, in words."""
+    parts = {"estimator": run.estimator, "optimizer": run.optimizer}
+    return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(part)) for name, part in parts.items()}
+
+
+def describe_run(run: Run, about: About) -> dict[str, Any]:
+    """Fields of `Result` that are known before the first step."""
+    problem = run.problem
+    loss = repr(problem.loss) if is_dataclass(problem.loss) else type(problem.loss).__name__
+    parts = {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
     return {
-        "parameters": [p.key for p in problem.parameters],
-        "views": len(problem.views),
-        "loss": repr(problem.loss) if is_dataclass(problem.loss) else type(problem.loss).__name__,
-        "max_depth": problem.max_depth,
+        "name": problem.name,
+        "method": about.method or describe(run.estimator),
+        "settings": {**about.settings, **parts, "steps": run.steps, "seconds": run.seconds},
+        "seed": run.seed,
+        "command": about.command,
+        "problem": {
+            "parameters": [p.key for p in problem.parameters],
+            "views": len(problem.views),
+            "loss": loss,
+            "max_depth": problem.max_depth,
+        },
+        "truth": problem.truth,
     }

@@ -6,6 +6,7 @@ import numpy as np
 
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
+from unrender.thumbnails import stretched
 from unrender.training.result import Result
 
 _PICTURE_PATHS = 1 << 22
@@ -13,13 +14,13 @@ _FEWEST, _MOST = 16, 512
 
 
 def pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
-    """Reference, initial and final picture of each view, and the control weight where there is one.
+    """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any.
 
     Args:
         problem, result: whose.
         spp: samples per pixel, or None for as many as some four million paths per picture allow.
     """
-    weights = result.info.get("control_weight", {})
+    weights, likely = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     found: dict[str, np.ndarray] = {}
     for index, view in enumerate(problem.views):
         reference = np.asarray(view.reference, np.float32)
@@ -29,4 +30,7 @@ def pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[s
         found[f"view{index}/result"] = render(problem, result.parameters, index, samples, seed=2)
         if index in weights:
             found[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
+        if index in likely:
+            density = np.asarray(likely[index], np.float32)
+            found[f"view{index}/pixel_probability"] = stretched(density, *reference.shape[:2])
     return found

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,8 @@ import numpy as np
 
 from unrender import files
 from unrender.errors import InputError
-from unrender.variant import current
+from unrender.training.history import lines
+from unrender.variant import LLVM, current, llvm_version
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Result:
         warnings: one line each.
         info: of the last estimate, as NumPy arrays.
         name, method, settings, seed, command, problem: what was run.
+        resumed: the steps at which it was taken up again.
         truth: {key: array} where it is known.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
     """
@@ -56,6 +58,7 @@ class Result:
     seed: int = 0
     command: str = ""
     problem: Mapping[str, Any] = field(default_factory=dict)
+    resumed: Sequence[int] = ()
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
 
@@ -64,29 +67,37 @@ class Result:
         """How many steps were taken, skipped ones among them."""
         return len(self.history)
 
-    def save(self, directory: str | Path) -> Path:
+    @property
+    def status(self) -> str:
+        """ "interrupted", or "finished"."""
+        return "interrupted" if self.stopped == "interrupted" else "finished"
+
+    def save(self, directory: str | Path, status: str | None = None) -> Path:
         """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz.
 
-        Each file is written beside its place and renamed. Raises `InputError` where the folder cannot be written.
+        Each file is written beside its place and renamed; run.json, with `status` (None for the result's own), comes last. Raises
+        `InputError` where the folder cannot be written.
         """
         folder = Path(directory)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _write_arrays(folder / "parameters.npz", self.parameters)
-            _write_arrays(folder / "initial.npz", self.initial)
+            files.write_arrays(folder / "parameters.npz", self.parameters)
+            files.write_arrays(folder / "initial.npz", self.initial)
             if self.truth:
-                _write_arrays(folder / "truth.npz", self.truth)
+                files.write_arrays(folder / "truth.npz", self.truth)
             if self.pictures:
-                _write_arrays(folder / "pictures.npz", self.pictures)
-            lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in map(_without_nan, self.history))
-            files.write(folder / "history.jsonl", lines.encode())
-            files.write(folder / "run.json", (json.dumps(self._summary(), indent=2) + "\n").encode())
+                files.write_arrays(folder / "pictures.npz", self.pictures)
+            files.write(folder / "history.jsonl", lines(self.history))
+            record = json.dumps(self.record(status or self.status), indent=2) + "\n"
+            files.write(folder / "run.json", record.encode(), durable=True)
         except OSError as error:
             raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
         return folder
 
-    def _summary(self) -> dict[str, Any]:
+    def record(self, status: str) -> dict[str, Any]:
+        """What run.json says of it; `status` is "running", "finished", "interrupted" or "failed"."""
         return {
+            "status": status,
             "name": self.name,
             "method": self.method,
             "settings": dict(self.settings),
@@ -102,11 +113,17 @@ class Result:
             "skipped": self.skipped,
             "warnings": list(self.warnings),
             "problem": dict(self.problem),
+            "resumed": list(self.resumed),
         }
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide the numbers."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for package in ("unrender", "mitsuba", "drjit", "numpy"):
         try:
@@ -116,8 +133,27 @@ def versions() -> dict[str, str]:
     return found
 
 
+def deciding_versions() -> dict[str, str]:
+    """What decides the bits of a run's numbers, as far as versions can: packages, LLVM, the variant."""
+    return dict(_deciding_versions(current() or "none"))
+
+
+@cache
+def _deciding_versions(name: str) -> dict[str, str]:
+    found = {name: version for name, version in versions().items() if name != "python"}
+    for package in ("scipy", "cholespy", "cma"):
+        found[package] = metadata.version(package)
+    llvm = llvm_version() if name == LLVM else None
+    return {**found, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
+
+
 def hardware() -> dict[str, Any]:
     """The processor and how many cores this process may use."""
+    return dict(_hardware())
+
+
+@cache
+def _hardware() -> dict[str, Any]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {"processor": _processor(), "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
 
@@ -131,15 +167,3 @@ def _processor() -> str:
         except OSError:
             pass
     return platform.processor() or platform.machine()
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _without_nan(v) for k, v in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
-    files.write(path, buffer.getvalue())

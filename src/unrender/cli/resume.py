@@ -1,0 +1,49 @@
+"""`unrender resume`: take up a run where its last checkpoint left it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from unrender import reopen
+from unrender.cli import arguments
+from unrender.cli.arguments import Threads
+from unrender.cli.execute import introduce
+from unrender.cli.progress import Progress
+from unrender.cli.run import conclude
+from unrender.training.live import Live
+from unrender.training.resume import go_on, look
+
+
+def resume(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")],
+    steps: Annotated[
+        int | None, typer.Option(help="Stop after that many steps, counted from the run's start. [default: as the run]")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after that much time, likewise.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Go on though the problem, its files or versions changed since.")
+    ] = False,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba's variant. [default: the run's]")] = None,
+    threads: Threads = None,
+) -> None:
+    """Go on with a run that was interrupted or killed, or give a finished one more.
+
+    It goes on from its last checkpoint and becomes the run that it would have been without the interruption.
+    """
+    console = Console(highlight=False)
+    if steps is not None or seconds is not None:
+        steps, seconds = arguments.budget(steps, seconds)
+    found = look(directory, steps, seconds)
+    alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
+    running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)
+    problem = reopen.problem_of(directory)
+    introduce(console, problem, running)
+    live = Live(directory, problem.name, found.record.method, found.record.command)
+    with Progress(console) as progress:
+        result = go_on(found, problem, force, [progress, live])
+    live.clear()
+    conclude(console, problem, result, directory)

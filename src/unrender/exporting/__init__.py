@@ -1,0 +1,1 @@
+"""The result taken home: a scene folder that plain Mitsuba loads, and the recovered maps alone."""

@@ -1,0 +1,136 @@
+"""What the page of a run tells in words and numbers: its head, its parameters, its views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.report import curves, measures, pictures, words
+from unrender.report.folder import RunFolder, root_mean_square
+
+STOPPED = {
+    "steps": "all steps done",
+    "seconds": "stopped when time was up",
+    "interrupted": "interrupted: this is what was reached",
+    "callback": "stopped by a callback",
+    "non-finite": "given up: gradients were not finite",
+}
+"""How a run may end, in words."""
+_LISTED_VALUES = 4
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure of the page's head: what it was, what it became."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One line of the table of parameters. Values as text, errors as numbers, None where not known."""
+
+    key: str
+    shape: str
+    truth: str
+    start: str
+    recovered: str
+    swatch: str
+    error_before: float | None
+    error_after: float | None
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """One line of the table of views.
+
+    Attributes:
+        view: its index.
+        before, after: root mean square errors over pixels and channels, at the start and of the result.
+        measures: {name: value} of the result, by the other measures; empty beyond the first views.
+    """
+
+    view: int
+    before: float | None
+    after: float | None
+    measures: dict[str, float | None]
+
+
+def tiles(run: RunFolder) -> list[Tile]:
+    """The head of a run's page."""
+    found = []
+    series = [(key, s) for key in run.truth if (s := curves.parameter_error(run, key)) is not None]
+    if len(series) == 1:
+        found.append(_tile("Parameter error", float(series[0][1].values[0]), float(series[0][1].values[-1]), "RMSE"))
+    elif (relative := curves.relative_error(run, list(run.truth))) is not None:
+        found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
+    after = curves.image_error(run)
+    if after is not None:
+        views = run.views.values()
+        before = [root_mean_square(of.initial, of.reference) for of in views if of.initial is not None]
+        known = [error for error in before if error is not None]
+        start = float(np.mean(known)) if len(known) == len(views) else None
+        found.append(_tile("Image error", start, after, "RMSE"))
+    loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
+    if loss is not None:
+        found.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
+    note = f"and {words.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
+    found.append(Tile("Time", words.duration(run.record.seconds), note))
+    skipped = f"{run.record.skipped} skipped, not finite" if run.record.skipped else ""
+    found.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
+    if len(run.history):
+        samples, seconds = float(run.history.samples[-1]), float(run.history.seconds[-1])
+        rate = f"{words.count(samples / seconds)} per second" if seconds > 0 else ""
+        found.append(Tile("Samples", words.count(samples), rate))
+    return found
+
+
+def _tile(label: str, before: float | None, after: float, unit: str) -> Tile:
+    return Tile(label, words.number(after), f"{unit}, from {words.number(before)}" if before is not None else unit)
+
+
+def row(run: RunFolder, key: str) -> ParameterRow:
+    """One parameter."""
+    result, initial, truth = run.parameters[key], run.initial[key], run.truth.get(key)
+    return ParameterRow(
+        key,
+        " × ".join(str(n) for n in run.shape(key)) or "number",
+        _values(truth) if truth is not None else "",
+        _values(initial),
+        _values(result),
+        _swatch(result),
+        run.error_before.get(key),
+        run.error_after.get(key),
+    )
+
+
+def _values(array: np.ndarray) -> str:
+    if array.size == 0:
+        return ""
+    if array.size > _LISTED_VALUES:
+        return " … ".join(words.number(float(value)) for value in (array.min(), array.max()))
+    return ", ".join(words.number(float(value)) for value in array.reshape(-1))
+
+
+def _swatch(array: np.ndarray) -> str:
+    """The colour of a parameter of three values within [0, 1], as #rrggbb; empty for others."""
+    if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
+        return ""
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in pictures.srgb(array.reshape(-1)))
+
+
+def view_rows(run: RunFolder) -> list[ViewRow]:
+    """All views."""
+    measured = measures.of_views(run)
+    return [
+        ViewRow(
+            view,
+            None if of.initial is None else root_mean_square(of.initial, of.reference),
+            root_mean_square(of.result, of.reference),
+            measured.get(view, {}),
+        )
+        for view, of in run.views.items()
+    ]

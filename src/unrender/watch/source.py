@@ -1,0 +1,218 @@
+"""One run folder as it is now: running, paused, finished, not there yet, or gone."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from unrender.errors import InputError
+from unrender.report import reading
+from unrender.report.folder import RunFolder, ViewPictures, pictures_by_view, read, read_record
+from unrender.report.history import History, Reader
+from unrender.training.live import FOLDER
+
+_FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz")
+_LIVE_FILES = ("status.json", "start.npz", "views.npz", *_FILES)
+_Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"
+FINISHED, LOST, VANISHED = "finished", "lost", "vanished"
+"""What a run may be doing. Lost: its process ended without a word."""
+
+
+class Status(BaseModel):
+    """live/status.json. Fields beyond these are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    status: str
+    stopped: str = ""
+    step: _Count = 0
+    steps: _Count | None = None
+    seconds: _Number = 0.0
+    budget_seconds: _Number | None = None
+    skipped: _Count = 0
+    warnings: list[str] = []
+    control: str = "run"
+    process: Annotated[int, Field(gt=0, lt=2**31)] | None = None
+    host: str = ""
+    initial_error: dict[str, float] = {}
+    shapes: dict[str, list[_Count]] = {}
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What is known of a run.
+
+    Attributes:
+        path: the run folder.
+        state: one of the above.
+        run: all that could be read, or None.
+        status: of a run that is live, or None.
+        problems: what could not be read, one line each.
+    """
+
+    path: Path
+    state: str
+    run: RunFolder | None = None
+    status: Status | None = None
+    problems: tuple[str, ...] = ()
+
+    @property
+    def listens(self) -> bool:
+        """Whether commands reach it."""
+        return self.state in (RUNNING, PAUSED)
+
+
+class Source:
+    """Follows a run folder. Nothing in it is trusted, nothing of it is required.
+
+    Attributes:
+        path: the folder.
+        revision: how often something new was seen.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._seen: tuple = ()
+        self._last = Snapshot(path, WAITING)
+        self._histories: dict[Path, Reader] = {}
+        self.revision = 0
+
+    def snapshot(self) -> Snapshot:
+        """What is there now; the same object as before where nothing has changed. Never raises for what is in the folder."""
+        stamps = self._stamps()
+        if stamps != self._seen:
+            found = self._look()
+            if found.run is None and self._last.run is not None and found.state in (VANISHED, WAITING):
+                found = Snapshot(self.path, VANISHED, self._last.run, self._last.status, found.problems)
+            self._seen, self._last = stamps, found
+            self.revision += 1
+        return self._last
+
+    def _stamps(self) -> tuple:
+        """Of every file that is read, and of whether the run's process lives."""
+        found: list[Any] = []
+        for path in [self.path / name for name in _FILES] + [self.path / FOLDER / name for name in _LIVE_FILES]:
+            try:
+                status = os.stat(path, follow_symlinks=False)
+                found.append((status.st_mtime_ns, status.st_size, status.st_ino))
+            except OSError:
+                found.append(None)
+        status = self._last.status
+        return (self.path.is_dir(), status is not None and _alive(status), *found)
+
+    def _look(self) -> Snapshot:
+        if not self.path.is_dir():
+            return Snapshot(self.path, VANISHED)
+        problems: list[str] = []
+        status = self._try(problems, self._status)
+        if status is not None and (status.status in (RUNNING, PAUSED) or not reading.exists(self.path / "run.json")):
+            run = self._try(problems, lambda: self._live(status, problems))
+            state = SAVING if status.status not in (RUNNING, PAUSED) else status.status
+            return Snapshot(self.path, state if _alive(status) else LOST, run, status, tuple(problems))
+        if status is None and not reading.exists(self.path / "run.json"):
+            return Snapshot(self.path, WAITING, problems=tuple(problems))
+        run = self._try(problems, lambda: read(self.path))
+        if run is None and status is not None:
+            run = self._try(problems, lambda: self._live(status, problems))
+        return Snapshot(self.path, FINISHED if run is not None else WAITING, run, status, tuple(problems))
+
+    def _status(self) -> Status | None:
+        path = self.path / FOLDER / "status.json"
+        if not reading.exists(path):
+            return None
+        found = reading.parse(reading.text(path, self.path), str(path))
+        try:
+            return Status.model_validate(found)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = reading.shown(".".join(str(part) for part in first["loc"]))
+            raise InputError(f"{path}: {name}: {first['msg']}, got {reading.shown(repr(first['input']))}") from error
+
+    def _live(self, status: Status, problems: list[str]) -> RunFolder:
+        """A run that goes on, from live/. What is missing is left out; what cannot be read is told in `problems`."""
+        live = self.path / FOLDER
+        record = read_record(live / "run.json", self.path)
+        told = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
+        record = record.model_copy(update={**told, "skipped": status.skipped, "warnings": status.warnings})
+        parameters, initial, truth, start, views = (
+            self._arrays(live / f"{name}.npz", problems)
+            for name in ("parameters", "initial", "truth", "start", "views")
+        )
+        history = self._try(problems, self._history) or _EMPTY
+        parameters = {key: value for key, value in parameters.items() if key in initial}
+        return RunFolder(
+            self.path,
+            record,
+            history,
+            parameters,
+            initial,
+            {key: value for key, value in truth.items() if key in parameters},
+            self._try(problems, lambda: _views(start, views, live)) or {},
+            {key: error for key, error in status.initial_error.items() if key in truth},
+            {key: float(of.values[-1]) for key, of in history.parameter_error.items() if key in truth},
+            {key: tuple(shape) for key, shape in status.shapes.items()},
+        )
+
+    def _history(self) -> History | None:
+        """The one that grows: in live/ where there is one, else the folder's own."""
+        for path in (self.path / FOLDER / "history.jsonl", self.path / "history.jsonl"):
+            if reading.exists(path):
+                return self._histories.setdefault(path, Reader(path, self.path)).read(to_the_end=False)
+        return None
+
+    def _arrays(self, path: Path, problems: list[str]) -> dict[str, np.ndarray]:
+        if not reading.exists(path):
+            return {}
+        return self._try(problems, lambda: reading.arrays(path, self.path)) or {}
+
+    def _try(self, problems: list[str], function: Callable[[], Any]) -> Any:
+        """What `function` returns; None, and a line in `problems`, where what it reads is malformed."""
+        try:
+            return function()
+        except InputError as error:
+            problems.append(str(error))
+        except FileNotFoundError:
+            pass  # replaced or removed while it was read: the next look will tell
+        except OSError as error:
+            problems.append(f"{self.path}: cannot be read: {error.strerror or error}")
+        return None
+
+
+_EMPTY = History(*(np.array([]) for _ in range(4)), parameter_error={})
+
+
+def _views(start: dict[str, np.ndarray], now: dict[str, np.ndarray], where: Path) -> dict[int, ViewPictures]:
+    """Views that have a reference and a picture. A weight of one channel, or none, is spread over three."""
+    arrays = {**start, **now}
+    found: dict[str, np.ndarray] = {}
+    for name, array in arrays.items():
+        view = name.partition("/")[0]
+        if f"{view}/reference" not in arrays or f"{view}/result" not in arrays:
+            continue
+        if name.endswith("/control_weight") and (array.ndim == 2 or array.shape[-1] == 1):
+            array = np.repeat(array.reshape(*array.shape[:2], 1), 3, axis=2)
+        found[name] = array
+    return pictures_by_view(found, where / "views.npz")
+
+
+def _alive(status: Status) -> bool:
+    """Whether the run's process lives, as far as this machine can tell."""
+    if status.process is None or status.host != platform.node():
+        return True
+    try:
+        os.kill(status.process, 0)  # signal 0 asks, and does nothing
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

@@ -1,0 +1,191 @@
+"""Runs killed at random instants, while they write too, end where they would have ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from victim import CASES
+
+import unrender as package
+from unrender.report import folder as report_folder
+from unrender.training import checkpoint
+from unrender.training.checkpoint import STATE
+
+SOURCE = str(Path(package.__file__).parents[1])
+ENVIRONMENT = {**os.environ, "PYTHONPATH": SOURCE}
+TINY = ["-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8"]
+COMMANDS = {
+    "plain": ["indirect-room", *TINY, "--method", "plain", "--set", "spp=2"],
+    "rcv": ["indirect-room", *TINY, "--method", "rcv"],
+    "rcv, primary": ["lamp", "-p", "resolution=8", "-p", "reference_spp=8", "--set", "space=primary"],
+    "adaptive": ["indirect-room", *TINY, "--method", "adaptive", "--set", "pixels=32", "--set", "refresh=7"],
+    "meta": ["indirect-room", *TINY, "--method", "meta"],
+    "coupled, rcv": ["indirect-room", *TINY, "--method", "coupled", "--set", "image=rcv"],
+    "smoothed": ["box2", "-p", "resolution=8", "-p", "reference_spp=8", "--method", "smoothed", "--set", "samples=4"],
+}
+COMMAND_STEPS = 40
+
+
+class Killer:
+    """Starts runs in children of one process and kills them."""
+
+    def __init__(self) -> None:
+        victim = Path(__file__).with_name("victim.py")
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen([sys.executable, str(victim)], env=ENVIRONMENT, **pipes)
+
+    def live(self, case: str, folder: Path, every: int, after: float | None = None) -> int:
+        """Let a run live, for `after` seconds or to its end. Returns its exit status, -9 where it was killed."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{case} {folder} {every}\n")
+        self._process.stdin.flush()
+        child = int(self._process.stdout.readline())
+        if after is not None:
+            time.sleep(after)
+            os.kill(child, signal.SIGKILL)
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        return int(self._process.stdout.readline())
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=60)
+        self._process.stdout.close()
+
+
+@pytest.fixture
+def killer() -> Iterator[Killer]:
+    made = Killer()
+    yield made
+    made.close()
+
+
+def states(folder: Path) -> dict[str, bytes]:
+    """Every number of the last checkpoint: parameters and the states of estimator and optimizer."""
+    last = max((folder / checkpoint.FOLDER).glob("[0-9]*"))
+    return {last.name: (last / STATE).read_bytes()}
+
+
+def check_readable(folder: Path) -> None:
+    """A run that has begun can be read, whatever it died of; one that has not can be begun."""
+    if (folder / "run.json").exists():
+        checkpoint.newest(folder)
+        report_folder.read(folder)
+
+
+def kill_analytic(killer: Killer, tmp_path: Path, kills: int, seed: int) -> None:
+    dice = random.Random(seed)
+    cases = list(CASES)
+    dice.shuffle(cases)
+    seconds: dict[str, float] = {}
+    died = number = 0
+    while died < kills:
+        case = cases[number % len(cases)]
+        number += 1
+        whole = tmp_path / f"{case}-whole"
+        if case not in seconds:
+            started = time.perf_counter()
+            assert killer.live(case, whole, 3) == 0
+            seconds[case] = time.perf_counter() - started
+        folder = tmp_path / f"{case}-{number}"
+        every = dice.choice((1, 1, 2, 5))
+        while killer.live(case, folder, every, dice.uniform(0, 1.1) * seconds[case]) == -signal.SIGKILL:
+            died += 1  # and once more, while it is resumed, now and then
+            check_readable(folder)
+            if dice.random() < 0.6:
+                assert killer.live(case, folder, every) == 0, (case, number)
+                break
+        assert states(folder) == states(whole), (case, number)
+        assert not list(folder.rglob("*.part"))
+        assert number < 4 * kills + 20
+
+
+def command(*words: object) -> subprocess.Popen[str]:
+    line = [sys.executable, "-m", "unrender", *map(str, words)]
+    return subprocess.Popen(line, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> int:
+    said, _ = process.communicate(timeout=300)
+    assert process.returncode in (0, -signal.SIGKILL), said
+    return process.returncode
+
+
+def wait_for_steps(process: subprocess.Popen[str], folder: Path, steps: int) -> None:
+    """Until the run has come so far, however fast the machine is; below 0, until its folder is there; or until it has ended."""
+    history = folder / "history.jsonl"
+    while process.poll() is None:
+        if folder.exists() and (steps < 0 or (history.exists() and history.read_bytes().count(b"\n") >= steps)):
+            return
+        time.sleep(0.005)
+
+
+def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
+    dice = random.Random(seed)
+    names = list(COMMANDS)
+    died = number = 0
+    while died < kills:
+        number += 1
+        assert number < 4 * kills + 20
+        name = names[number % len(names)]
+        words = [
+            *COMMANDS[name],
+            "--steps",
+            COMMAND_STEPS,
+            "--threads",
+            1,
+            "--variant",
+            "llvm_ad_rgb",
+            "--final-spp",
+            1,
+        ]
+        whole, folder = tmp_path / f"{names.index(name)}-whole", tmp_path / f"{names.index(name)}-{number}"
+        if not whole.exists():
+            assert finish(command("run", *words, "--out", whole, "--checkpoint-every", 7)) == 0
+        process = command("run", *words, "--out", folder, "--checkpoint-every", dice.choice((1, 3)))
+        wait_for_steps(process, folder, dice.randint(-3, COMMAND_STEPS))
+        time.sleep(dice.uniform(0, 0.05))
+        process.kill()
+        status = finish(process)
+        if status == 0:
+            continue
+        check_readable(folder)
+        begun = (folder / "run.json").exists()
+        if begun and json.loads((folder / "run.json").read_text())["status"] == "finished":
+            continue  # it died while it wrote its page, and is refused: there is nothing to go on with
+        died += 1
+        again = (
+            ["resume", folder] if begun else ["run", *words, "--out", folder, "--overwrite", "--checkpoint-every", 5]
+        )
+        assert finish(command(*again)) == 0, (name, number)
+        assert states(folder) == states(whole), (name, number)
+
+
+def test_some_are_killed(killer: Killer, tmp_path: Path) -> None:
+    kill_analytic(killer, tmp_path, 5, seed=1)
+
+
+def test_one_command_is_killed(tmp_path: Path) -> None:
+    kill_commands(tmp_path, 1, seed=2)
+
+
+@pytest.mark.slow
+def test_many_are_killed(killer: Killer, tmp_path: Path) -> None:
+    kill_analytic(killer, tmp_path, 78, seed=3)
+
+
+@pytest.mark.slow
+def test_many_commands_are_killed(tmp_path: Path) -> None:
+    kill_commands(tmp_path, 22, seed=4)

@@ -1,0 +1,106 @@
+"""Exports from Python: what has no description, what stays when something goes wrong, poses as matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.exporting import folder as exporting
+from unrender.rendering import poses
+from unrender.rendering.poses import Pose
+
+MADE_BEFORE: list[Any] = []
+
+
+def scene(bsdf: Any) -> dict[str, Any]:
+    return {
+        "type": "scene",
+        "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "center": [0, 0, 3], "bsdf": bsdf},
+    }
+
+
+def problem(description: Any, key: str = "sky.radiance.value") -> ur.Problem:
+    return ur.Problem(description, [ur.Parameter(key)], [ur.View(np.ones((4, 4, 3)))])
+
+
+def start(asked: ur.Problem) -> dict[str, np.ndarray]:
+    return {key: np.array(value.numpy()) for key, value in asked.initial().items()}
+
+
+def test_a_material_that_tells_no_description_is_one_line(tmp_path: Path) -> None:
+    MADE_BEFORE.append(mi.load_dict({"type": "diffuse"}))
+    for description in (scene(MADE_BEFORE[0]), lambda: scene(MADE_BEFORE[0])):
+        asked = problem(description)
+        with pytest.raises(ur.InputError, match=r"^ball\.bsdf: a ready-made .*, which tells no description of itself"):
+            ur.export((asked, start(asked)), tmp_path / "out")
+        assert not list(tmp_path.iterdir())
+    MADE_BEFORE.clear()
+
+
+def test_materials_made_by_mitsuba_in_the_function_are_heard(tmp_path: Path) -> None:
+    """One object in two shapes stays one material."""
+
+    def description() -> dict[str, Any]:
+        shared = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.25}})
+        return scene(shared) | {"other": {"type": "sphere", "center": [0, 2, 3], "bsdf": shared}}
+
+    loader = mi.load_dict
+    asked = problem(description, "ball.bsdf.brdf_0.reflectance.value")
+    done = ur.export((asked, {"ball.bsdf.brdf_0.reflectance.value": np.array(0.75)}), tmp_path / "out")
+    assert mi.load_dict is loader
+    found: Any = mi.load_file(str(done.scene))
+    shapes = [shape for shape in found.shapes() if shape.bsdf() is not None]
+    assert shapes[0].bsdf() == shapes[1].bsdf()
+    (name,) = (key for key in mi.traverse(found).keys() if key.endswith("reflectance.value"))  # noqa: SIM118
+    np.testing.assert_allclose(np.array(mi.traverse(found)[name]), 0.75)
+    assert name == "ball.bsdf.brdf_0.reflectance.value"
+    assert not done.notices
+
+
+def test_values_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    asked = problem(scene({"type": "diffuse"}))
+    with pytest.raises(ur.InputError, match="expected"):
+        ur.export((asked, {}), tmp_path / "out")
+    with pytest.raises(ur.InputError, match="shape"):
+        ur.export((asked, {"sky.radiance.value": np.zeros((2, 2))}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_with_other_values_than_asked_for_is_not_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loading what was written, and holding it to its values, is what stands between a fault here and a wrong scene."""
+    sound = exporting.store
+
+    def faulty(graph: Any, place: Any, value: Any, *more: Any) -> None:
+        sound(graph, place, value * 1.01, *more)
+
+    monkeypatch.setattr(exporting, "store", faulty)
+    asked = problem(scene({"type": "diffuse"}))
+    with pytest.raises(ur.InputError, match=r"parameter sky\.radiance\.value cannot be exported: .* another value"):
+        ur.export((asked, start(asked)), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_posed_matrices_are_the_renderers_poses() -> None:
+    """The matrix takes points where the renderer's rays see them."""
+    loaded = mi.load_dict(scene({"type": "diffuse"}), parallel=False, optimize=False)
+    values = {
+        "ball.translation": np.array([0.1, -0.2, 0.3], np.float32),
+        "ball.rotation.y": np.float32(0.7),
+        "ball.scale": np.float32(1.3),
+        "camera.rotation": np.array([0.1, 0.2, -0.3], np.float32),
+    }
+    found = poses.matrices(loaded, values)
+    assert set(found) == {"ball", "camera"}
+    point = np.array([0.4, 0.5, 2.0])
+    ball = Pose([0.0, 0.0, 3.0], [0.1, -0.2, 0.3], [0.0, 0.7, 0.0], 1.3)
+    camera = Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.2, -0.3], 1.0)
+    for name, pose in (("ball", ball), ("camera", camera)):
+        expected = np.array(pose.point(mi.Point3f(*map(float, point)))).reshape(-1)
+        np.testing.assert_allclose((found[name] @ [*point, 1])[:3], expected, rtol=1e-5)
