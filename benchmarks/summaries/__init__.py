@@ -1,0 +1,1 @@
+"""What docs/results.md says of the benchmarks, by subject."""
