@@ -125,14 +125,29 @@ def numpy(x: Array) -> np.ndarray:
     return np.array(x.numpy() if is_drjit(x) else x)
 
 
+def owned(values: Array, kind: type) -> Array:
+    """A flat Dr.Jit array of type `kind` (32 bits an element) with the elements of `values`, in memory of its own.
+
+    Dr.Jit borrows NumPy's memory where it can. What is written there later would change the array, frozen kernels read stale
+    texels or abort (Dr.Jit 1.5), and kernels are compiled once for memory that starts on a multiple of 64 bytes and once more for
+    any other, which in NumPy is chance. So the elements are laid on such a multiple, and copied by one and the same kernel.
+    """
+    given = np.ravel(values)
+    room = np.empty(given.size + 16, np.uint32 if dr.is_integral_v(kind) else np.float32)
+    start = -room.ctypes.data % 64 // 4
+    room = room[start : start + given.size]
+    room[:] = given
+    copy = kind(room) * dr.opaque(kind, 1)
+    dr.eval(copy)
+    return copy
+
+
 def like(values: np.ndarray, x: Array) -> Array:
-    """`values` as an array of the kind of `x`, in memory of its own (Dr.Jit would borrow NumPy's)."""
+    """`values` as an array of the kind of `x`, in memory of its own."""
     if not is_drjit(x):
         return np.array(values, x.dtype)
-    given = type(x)(np.ascontiguousarray(values, np.float32))
-    owned = type(x)(given.array * dr.opaque(type(given.array), 1), given.shape)
-    dr.eval(owned)
-    return owned
+    flat = owned(values, dr.array_t(x))
+    return type(x)(flat, np.shape(values)) if dr.is_tensor_v(x) else flat
 
 
 def number(x: Array) -> float:
@@ -142,13 +157,9 @@ def number(x: Array) -> float:
 
 def like_integers(values: np.ndarray, like: Array) -> Array:
     """Whole numbers in [0, 2**32) in the form that indexes arrays such as `like`: `np.uint32`, or Dr.Jit's UInt32 in memory of its own."""
-    values = np.ascontiguousarray(values, np.uint32)
     if not is_drjit(like):
-        return values
-    kind = dr.uint32_array_t(dr.array_t(like))
-    owned = kind(values) + dr.opaque(kind, 0)
-    dr.eval(owned)
-    return owned
+        return np.ascontiguousarray(values, np.uint32)
+    return owned(values, dr.uint32_array_t(dr.array_t(like)))
 
 
 def gather_rows(x: Array, index: Array) -> Array:

@@ -1,9 +1,21 @@
-"""Counts the kernels that Dr.Jit makes anew."""
+"""Counts the kernels that Dr.Jit makes anew, and gives them inputs that do not ask for another by chance."""
+
+from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender import arrays
+
+
+def on_device(x: Any) -> mi.TensorXf:
+    """The numbers in the device's own memory: NumPy's would be shared, and compile other kernels where it is not aligned."""
+    return mi.TensorXf(arrays.owned(x, mi.Float), np.shape(x))
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from typing import Any
 
 import drjit as dr
 import kernels
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -152,9 +151,7 @@ def test_the_same_on_the_device(form: str, options: dict[str, Any]) -> None:
             rows.append(np.stack([arrays.numpy(x) for x in found]))
         return rows
 
-    for a, b in zip(
-        go(lambda x: np.asarray(x, np.float64)), go(lambda x: mi.TensorXf(x.astype(np.float32))), strict=True
-    ):
+    for a, b in zip(go(lambda x: np.asarray(x, np.float64)), go(lambda x: kernels.on_device(x)), strict=True):
         # A variance about the mean cancels digits of single precision.
         np.testing.assert_allclose(
             a, b, rtol=5e-2 if "centred" in options else 2e-3, atol=5e-3 if "centred" in options else 2e-4
@@ -167,11 +164,11 @@ def test_no_step_compiles_a_kernel_of_its_own() -> None:
 
     def go(steps: range, state: meta.State) -> meta.State:
         for i in steps:
-            *found, state = meta.update(state, mi.TensorXf(F[i]), mi.TensorXf(D[i]), float(norms[i]))
+            *found, state = meta.update(state, kernels.on_device(F[i]), kernels.on_device(D[i]), float(norms[i]))
             dr.eval(found, state)
         return state
 
-    state = go(range(10), meta.init(mi.TensorXf(F[0])))
+    state = go(range(10), meta.init(kernels.on_device(F[0])))
     with kernels.recorded() as new:
         go(range(10, 60), state)
     assert len(new) >= 50

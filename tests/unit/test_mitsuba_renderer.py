@@ -95,13 +95,13 @@ def test_a_ready_made_object_cannot_be_in_two_states() -> None:
 
 CV = ur.images.RecursiveControlVariate
 STEADY: dict[str, tuple[Any, int]] = {
-    # estimator, kernels that the steps after the tenth may still add: Dr.Jit orders the inputs of some in several ways
+    # estimator, kernels that the thirty steps after the tenth may still add: Dr.Jit orders the inputs of some in several ways
     "plain": (ur.PathGradient(ur.images.Plain(), spp=2), 0),
     "rcv": (ur.PathGradient(CV(), spp=2), 0),
-    "meta": (ur.MetaEstimator(), 4),
-    "meta, primary space": (ur.MetaEstimator(space="primary"), 4),
-    "coupled": (ur.MetaEstimator(coupled=True), 4),
-    "coupled, rcv": (ur.MetaEstimator(coupled=True, image=CV()), 4),
+    "meta": (ur.MetaEstimator(), 10),
+    "meta, primary space": (ur.MetaEstimator(space="primary"), 10),
+    "coupled": (ur.MetaEstimator(coupled=True), 10),
+    "coupled, rcv": (ur.MetaEstimator(coupled=True, image=CV()), 10),
 }
 
 

@@ -117,7 +117,7 @@ def test_pure_and_of_the_parameters_kind(optimizer, gradients):
 
 def kernels_per_step(optimizer, gradients):
     """Number of kernels that each step on the device compiles; also checks the steps against NumPy's."""
-    shared = {key: mi.TensorXf(np.stack([g[key] for g in gradients])) for key in gradients[0]}
+    shared = {key: kernels.on_device(np.stack([g[key] for g in gradients])) for key in gradients[0]}
     state, compiled = optimizer.init({key: shared[key][0] for key in shared}), []
     for n, expected in enumerate(take(optimizer, gradients)):
         gradient = {key: shared[key][n] for key in shared}
@@ -217,8 +217,8 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
     variances = [{key: np.square(g) + 0.1 for key, g in tree.items()} for tree in gradients]
     optimizer = MetaAdam(0.1, schedule=Exponential(7))
     expected = meta_take(optimizer, gradients, variances)
-    device = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in gradients]
-    spread = [{key: mi.TensorXf(x.astype(np.float32)) for key, x in tree.items()} for tree in variances]
+    device = [{key: kernels.on_device(x) for key, x in tree.items()} for tree in gradients]
+    spread = [{key: kernels.on_device(x) for key, x in tree.items()} for tree in variances]
     state, made = optimizer.init(device[0]), 0
     for n, (gradient, variance) in enumerate(zip(device, spread, strict=True)):
         with kernels.recorded() as new:

@@ -1,6 +1,5 @@
 """Running covariance, control weight and recursion against closed forms, in NumPy and on the device."""
 
-import drjit as dr
 import kernels
 import mitsuba as mi
 import numpy as np
@@ -168,21 +167,14 @@ def step(state, memory, x, y):
     return welford.update(state, x, y), advance(memory, x, y, w), w, variance
 
 
-def on_device(x):
-    """A sample in the device's own memory; NumPy's would be shared, and compile other kernels if not aligned."""
-    tensor = mi.TensorXf(np.stack([x]))[0]
-    dr.eval(tensor)
-    return tensor
-
-
 def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(stream):
     xs, ys = (s.astype(np.float32) for s in stream)
     host = welford.init(xs[0].astype(float)), xs[0].astype(float)
-    device = welford.init(on_device(xs[0])), on_device(xs[0])
+    device = welford.init(kernels.on_device(xs[0])), kernels.on_device(xs[0])
     compiled = []
     for x, y in zip(xs, ys, strict=True):
         host = step(*host[:2], x.astype(float), y.astype(float))
-        x, y = on_device(x), on_device(y)
+        x, y = kernels.on_device(x), kernels.on_device(y)
         with kernels.recorded() as new:
             device = step(*device[:2], x, y)
             arrays.evaluate(device)

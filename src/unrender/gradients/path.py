@@ -92,10 +92,10 @@ class PathGradient:
             pick, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp, pick=pick)
         pixels = self.pixels.observe(problem, pixels, step.gradient)
-        next_state = PathGradientState(step.image, pixels, state.batches + 1)
-        if pick.draw is None:
-            image = step.image if isinstance(self.pixels, All) else self.image.prepare(problem, step.image)
-            next_state = PathGradientState(image, pixels)
+        whole, image = pick.draw is None, step.image
+        if whole and not isinstance(self.pixels, All):
+            image = self.image.prepare(problem, image)
+        next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1)
         arrays.evaluate(step.gradient, step.losses, next_state, step.told)
         loss = sum(arrays.number(value) for value in step.losses)
         info = {"samples": step.samples, "images": step.images, **step.told}

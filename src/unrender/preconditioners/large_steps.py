@@ -62,17 +62,4 @@ class LargeSteps:
         self.check("parameter", shape)
         wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (len(shape) - 1)
         result = grid.solver(float(self.strength), shape[:-1], wrap).solve(arrays.numpy(x))
-        return type(x)(_aligned(result)) if arrays.is_drjit(x) else result.astype(x.dtype)
-
-
-def _aligned(x: np.ndarray) -> np.ndarray:
-    """A copy that begins at a multiple of 64 bytes.
-
-    On the CPU, Dr.Jit shares NumPy's memory and compiles one kernel for aligned, another for other memory: where NumPy
-    happens to put an array must not decide.
-    """
-    room = np.empty(x.nbytes + 64, np.uint8)
-    start = -room.ctypes.data % 64
-    result = room[start : start + x.nbytes].view(x.dtype).reshape(x.shape)
-    result[...] = x
-    return result
+        return arrays.like(result, x)

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender import arrays
 from unrender.errors import InputError
 from unrender.names import did_you_mean
 from unrender.rendering import camera, poses
@@ -121,16 +122,8 @@ class MitsubaRenderer:
         return self._resolutions
 
     def array(self, values: np.ndarray) -> Any:
-        """`mi.TensorXf` with these values, in memory of its own.
-
-        Dr.Jit would borrow NumPy's memory, and frozen kernels then read stale texels or abort (Dr.Jit 1.5, where a texture has 1 or 4
-        channels and so is stored as it is given).
-        """
-        shape = np.shape(values)
-        borrowed = mi.Float(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
-        owned = mi.TensorXf(borrowed * dr.opaque(mi.Float, 1), shape)
-        dr.eval(owned)
-        return owned
+        """`mi.TensorXf` with these values, in memory of its own."""
+        return mi.TensorXf(arrays.owned(values, mi.Float), np.shape(values))
 
     def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
         """Announce the parameters to recover. See `Renderer.select`.
@@ -346,10 +339,14 @@ class MitsubaRenderer:
         if self.pair.volumetric:
             tables = {**(tables or {}), **self.pair.media(what.startswith("previous"), shot.sensor)}
         arguments = (scene, living, tables, mi.UInt32(shot.seed), shot.pixels, chosen, *more)
-        try:
+
+        def launch() -> Any:
             if what != "tangent":  # where they are the input
                 self._clear_gradients()
             return self._frozen[key](*arguments)
+
+        try:
+            return launch()
         except RuntimeError as error:
             if "frozen function" not in str(error):
                 raise
@@ -361,9 +358,7 @@ class MitsubaRenderer:
                 else "phase functions or other Mitsuba objects keep kernels from being frozen: steps are slower"
             )
             self._frozen[key] = trace(what, shot.sensor, shot.spp, count, copies)
-            if what != "tangent":
-                self._clear_gradients()
-            return self._frozen[key](*arguments)
+            return launch()
 
     def _clear_gradients(self) -> None:
         for leaf in (*self._leaves.values(), *self._leaves_previous.values()):

@@ -89,4 +89,6 @@ def read(path: Path) -> tuple[list[dict[str, Any]], str]:
 def _without_nan(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _without_nan(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

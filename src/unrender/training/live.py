@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import os
 import platform
 import shutil
@@ -20,6 +18,7 @@ from unrender import arrays, files, trees
 from unrender.errors import InputError
 from unrender.thumbnails import reduced, stretched
 from unrender.training.callbacks import Callback
+from unrender.training.history import lines
 from unrender.training.result import hardware, versions
 from unrender.variant import current
 
@@ -165,9 +164,9 @@ class Live(Callback):
         if not self._started and run.estimate is not None:
             self._started = True
             views = {**_references(run), **{f"{name}/initial": image for name, image in _images(run).items()}}
-            _write_arrays(self._live / "start.npz", views)
-        _write_arrays(self._live / "views.npz", _views(run))
-        _write_arrays(self._live / "parameters.npz", _small(trees.numpy(run.parameters)))
+            files.write_arrays(self._live / "start.npz", views, compress=False)
+        files.write_arrays(self._live / "views.npz", _views(run), compress=False)
+        files.write_arrays(self._live / "parameters.npz", _small(trees.numpy(run.parameters)), compress=False)
         self._history.write(self._live)
         self._write_status(run, status, record)
         self._cost = time.monotonic() - began
@@ -176,11 +175,11 @@ class Live(Callback):
     def _write_start(self, run: Run) -> None:
         initial = trees.numpy(run.parameters)
         self._initial_error = run.problem.parameter_error(initial)
-        _write_arrays(self._live / "start.npz", _references(run))
-        _write_arrays(self._live / "initial.npz", _small(initial))
-        _write_arrays(self._live / "parameters.npz", _small(initial))
+        files.write_arrays(self._live / "start.npz", _references(run), compress=False)
+        files.write_arrays(self._live / "initial.npz", _small(initial), compress=False)
+        files.write_arrays(self._live / "parameters.npz", _small(initial), compress=False)
         if run.problem.truth:
-            _write_arrays(self._live / "truth.npz", _small(run.problem.truth))
+            files.write_arrays(self._live / "truth.npz", _small(run.problem.truth), compress=False)
         record = {
             **self._told,
             "name": self._told["name"] or run.problem.name,
@@ -236,8 +235,8 @@ class _OwnHistory:
         if _stamp(self._other) != self._before:
             path.unlink(missing_ok=True)
         elif self._records:
-            with path.open("a", encoding="utf-8") as file:
-                file.write("".join(json.dumps(_finite(record)) + "\n" for record in self._records))
+            with path.open("ab") as file:
+                file.write(lines(self._records))
         self._records.clear()
 
 
@@ -289,20 +288,5 @@ def _small(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def _finite(value: Any) -> Any:
-    """What is not finite as null, which JSON has a word for."""
-    if isinstance(value, Mapping):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    files.write(path, (json.dumps(_finite(value)) + "\n").encode())
-
-
-def _write_arrays(path: Path, of: Mapping[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{key: np.asarray(value, np.float32) for key, value in of.items()})
-    files.write(path, buffer.getvalue())
+    files.write(path, lines([value]))
