@@ -16,8 +16,7 @@ from unrender.gallery import meshes
 from unrender.problem.problem import Problem
 
 RUNS, SPP = 24, 32
-MEDIA = ("three-bodies", "tea", "smoke", "nerf-volume")
-RENDERED = [name for name in ur.gallery.names() if name not in ("exponential", "quad", *MEDIA)]
+RENDERED = [name for name in ur.gallery.names() if name not in ("exponential", "quad", "nerf-volume")]
 
 
 def elsewhere(problem: Problem, share: float = 0.2) -> dict[str, np.ndarray]:
@@ -38,7 +37,7 @@ def ours(problem: Problem, parameters: dict[str, np.ndarray], view: int) -> np.n
     return np.stack([ur.render(problem, parameters, view, SPP, seed) for seed in range(RUNS)])
 
 
-def theirs(path: Path, sensor: int) -> np.ndarray:
+def theirs(path: Path | None, sensor: int) -> np.ndarray:
     scene: Any = mi.load_file(str(path))
     images = np.stack(
         [np.array(mi.render(scene, sensor=sensor, spp=SPP, seed=mi.UInt32(1000 + seed))) for seed in range(RUNS)]
@@ -54,12 +53,39 @@ def small(name: str) -> Problem:
     return ur.gallery.problem(name, **options)
 
 
-@pytest.mark.parametrize("name", MEDIA)
-def test_media_are_refused_and_nothing_is_left(name: str, tmp_path: Path) -> None:
-    problem = small(name)
-    with pytest.raises(ur.InputError, match="participating media cannot be exported yet"):
-        ur.export((problem, elsewhere(problem)), tmp_path / "out")
-    assert not list(tmp_path.iterdir())
+def test_of_an_emissive_medium_there_are_the_grids(tmp_path: Path) -> None:
+    problem = small("nerf-volume")
+    parameters = elsewhere(problem)
+    for overwrite in (False, True):
+        done = ur.export((problem, parameters), tmp_path / "out", overwrite=overwrite)
+    assert done.scene is None
+    assert any("plain Mitsuba has no emissive medium" in notice for notice in done.notices)
+    for key, value in parameters.items():
+        grid = np.array(mi.VolumeGrid(str(done.folder / "maps" / f"{key.removesuffix('.data')}.vol")))
+        np.testing.assert_array_equal(grid.reshape(value.shape), value)
+
+
+def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
+    def scene() -> dict[str, Any]:
+        rgb = lambda *x: {"type": "rgb", "value": list(x)}  # noqa: E731
+        return {
+            "type": "scene",
+            "camera": {"type": "perspective", "fov": 40.0, "film": {"type": "hdrfilm", "width": 8, "height": 8},
+                       "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])},
+            "sky": {"type": "constant"},
+            "lamp": {"type": "point", "position": [0, 3, 2], "intensity": rgb(9, 9, 9)},
+            "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {
+                "type": "homogeneous", "scale": 2.0, "sigma_t": rgb(0.9, 0.7, 0.5), "albedo": 0.8,
+                "phase": {"type": "hg", "g": 0.4}}},
+        }  # fmt: skip
+
+    keys = ["ball.interior_medium.albedo.value.value", "ball.interior_medium.phase_function.g"]
+    problem = ur.Problem(scene, [ur.Parameter(key) for key in keys], [ur.View(np.zeros((8, 8, 3)))], max_depth=5)
+    parameters = elsewhere(problem)
+    done = ur.export((problem, parameters), tmp_path / "out")
+    assert done.scene is not None
+    verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
+    assert verdict, figures
 
 
 @pytest.mark.parametrize("name", RENDERED)

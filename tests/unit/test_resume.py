@@ -240,6 +240,20 @@ def test_a_problem_file_that_is_gone_is_made_again_from_the_folder(wall: Path) -
     np.testing.assert_array_equal(ur.resume(folder).parameters[WALL], whole.parameters[WALL])
 
 
+def test_a_plain_number_of_the_scene_counts() -> None:
+    def made(refraction: float) -> ur.Problem:
+        scene = {
+            "type": "scene",
+            "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 6}},
+            "lens": {"type": "sphere", "bsdf": {"type": "dielectric", "int_ior": refraction}},
+            "wall": {"type": "rectangle"},
+        }
+        return ur.Problem(scene, [ur.Parameter("wall.bsdf.reflectance.value")], [ur.View(np.zeros((6, 4, 3)))])
+
+    assert differences(fingerprint(made(1.5)), fingerprint(made(1.5))) == []
+    assert differences(fingerprint(made(1.5)), fingerprint(made(1.6))) == ["scene: lens has changed"]
+
+
 def test_a_problem_of_an_xml_scene_is_made_again_with_its_arrays(wall: Path) -> None:
     rng = np.random.default_rng(1)
     made = ur.Problem(

@@ -21,7 +21,7 @@ def export(
     spp: Annotated[int, typer.Option(min=1, help="Samples per pixel that the scene asks for.")] = 256,
     variant: Variant = "auto",
 ) -> None:
-    """Write a run's result as a scene folder: XML, textures, meshes, and the recovered maps alone."""
+    """Write a run's result as a scene folder: XML, textures, meshes, volumes, and the recovered maps alone."""
     console = Console(highlight=False)
     if not directory.is_dir():
         raise InputError(f"{directory}: no such run folder")
@@ -31,4 +31,5 @@ def export(
     done = write(directory, directory / "scene" if out is None else out, overwrite, spp)
     for notice in done.notices:
         console.print(f"note: {escape(notice)}", soft_wrap=True)
-    console.print(f"scene: {escape(str(done.scene))}", soft_wrap=True)
+    written = ("values", done.folder) if done.scene is None else ("scene", done.scene)
+    console.print(f"{written[0]}: {escape(str(written[1]))}", soft_wrap=True)

@@ -43,12 +43,12 @@ class Exported:
 
     Attributes:
         folder: where.
-        scene: the XML file.
+        scene: the XML file; None where there is none, as plain Mitsuba has no emissive media.
         notices: one line for each thing that its user should know of.
     """
 
     folder: Path
-    scene: Path
+    scene: Path | None
     notices: tuple[str, ...]
 
 
@@ -65,7 +65,9 @@ def export(
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
-    integrator is `path` with the problem's depth, every film has a box filter. Sensors come in the problem's order (`-s 1` for the second).
+    integrator is `path`, or `volpath` where there are participating media, with the problem's depth, every film has a box filter. Sensors
+    come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not have, only the
+    recovered values are written.
 
     Args:
         what: a run folder, or a problem and {key: array} of all its parameters.
@@ -86,21 +88,26 @@ def export(
         problem, parameters = what
     if not isinstance(problem.renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
-    if problem.renderer.pair.volumetric:
-        raise InputError(f"{problem.name}: scenes with participating media cannot be exported yet")
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
     beside = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         try:
             beside.mkdir(parents=True)
-            notices = _fill(beside, problem.renderer, values, problem.max_depth, spp)
+            notices = maps.write(values, beside)
+            plain = not problem.renderer.pair.emissive
+            if plain:
+                notices = _fill(beside, problem.renderer, values, problem.max_depth, spp) + notices
+            else:
+                notices.append(
+                    f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
+                )
             _swap(beside, out)
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
-    return Exported(out, out / SCENE, tuple(notices))
+    return Exported(out, out / SCENE if plain else None, tuple(notices))
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
@@ -112,7 +119,7 @@ def _check_place(out: Path, overwrite: bool) -> None:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
     if not found:
         return
-    if SCENE not in found or maps.RECORD not in found or not found <= _OWN:
+    if maps.RECORD not in found or not found <= _OWN:
         raise InputError(f"export to {out}: the folder holds other things; give a new one")
     if not overwrite:
         raise InputError(f"export to {out}: holds an earlier export; give --overwrite (overwrite=True) to replace it")
@@ -131,7 +138,7 @@ def _swap(beside: Path, out: Path) -> None:
 def _fill(
     folder: Path, renderer: MitsubaRenderer, values: dict[str, np.ndarray], max_depth: int, spp: int
 ) -> list[str]:
-    """Write the files of an export."""
+    """Write scene.xml and the files that it names."""
     graph = SceneGraph(_description(renderer.pair.description, folder))
     scene = renderer.pair.current
     moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
@@ -147,12 +154,11 @@ def _fill(
         except InputError as error:
             raise InputError(f"parameter {key} cannot be exported: {error}") from error
     posed = [_move(graph, target, matrix) for target, matrix in poses.matrices(scene, moved).items()]
-    _set_up_rendering(graph, max_depth, spp)
+    _set_up_rendering(graph, "volpath" if renderer.pair.volumetric else "path", max_depth, spp)
     _gather_files(graph, folder)
     path = folder / SCENE
     path.write_bytes(graph.xml())
-    notices = _verify(graph, path, {key: places[key].key for key in own}, posed)
-    return notices + maps.write(values, folder)
+    return _verify(graph, path, {key: places[key].key for key in own}, posed)
 
 
 def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
@@ -175,9 +181,9 @@ def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
     return index
 
 
-def _set_up_rendering(graph: SceneGraph, max_depth: int, spp: int) -> None:
-    """What the run's pictures were rendered with: path tracing of that depth, independent samples, pixels without a filter."""
-    graph.child(0, mi.ObjectType.Integrator, "path")["max_depth"] = max_depth
+def _set_up_rendering(graph: SceneGraph, integrator: str, max_depth: int, spp: int) -> None:
+    """What the run's pictures were rendered with: paths of that depth, independent samples, pixels without a filter."""
+    graph.child(0, mi.ObjectType.Integrator, integrator)["max_depth"] = max_depth
     films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
     for index in graph.of(mi.ObjectType.Sensor):
         graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
@@ -215,7 +221,7 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
                 taken[path] = f"{kind}/{name}"
         node.props["filename"] = taken[path]
     for path in folder.glob("*/*"):  # what a recovered value took the place of
-        if path.relative_to(folder).as_posix() not in taken.values():
+        if path.parent.name != maps.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
             path.unlink()
 
 

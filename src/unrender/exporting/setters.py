@@ -44,6 +44,8 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
     ):  # of the material that a shape has when none is given
         material = graph.add(place.node, "bsdf", mi.ObjectType.BSDF, "diffuse")
         graph.nodes[material].props[path[1]] = _native(value)
+    elif len(path) == 3 and path[1:] == ("value", "value"):  # a medium's volume that is one colour
+        node.props[path[0]] = _native(value)
     elif len(path) == 1:
         _number(node.props, path[0], value)
     else:

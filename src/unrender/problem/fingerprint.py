@@ -78,7 +78,7 @@ def _of_array(array: np.ndarray) -> str:
 def _of_scene(problem: Problem) -> dict[str, str]:
     unknown = {parameter.key for parameter in problem.parameters}
     known = problem.renderer.parameters()
-    keys = sorted(key for key, info in known.items() if info.perturbable and key not in unknown)
+    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in unknown)
     objects: dict[str, list[bytes]] = {}
     for key, value in problem.renderer.values(keys).items():
         name = key.partition(".")[0]

@@ -31,6 +31,7 @@ class ParameterInfo:
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
+        compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
     """
 
     shape: tuple[int, ...]
@@ -40,6 +41,7 @@ class ParameterInfo:
     lowest: float | None = None
     highest: float | None = None
     perturbable: bool = True
+    compiled: bool = False
 
 
 @dataclass(frozen=True)

@@ -225,6 +225,9 @@ class ScenePair:
         if re.match(r"object_\d{9,}\.", key):
             why = "its object has no id in the XML, so its name changes; give it one"
             return ParameterInfo(shape, False, False, why, perturbable=False)
+        if isinstance(value, (int, float)):
+            why = "it is a plain number, which Mitsuba compiles into its kernels"
+            return ParameterInfo(shape, False, False, why, perturbable=False, compiled=True)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             why = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):
