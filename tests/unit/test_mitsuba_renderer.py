@@ -54,7 +54,7 @@ def test_values_survive_the_way_to_a_tensor_and_back() -> None:
         ({}, "small-box.vertex_positions", 'moves a shape, which space="path" cannot carry.*space="primary"'),
         ({}, "light.to_world", "no derivatives"),
         ({}, "small-box.faces", "not differentiable"),
-        ({"lens": {"type": "sphere", "bsdf": {"type": "dielectric"}}}, "lens.bsdf.eta", "a plain number, which Mitsuba compiles into its kernels"),
+        ({"lens": {"type": "sphere", "bsdf": {"type": "dielectric"}}}, "lens.bsdf.eta", "a plain number, which Mitsuba compiles"),
         ({}, "back.bsdf.reflectanse.data", "did you mean back.bsdf.reflectance.data"),
         (
             {"ball": {"type": "sphere", "b": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "conductor"}, "b": {"type": "diffuse"}}}},

@@ -2,8 +2,9 @@
 
     python benchmarks/adaptive/fig3_variance/run.py [--runs 1024] [--count 512] [--resolution 64]
 
-`mirror-trio` at its start, L2. Every scheme traces as many paths a step: `count` pixels with two paths each (image and adjoint,
-crossed); all pixels at once, at two paths each, has its variance scaled to that budget. The schemes that estimate probabilities do so
+`mirror-trio` at its start, L2. Every scheme traces as many paths a step: `count` pixels with two paths each; all pixels at once, at two
+paths each, has its variance scaled to that budget. Of the two paths one gives the image and the other its derivative, as in the paper,
+or, crossed, each gives both. The schemes that estimate probabilities do so
 once, from `--samples` paths, before the runs; these are left out, as the paper leaves them. Draws independent of one another, as in the
 paper, and stratified ones.
 """
@@ -22,32 +23,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
 from schemes import SCHEMES, pixels
+from variance import gradients, spread
 
 import unrender as ur
 from unrender.gradients.path import PathGradient
-from unrender.keys import Key
 
 HERE = Path(__file__).resolve().parent
 ONE_LEVEL = "adaptive, one level"
-
-
-def gradients(problem: ur.Problem, estimator: PathGradient, runs: int) -> tuple[np.ndarray, int, dict[int, np.ndarray]]:
-    """(runs, n) independent estimates at the start, paths of one, and the probabilities that served them."""
-    at = problem.initial()
-    state = estimator.init(problem, at)
-    first, state = estimator.estimate(problem, at, state, Key(0))
-    rows, samples = [], 0
-    for run in range(runs):
-        found, state = estimator.estimate(problem, at, state, Key(1, run))
-        rows.append(np.concatenate([np.array(g).ravel() for g in found.gradient.values()]))
-        samples = found.info["samples"]
-    return np.array(rows), samples, first.info.get("pixel_probability", {})
-
-
-def spread(rows: np.ndarray) -> tuple[float, float]:
-    """The variance summed over parameters, and its standard error, from four parts."""
-    parts = [np.var(part, axis=0, ddof=1).sum() for part in np.array_split(rows, 4)]
-    return float(np.var(rows, axis=0, ddof=1).sum()), float(np.std(parts, ddof=1) / 2)
+CROSSED = {1: "", 2: ", crossed"}
+"""By the estimator's `spp`."""
 
 
 def main() -> None:
@@ -59,22 +43,24 @@ def main() -> None:
     asked = parser.parse_args()
     ur.use()
     problem = ur.gallery.problem("mirror-trio", resolution=asked.resolution)
-    rows, samples, _ = gradients(problem, PathGradient(spp=2), asked.runs)
     budget = 2 * asked.count
-    whole, error = spread(rows)
+    found: dict[str, Any] = {}
+    for spp, crossed in CROSSED.items():
+        rows, samples, _ = gradients(problem, PathGradient(spp=spp), asked.runs)
+        whole, error = spread(rows)
+        found[f"all{crossed}"] = {"variance": whole * samples / budget, "error": error * samples / budget}
     exact = rows.mean(axis=0)
-    found: dict[str, Any] = {"all": {"variance": whole * samples / budget, "error": error * samples / budget}}
     maps = {}
-    for stratified in (False, True):
+    for spp, stratified in ((1, False), (2, False), (1, True), (2, True)):
         for label, levels in (*((scheme, {}) for scheme in SCHEMES), (ONE_LEVEL, {"levels": 0})):
             scheme = "adaptive" if label == ONE_LEVEL else label
             options: dict[str, Any] = {"stratified": stratified, "samples": asked.samples, "refresh": 10 * asked.runs}
             rows, samples, probability = gradients(
-                problem, PathGradient(pixels=pixels(scheme, asked.count, **options, **levels), spp=2), asked.runs
+                problem, PathGradient(pixels=pixels(scheme, asked.count, **options, **levels), spp=spp), asked.runs
             )
             assert samples == budget
             variance, error = spread(rows)
-            name = f"{label}, stratified" if stratified else label
+            name = label + CROSSED[spp] + (", stratified" if stratified else "")
             z = (rows.mean(axis=0) - exact) / np.sqrt(np.var(rows, axis=0, ddof=1) / asked.runs)
             found[name] = {"variance": variance, "error": error, "z": float(np.abs(z).max())}
             if probability:
@@ -82,11 +68,14 @@ def main() -> None:
             print(name, found[name], flush=True)
     ratios = {
         f"{other}{end} / {ours}{end}": found[other + end]["variance"] / found[ours + end]["variance"]
-        for end in ("", ", stratified")
+        for end in ("", ", crossed", ", stratified", ", crossed, stratified")
         for ours in ("adaptive", ONE_LEVEL)
         for other in ("uniform", "loss")
     }
-    ratios["all / adaptive"] = found["all"]["variance"] / found["adaptive"]["variance"]
+    for crossed in CROSSED.values():
+        ratios[f"all{crossed} / adaptive{crossed}"] = (
+            found[f"all{crossed}"]["variance"] / found[f"adaptive{crossed}"]["variance"]
+        )
     print(ratios)
     np.savez_compressed(HERE / "maps.npz", reference=np.asarray(problem.views[0].reference), **maps)
     write(HERE, {"settings": vars(asked), "schemes": found, "ratios": ratios})
