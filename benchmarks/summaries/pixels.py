@@ -27,8 +27,9 @@ paper's variance 0.85 / 1.22 / 0.97. So refreshes now take 4096 paths at least. 
 times cost, rates that fall."""
 
 FAILURE = """\
-Few paths estimate the caustic's probabilities no worse than those of the other scene by this measure: the failure of
-the paper's figure does not show in it."""
+Taken as they come, probabilities from 4 paths per pixel make the caustic's gradient noisier than uniform draws do, as
+the paper found; the same paths serve the other two scenes. Denoised, as `Adaptive` does by default, they serve the
+caustic too, at half as much variance again as probabilities from 1024 paths."""
 
 
 def variance(found: dict[str, Any]) -> str:

@@ -85,18 +85,18 @@ def main() -> None:
 def plot(results: dict[str, Any]) -> None:
     """The picture, where the schemes look, and what it brings."""
     maps = np.load(HERE / "maps.npz")
-    figure, axes = plt.subplots(1, 4, figsize=(14, 3.6), layout="constrained")
+    figure, axes = plt.subplots(1, 4, figsize=(16, 4), layout="constrained", width_ratios=(1, 1.15, 1.15, 1.3))
     axes[0].imshow(np.clip(maps["reference"], 0, 1) ** (1 / 2.2))
     axes[0].set_title("reference")
     for axis, name in zip(axes[1:3], ("loss", "adaptive"), strict=True):
         shown = axis.imshow(maps[name], cmap="magma", norm="log", vmin=0.1)
-        axis.set_title(f"probability over uniform: {name}")
+        axis.set_title(f"{name}, over uniform")
         figure.colorbar(shown, ax=axis)
     for axis in axes[:3]:
         axis.axis("off")
     entries = results["schemes"]
     axes[3].barh(list(entries), [e["variance"] for e in entries.values()], xerr=[e["error"] for e in entries.values()])
-    axes[3].set(xscale="log", xlabel="variance of dL/d(roughness), equal paths")
+    axes[3].set(xscale="log", xlabel="variance of dL/d(roughness)")
     figure.savefig(HERE / "figure.png", dpi=110)
     print(f"wrote {HERE / 'figure.png'}")
 

@@ -122,7 +122,7 @@ def plot(results: dict[str, Any]) -> None:
             axis.imshow(stored[f"{name}|{which}"], cmap="magma", norm="log")
             spp = FEW if which == "few" else results["settings"]["many"]
             ratio = results["variance"][name][which]["mean"]
-            axis.set_title(f"{spp} paths per pixel: {ratio:.2f} of uniform's variance")
+            axis.set_title(f"{spp} paths a pixel: variance × {ratio:.2f}")
         for axis in row:
             axis.axis("off")
     figure.savefig(HERE / "figure.png", dpi=110)
