@@ -12,6 +12,7 @@ import pytest
 from scipy import stats
 from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
 
+import unrender as ur
 from unrender.rendering.mitsuba_renderer import MitsubaRenderer
 from unrender.rendering.port import Shot
 
@@ -89,6 +90,26 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     same = {k: renderer.array(np.ones(3)) for k in values}
     wrong = blocks(renderer.tangent_moment(values, paths, same))
     assert np.abs((wrong - single)[known] / error[known]).max() > limit
+
+
+@pytest.mark.parametrize("name", ["smoke", "three-bodies", "nerf-volume"])
+def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str) -> None:
+    """Collisions are chosen by chance apart from what they bring, so no finite difference sees a path's derivative; its adjoint does."""
+    problem = ur.gallery.problem(name, resolution=6, reference_spp=1)
+    renderer, values = problem.renderer, problem.initial()
+    renderer.select(list(values), None)
+    rng = np.random.default_rng(0)
+    tangents = {key: rng.normal(size=x.shape) * np.array(x) for key, x in values.items()}
+    paths = renderer.image(values, Shot(0, 1, 7)).paths
+    found = np.array(renderer.tangent_moment(values, paths, {k: renderer.array(x) for k, x in tangents.items()}))
+    expected = np.zeros_like(found)
+    for place in np.ndindex(found.shape):
+        weights = np.zeros((1, *found.shape))
+        weights[0][place] = 1.0
+        gradient = renderer.adjoint(values, paths, renderer.array(weights))
+        expected[place] = sum(np.sum(np.array(gradient[key]) * x) for key, x in tangents.items()) ** 2
+    assert (expected > 0).sum() > 10
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-4 * expected.max())
 
 
 def test_gradients_after_a_tangent_pass_are_what_they_were() -> None:

@@ -360,6 +360,7 @@ def test_states_of_another_form_are_told(other: Any) -> None:
     with pytest.raises(InputError, match="state"):
         check_alike(other, [{"a": np.zeros((2, 2))}])
     check_alike({"a": np.zeros((5, 2))}, [{"a": np.zeros((2, 2))}])
+    check_alike({"a": np.float64(2)}, [{"a": 0.0}])  # what a state counts by NumPy's numbers once it has been moved on
 
 
 def test_what_comes_later_is_let_in() -> None:

@@ -280,10 +280,6 @@ class MitsubaRenderer:
 
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> Any:
         """Path replay in forward mode: the squared derivative of each path along the tangents. See `Renderer.tangent_moment`."""
-        if self.pair.volumetric:
-            raise InputError(
-                "pixels: adaptive probabilities are not known in scenes with participating media; use LossProportional or Uniform"
-            )
         self._loaded.clear()
         self._set_current(parameters)
         shot = paths.shot

@@ -93,7 +93,9 @@ class VolumePair:
         L, Lₚ, kept = self._trace(mode, scene, tables, sampler, start, pair, *states, noise=noise)
         if self.differentiate_media:
             dr.eval(kept)  # Two backward passes in one kernel would race for the same gradients.
-            self._in_scattering(scene, tables, noise, kept, δL, δLₚ, pair)
+            scattered = self._in_scattering(mode, scene, tables, noise, kept, δL, δLₚ, pair)
+            if mode == dr.ADMode.Forward:
+                L += scattered
         return L, Lₚ
 
     @dr.syntax
@@ -111,8 +113,8 @@ class VolumePair:
         δLₚ: Any = None,
         noise: Any = None,
     ) -> tuple[Any, Any, Any]:
-        """A path from `start` on; with `Backward` its replay, and what differential ratio tracking keeps of it."""
-        primal = mode == dr.ADMode.Primal
+        """A path from `start` on; otherwise its replay, and what differential ratio tracking keeps of it."""
+        primal, forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
         follow_delta = self.changing_delta and (pair or not primal)
         follow_media = self.differentiate_media and not primal
         bsdf_ctx = mi.BSDFContext()
@@ -124,8 +126,9 @@ class VolumePair:
         depth = mi.UInt32(start.depth)
         L = mi.Spectrum(0 if primal else state_in)
         Lₚ = mi.Spectrum(stateₚ_in if stateₚ_in is not None else 0)
-        δL = mi.Spectrum(δL if δL is not None else 0)
-        δLₚ = mi.Spectrum(δLₚ if δLₚ is not None else 0)
+        δL = mi.Spectrum(δL if δL is not None else 1)
+        δLₚ = mi.Spectrum(δLₚ if δLₚ is not None else 1)
+        along = mi.Spectrum(0)  # the derivative along the tangents
         β = mi.Spectrum(1)
         βₚ = mi.Spectrum(1)
         η = mi.Float(1)
@@ -273,7 +276,10 @@ class VolumePair:
                     Lo += δL * (Le + Ld + L * relative(value))
                     if dr.hint(pair, mode="scalar"):
                         Lo += δLₚ * (Leₚ + Ldₚ + Lₚ * relative(valueₚ))
-                    dr.backward_from(Lo, flags=_KEEP)
+                    if dr.hint(forward, mode="scalar"):
+                        along += dr.forward_to(Lo)
+                    else:
+                        dr.backward_from(Lo, flags=_KEEP)
             η *= dr.select(meets, bs.eta, 1)
             β *= weight
             if dr.hint(pair, mode="scalar"):
@@ -297,7 +303,7 @@ class VolumePair:
             active = (scatters | (meets & (may_scatter | null))) & (most > 0) & (~roulette | (sampler.next_1d() < q))
             depth[moved] += 1
 
-        return L, Lₚ, kept
+        return along if forward else L, Lₚ, kept
 
     @dr.syntax
     def _connect(
@@ -356,20 +362,25 @@ class VolumePair:
         return T, Tₚ, way
 
     def _in_scattering(
-        self, scene: Any, tables: Any, noise: Any, kept: Reservoir, δL: Any, δLₚ: Any, pair: bool
-    ) -> None:
-        """Back-propagate the derivative of the scattering at the kept point, whose light is found by a path of its own."""
+        self, mode: dr.ADMode, scene: Any, tables: Any, noise: Any, kept: Reservoir, δL: Any, δLₚ: Any, pair: bool
+    ) -> Any:
+        """Back-propagate the derivative of the scattering at the kept point, whose light is found by a path of its own; with `Forward`
+        the derivative along the tangents is returned."""
         start = Start(kept.ray, kept.medium, kept.depth, kept.total > 0, kept.t)
         L, Lₚ, _ = self._trace(dr.ADMode.Primal, scene, tables, noise, start, pair)
         share = dr.select(kept.weight > 0, kept.total / kept.weight, 0)
         mei = tracking.at(kept.ray, kept.t)
         with dr.resume_grad():
             σₛ = kept.medium.get_scattering_coefficients(mei, start.active)[0]
-            Lo = δL * L * kept.β * share * σₛ
+            Lo = L * kept.β * share * σₛ
+            if mode == dr.ADMode.Forward:
+                return dr.forward_to(Lo)
+            Lo *= δL
             if pair:
                 mediumₚ = remap(mi.MediumPtr, tables["medium"], kept.medium)
                 Lo += δLₚ * Lₚ * kept.βₚ * share * mediumₚ.get_scattering_coefficients(mei, start.active)[0]
             dr.backward_from(Lo, flags=_KEEP)
+        return None
 
 
 class Start:
