@@ -551,6 +551,8 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ("Drawn pixels: what they cost", "adaptive/cost", pixels.cost, ""),
     ("Participating media: what they cost", "volumes/cost", media.cost, media.COST),
     ("Participating media: gradients", "volumes/gradients", media.gradients, media.GRADIENTS),
+    ("Participating media: where noise pushes a loss (Figs 5 and 6)", "volumes/fig5_drift", media.drift, media.DRIFT),
+    ("Participating media: what a control variate saves (Fig. 11)", "volumes/fig11_smoke", media.smoke, media.SMOKE),
     ("What checkpoints cost", "checkpoints", life.checkpoints, life.CHECKPOINTS),
     ("What watching costs", "watch", life.watching, life.WATCHING),
 ]
