@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from unrender.gradients.path import PathGradient
     from unrender.gradients.smoothed import SmoothedDerivatives
     from unrender.keys import Key
+    from unrender.problem.grids import Grid, read_grid, write_grid
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
     from unrender.problem.render import render, render_pair
@@ -56,6 +57,7 @@ _MODULES = (
 _HOMES = {
     "Callback": "training.callbacks",
     "Estimate": "gradients.estimate",
+    "Grid": "problem.grids",
     "Key": "keys",
     "Live": "training.live",
     "LossValues": "gradients.black_box",
@@ -70,9 +72,11 @@ _HOMES = {
     "estimate": "training.loop",
     "export": "exporting.folder",
     "optimize": "training.loop",
+    "read_grid": "problem.grids",
     "render": "problem.render",
     "render_pair": "problem.render",
     "resume": "reopen",
+    "write_grid": "problem.grids",
 }
 
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
@@ -82,6 +86,7 @@ with suppress(VariantError):  # said again, in one line, by whatever needs Mitsu
 __all__ = [
     "Callback",
     "Estimate",
+    "Grid",
     "InputError",
     "Key",
     "Live",
@@ -106,6 +111,7 @@ __all__ = [
     "optimizers",
     "pixels",
     "preconditioners",
+    "read_grid",
     "render",
     "render_pair",
     "report",
@@ -113,6 +119,7 @@ __all__ = [
     "smoothed",
     "statistics",
     "use",
+    "write_grid",
 ]
 
 

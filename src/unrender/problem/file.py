@@ -7,7 +7,7 @@
 
     [[parameters]]
     key = "wall.bsdf.reflectance.data"
-    initial = 0.5                              # a number, a colour [r, g, b], a picture file, a .npy file
+    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), an array (.npy, .npz)
     bounds = [0.0, 1.0]                        # inf and -inf are open
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
@@ -50,7 +50,7 @@ class _Model(BaseModel):
 class _Parameter(_Model):
     key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
     initial: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture or .npy file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
     bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is open)")
     learning_rate: _Number | None = Field(None, description="a number above 0")
@@ -58,7 +58,7 @@ class _Parameter(_Model):
         None, description='a table such as { type = "LargeSteps", strength = 10.0 }'
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture or .npy file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
 
 

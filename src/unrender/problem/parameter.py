@@ -17,9 +17,10 @@ class Parameter:
 
     Args:
         key: as `mitsuba.traverse` names it, e.g. ``"back.bsdf.reflectance.data"``.
-        initial: where the descent starts: a number, a colour, an image file, an array of the parameter's shape (a number
-            or a colour fills it), or None for the scene's own value. An image file is scaled to the parameter's resolution;
-            8-bit files are taken as sRGB and linearised.
+        initial: where the descent starts: a number, a colour, an image or grid file, an array of the parameter's shape (a number
+            or a colour fills it), or None for the scene's own value. An image file is scaled to the resolution of a texture (H, W, C),
+            a `.vol` file to that of a grid (Z, Y, X, C); 8-bit images are taken as sRGB and linearised. A `.npy` file, or an `.npz`
+            archive of one array, must have the parameter's shape; a last axis of length 1 may be missing.
         bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
