@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from unrender.gradients.path import PathGradient
     from unrender.gradients.smoothed import SmoothedDerivatives
     from unrender.keys import Key
+    from unrender.problem.coarse_to_fine import CoarseToFine
     from unrender.problem.grids import Grid, read_grid, write_grid
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
@@ -56,6 +57,7 @@ _MODULES = (
 )
 _HOMES = {
     "Callback": "training.callbacks",
+    "CoarseToFine": "problem.coarse_to_fine",
     "Estimate": "gradients.estimate",
     "Grid": "problem.grids",
     "Key": "keys",
@@ -85,6 +87,7 @@ with suppress(VariantError):  # said again, in one line, by whatever needs Mitsu
 # Without grey_box, which needs PyTorch: `from unrender import *` and `help(unrender)` must work where that is missing.
 __all__ = [
     "Callback",
+    "CoarseToFine",
     "Estimate",
     "Grid",
     "InputError",

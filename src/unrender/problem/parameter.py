@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.preconditioners.base import Preconditioner
+from unrender.problem.coarse_to_fine import CoarseToFine
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Parameter:
         bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
+        coarse_to_fine: `CoarseToFine`, or its steps alone, for a texture or grid that is coarse at first; None for one resolution.
     """
 
     key: str
@@ -31,3 +34,4 @@ class Parameter:
     bounds: tuple[float | None, float | None] | None = None
     learning_rate: float | None = None
     preconditioner: Preconditioner | None = None
+    coarse_to_fine: CoarseToFine | Sequence[int] | None = None

@@ -26,6 +26,7 @@ _DEVICE = (
     *(f"TensorX{kind}" for kind in ("f", "f16", "f64", "i", "i64", "u", "u64", "b")),
     *("Float", "Float16", "Float64", "Int", "Int64", "UInt", "UInt64", "Bool"),
 )
+_FLOATS = (float, np.floating)
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -75,6 +76,9 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
     states grow with the steps, and where all patterns have nothing yet there may be anything that a state is made of.
     """
     if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
+        return
+    # A number may be NumPy's or Python's: where arrays are NumPy's, one that was not yet summed to is still Python's.
+    if isinstance(state, _FLOATS) and any(isinstance(pattern, _FLOATS) for pattern in patterns):
         return
     fitting = [pattern for pattern in patterns if type(pattern) is type(state)]
     if not fitting:
