@@ -1,15 +1,16 @@
 """Coarse to fine: what states should do at a change of resolution, at equal steps.
 
-    python benchmarks/coarse_to_fine/run.py smoke plain rcv
+    python benchmarks/coarse_to_fine/run.py smoke plain rcv --variants none reset
 
 Per variant and seed: the parameters' error and the loss over the last steps. Variants: "none" (the finest resolution from the start),
-"reset", "carry-1", "carry-1.5" and "carry-2" (mean squares times n^-1 to n^-2, see `unrender.training.refining`).
+"reset" (all states begun anew), "carry-1", "carry-1.5" and "carry-2" (all carried, mean squares times n^-1 to n^-2, see
+`unrender.training.refining`), "estimator" (only the estimator's carried, as by default).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from unrender.methods import method
 from unrender.training import refining
 
 SEEDS, LAST = 3, 10
-VARIANTS = ("none", "reset", "carry-1", "carry-1.5", "carry-2")
+VARIANTS = ("none", "reset", "carry-1", "carry-1.5", "carry-2", "estimator")
 PROBLEMS = {
     "smoke": ({"resolution": 16, "grid_resolution": 16, "views": 4, "reference_spp": 256}, (40, 80), 120),
     "indirect-room L2": (
@@ -33,15 +34,15 @@ PROBLEMS = {
 }
 
 
-def main(name: str, methods: list[str]) -> None:
+def main(name: str, methods: list[str], variants: list[str]) -> None:
     options, changes, steps = PROBLEMS[name]
     base = ur.gallery.problem(name.split()[0], **options)
     path = Path(__file__).parent / "results.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     for chosen in methods:
-        for variant in VARIANTS:
-            refining.SQUARES = float(variant.partition("-")[2] or 1)
-            states = "reset" if variant == "reset" else "carry"
+        for variant in variants:
+            refining.SQUARES = float(variant.partition("-")[2] or 2)
+            states = variant if variant in ("reset", "estimator") else "carry"
             way = None if variant == "none" else ur.CoarseToFine(changes, states=states)
             parameters = [replace(p, coarse_to_fine=way) for p in base.parameters]
             problem = ur.Problem(
@@ -77,4 +78,9 @@ def main(name: str, methods: list[str]) -> None:
 
 if __name__ == "__main__":
     ur.use("llvm_ad_rgb")
-    main(sys.argv[1], sys.argv[2:])
+    parser = argparse.ArgumentParser()
+    parser.add_argument("problem", choices=PROBLEMS)
+    parser.add_argument("methods", nargs="+")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=VARIANTS)
+    asked = parser.parse_args()
+    main(asked.problem, asked.methods, asked.variants)

@@ -113,7 +113,7 @@ def test_shapes_by_step() -> None:
         (lambda: ur.CoarseToFine((True, 4)), "steps must be whole numbers"),
         (lambda: ur.CoarseToFine((4,), factor=1), "factor must be"),
         (lambda: ur.CoarseToFine((4,), wrap=1), "wrap must be true, false"),  # type: ignore
-        (lambda: ur.CoarseToFine((4,), states="keep"), 'states must be "carry" or "reset", got \'keep\''),  # type: ignore
+        (lambda: ur.CoarseToFine((4,), states="keep"), 'states must be "estimator", "carry" or "reset", got \'keep\''),  # type: ignore
         (lambda: problem((1, 2, 3, 4)), "coarse_to_fine: shape .* is too small to be coarser 4 times by 2"),
         (lambda: problem(ur.CoarseToFine((1,), wrap=(True,))), "coarse_to_fine: wrap must have 2 entries"),
         (lambda: problem("soon"), "coarse_to_fine: CoarseToFine: steps must be whole numbers"),
@@ -227,6 +227,18 @@ def test_reset_states_know_nothing_but_the_step(name: str) -> None:
         assert not memory.estimator.elements
 
 
+def test_by_default_the_estimator_remembers_and_the_optimizer_starts_anew() -> None:
+    assert ur.CoarseToFine((3,)).states == "estimator"
+    parameters, before, run, memory = at_the_change("rcv", "estimator")
+    assert memory.estimator.image.views is before.estimator.image.views
+    np.testing.assert_allclose(
+        memory.estimator.image.parameters[KEY], by_hand(before.estimator.image.parameters[KEY]), rtol=1e-12
+    )
+    assert (memory.optimizer.step, memory.optimizer.begun) == (5, 5)
+    assert not memory.optimizer.first_moment[KEY].any()
+    assert parameters[KEY].shape != run.parameters[KEY].shape
+
+
 def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     """−η sign(g), by the schedule's factor of the present step."""
     schedule = ur.optimizers.schedules.Steps(every=3, factor=0.5)
@@ -264,7 +276,7 @@ class Shapes(ur.Callback):
         self.seen.append(arrays.shape(run.parameters[KEY])[:-1])
 
 
-@pytest.mark.parametrize("states", ["carry", "reset"])
+@pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_run_ends_fine_with_the_history_of_all_stages(name: str, states: Any, tmp_path: Path) -> None:
     listen = Shapes()
@@ -319,7 +331,7 @@ class Stop(ur.Callback):
 
 
 @pytest.mark.parametrize("at", [2, 3, 4])
-@pytest.mark.parametrize("states", ["carry", "reset"])
+@pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:
     """Interrupted before a change of resolution, at it, and after it."""

@@ -22,21 +22,22 @@ class CoarseToFine:
     averaged over the coarse texels (`resampling.downsample`); at each change the parameter becomes its linear interpolant
     (`resampling.upsample`), which shows the same up to the kinks of linear interpolation.
 
-    What optimizer, estimator and pixel sampler remember (`states`) is either carried through a change or starts anew, see
-    `unrender.training.refining`. Learning rates and their schedules go on in both cases.
+    What optimizer, estimator and pixel sampler remember is either carried through a change or starts anew (`states`), see
+    `unrender.training.refining`. Learning rates and their schedules go on in any case.
 
     Args:
         steps: before which of the run's steps the resolution grows, counted from 0: ascending, each at least 1.
         factor: how many times more texels along each axis, >= 2.
         wrap: whether opposite borders are neighbours, as for a tiling texture (Mitsuba's `repeat`); for all axes or one truth value per
             axis. Otherwise values are constant beyond the border (`clamp`).
-        states: "carry" or "reset".
+        states: "estimator" carries what the estimator remembers, its pixel sampler's state included, and the optimizer starts anew;
+            "carry" carries all; with "reset" all start anew.
     """
 
     steps: tuple[int, ...]
     factor: int = 2
     wrap: bool | tuple[bool, ...] = False
-    states: Literal["carry", "reset"] = "carry"
+    states: Literal["estimator", "carry", "reset"] = "estimator"
 
     def __post_init__(self):
         steps = tuple(self.steps) if isinstance(self.steps, (list, tuple)) else ()
@@ -51,8 +52,8 @@ class CoarseToFine:
         object.__setattr__(self, "wrap", wrap)
         if not all(isinstance(wraps, bool) for wraps in (wrap if isinstance(wrap, tuple) else (wrap,))):
             raise InputError(f"CoarseToFine: wrap must be true, false, or one of these per axis, got {wrap!r}")
-        if self.states not in ("carry", "reset"):
-            raise InputError(f'CoarseToFine: states must be "carry" or "reset", got {self.states!r}')
+        if self.states not in ("estimator", "carry", "reset"):
+            raise InputError(f'CoarseToFine: states must be "estimator", "carry" or "reset", got {self.states!r}')
 
     def check(self, shape: tuple[int, ...]) -> None:
         """Raise `InputError` where a parameter of this (full) shape cannot be coarse at first."""
