@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from unrender.gradients.path import PathGradient
     from unrender.gradients.smoothed import SmoothedDerivatives
     from unrender.keys import Key
+    from unrender.problem.coarse_to_fine import CoarseToFine
+    from unrender.problem.grids import Grid, read_grid, write_grid
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
     from unrender.problem.render import render, render_pair
@@ -55,7 +57,9 @@ _MODULES = (
 )
 _HOMES = {
     "Callback": "training.callbacks",
+    "CoarseToFine": "problem.coarse_to_fine",
     "Estimate": "gradients.estimate",
+    "Grid": "problem.grids",
     "Key": "keys",
     "Live": "training.live",
     "LossValues": "gradients.black_box",
@@ -70,9 +74,11 @@ _HOMES = {
     "estimate": "training.loop",
     "export": "exporting.folder",
     "optimize": "training.loop",
+    "read_grid": "problem.grids",
     "render": "problem.render",
     "render_pair": "problem.render",
     "resume": "reopen",
+    "write_grid": "problem.grids",
 }
 
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
@@ -81,7 +87,9 @@ with suppress(VariantError):  # said again, in one line, by whatever needs Mitsu
 # Without grey_box, which needs PyTorch: `from unrender import *` and `help(unrender)` must work where that is missing.
 __all__ = [
     "Callback",
+    "CoarseToFine",
     "Estimate",
+    "Grid",
     "InputError",
     "Key",
     "Live",
@@ -106,6 +114,7 @@ __all__ = [
     "optimizers",
     "pixels",
     "preconditioners",
+    "read_grid",
     "render",
     "render_pair",
     "report",
@@ -113,6 +122,7 @@ __all__ = [
     "smoothed",
     "statistics",
     "use",
+    "write_grid",
 ]
 
 

@@ -9,7 +9,7 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -119,7 +119,12 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compress: bool = 
     return write(path, buffer.getvalue())
 
 
-def read_arrays(path: Path, most_bytes: int = MOST_ARRAYS) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: Path,
+    most_bytes: int = MOST_ARRAYS,
+    check: Callable[[tuple[int, ...]], None] | None = None,
+    one: bool = False,
+) -> dict[str, np.ndarray]:
     """The arrays of an .npz archive: real numbers of any kind, as stored.
 
     Sizes are checked before memory is taken for them, pickled objects are never loaded, and nothing is unpacked to a file.
@@ -127,6 +132,8 @@ def read_arrays(path: Path, most_bytes: int = MOST_ARRAYS) -> dict[str, np.ndarr
     Args:
         path: the archive.
         most_bytes: of all arrays together.
+        check: shown each array's shape before memory is taken for it; raises `InputError` for one that does not suit.
+        one: whether there must be exactly one array.
 
     Raises:
         InputError: there is none that can be read, an array is not of real numbers or does not have the size that its header
@@ -141,13 +148,15 @@ def read_arrays(path: Path, most_bytes: int = MOST_ARRAYS) -> dict[str, np.ndarr
             names = [member.filename for member in members]
             if len(set(names)) != len(names):
                 raise InputError(f"{path}: {_repeated(names)} is there twice")
+            if one and len(members) != 1:
+                raise InputError(f"{path}: expected an archive of one array, got {len(members)}")
             if sum(member.file_size for member in members) > most_bytes:
                 raise InputError(f"{path}: its arrays are larger than {most_bytes} bytes together")
             found = {}
             for member in members:
                 name = member.filename.removesuffix(".npy")
                 with archive.open(member) as file:
-                    found[name] = _read_array(file, member.file_size, f"{path}: {name}")
+                    found[name] = _read_array(file, member.file_size, f"{path}: {name}", check)
             return found
     except (InputError, MemoryError):
         raise
@@ -157,14 +166,16 @@ def read_arrays(path: Path, most_bytes: int = MOST_ARRAYS) -> dict[str, np.ndarr
         raise _unreadable(path, name, error) from error
 
 
-def read_array(path: Path, most_bytes: int = MOST_ARRAYS) -> np.ndarray:
+def read_array(
+    path: Path, most_bytes: int = MOST_ARRAYS, check: Callable[[tuple[int, ...]], None] | None = None
+) -> np.ndarray:
     """The array of real numbers in a .npy file; see `read_arrays`. Raises `InputError`."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             if size > most_bytes:
                 raise InputError(f"{path}: larger than {most_bytes} bytes")
-            return _read_array(file, size, str(path))
+            return _read_array(file, size, str(path), check)
     except InputError:
         raise
     except (OSError, ValueError, EOFError) as error:
@@ -181,7 +192,9 @@ def _repeated(names: Iterable[str]) -> str:
     return next(name for name in names if name in seen or seen.add(name))
 
 
-def _read_array(file: BinaryIO | Any, size: int, where: str) -> np.ndarray:
+def _read_array(
+    file: BinaryIO | Any, size: int, where: str, check: Callable[[tuple[int, ...]], None] | None = None
+) -> np.ndarray:
     """One array in NumPy's format, of `size` bytes with its header."""
     start = file.read(8)
     if start[:6] != _MAGIC or start[6:] not in (b"\1\0", b"\2\0", b"\3\0"):
@@ -200,5 +213,7 @@ def _read_array(file: BinaryIO | Any, size: int, where: str) -> np.ndarray:
     expected = math.prod(shape) * dtype.itemsize
     if expected != size - file.tell():
         raise InputError(f"{where}: its header declares {expected} bytes of numbers, there are {size - file.tell()}")
+    if check is not None:
+        check(shape)
     array = np.frombuffer(file.read(expected), dtype)
     return array.reshape(shape[::-1]).T.copy() if transposed else array.reshape(shape).copy()

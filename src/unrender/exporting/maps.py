@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from PIL import Image
 
 from unrender.exporting.ready_made import as_bitmap, file_name
+from unrender.problem.grids import write_grid
 from unrender.report.pictures import srgb
 
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
@@ -62,7 +62,7 @@ def _large(key: str, value: np.ndarray, folder: Path) -> dict[str, Any]:
         clipped = int(np.sum((shown < 0) | (shown > 1)))
         return {"files": [f"{base}.exr", f"{base}.png"], "png": kind, "clipped": clipped}
     if value.ndim == 4:
-        mi.VolumeGrid(np.ascontiguousarray(value)).write(str(folder / f"{base}.vol"))
+        write_grid(folder / f"{base}.vol", value)
         return {"files": [f"{base}.vol"]}
     np.save(folder / f"{base}.npy", value, allow_pickle=False)
     return {"files": [f"{base}.npy"]}

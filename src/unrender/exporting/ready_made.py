@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.errors import InputError
+from unrender.problem.grids import write_grid
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """The folders of a scene's files."""
@@ -104,9 +105,7 @@ class FilesOnly:
 
     def _volume(self, value: Any, place: tuple[str, ...]) -> str:
         path = self._path(VOLUMES, place[:-1], ".vol")
-        grid = value if isinstance(value, mi.VolumeGrid) else mi.VolumeGrid(np.array(value, np.float32))
-        grid.write(str(path))
-        return str(path)
+        return str(write_grid(path, value if isinstance(value, mi.VolumeGrid) else np.array(value, np.float32)))
 
     def _path(self, kind: str, place: tuple[str, ...], ending: str) -> Path:
         path = self._folder / kind / (file_name(".".join(place)) + ending)

@@ -11,6 +11,7 @@ import numpy as np
 from unrender.errors import InputError
 from unrender.exporting.graph import Place, SceneGraph
 from unrender.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name
+from unrender.problem.grids import write_grid
 
 _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 _METALS = ("conductor", "roughconductor")
@@ -73,7 +74,7 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
     plugin = props.plugin_name()
     if plugin == "gridvolume":
         path = _path(folder, VOLUMES, name, ".vol")
-        mi.VolumeGrid(np.ascontiguousarray(value, np.float32)).write(str(path))
+        write_grid(path, value)
     elif plugin in ("bitmap", "envmap"):
         path = _path(folder, BITMAPS, name, ".exr")
         # Mitsuba repeats the first column behind the last one, and the last before the first.

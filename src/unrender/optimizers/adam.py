@@ -22,12 +22,14 @@ class AdamState:
         learning_rates: of each parameter, before the schedule.
         first_moment: exponentially weighted mean of the gradient, not debiased.
         second_moment: of its square.
+        begun: the step at which the moments began.
     """
 
     step: int
     learning_rates: dict[str, float]
     first_moment: Tree
     second_moment: Tree
+    begun: int = 0
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Adam:
         gradient = estimate.gradient
         first = trees.map(lambda m, g: self.beta_1 * m + (1.0 - self.beta_1) * g, state.first_moment, gradient)
         second = trees.map(lambda v, g: self.beta_2 * v + (1.0 - self.beta_2) * (g * g), state.second_moment, gradient)
-        made = state.step + 1
+        made = state.step + 1 - state.begun
         factor = rates.factor("Adam", self.schedule, state.step) / (1.0 - self.beta_1**made)
         debias = 1.0 / math.sqrt(1.0 - self.beta_2**made)
 
@@ -83,4 +85,6 @@ class Adam:
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, first[key])
             return rate * (first[key] / (root + self.epsilon))
 
-        return {key: step(key) for key in first}, replace(state, step=made, first_moment=first, second_moment=second)
+        return {key: step(key) for key in first}, replace(
+            state, step=state.step + 1, first_moment=first, second_moment=second
+        )

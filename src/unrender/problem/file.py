@@ -7,10 +7,11 @@
 
     [[parameters]]
     key = "wall.bsdf.reflectance.data"
-    initial = 0.5                              # a number, a colour [r, g, b], a picture file, a .npy file
+    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), an array (.npy, .npz)
     bounds = [0.0, 1.0]                        # inf and -inf are open
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
+    coarse_to_fine = [200, 400]                # steps before which the resolution doubles, see CoarseToFine
     truth = "wall.exr"                         # where it is known, to measure the error
 
     [[views]]
@@ -33,7 +34,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Stric
 from unrender import files
 from unrender.errors import InputError
 from unrender.names import did_you_mean
-from unrender.problem import components, lines
+from unrender.problem import coarse_to_fine, components, lines
 from unrender.problem.field import FieldError, Place, dotted
 from unrender.problem.lines import tomllib
 from unrender.problem.parameter import Parameter
@@ -50,15 +51,19 @@ class _Model(BaseModel):
 class _Parameter(_Model):
     key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
     initial: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture or .npy file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
     bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is open)")
     learning_rate: _Number | None = Field(None, description="a number above 0")
     preconditioner: StrictStr | dict[str, Any] | None = Field(
         None, description='a table such as { type = "LargeSteps", strength = 10.0 }'
     )
+    coarse_to_fine: list[StrictInt] | dict[str, Any] | None = Field(
+        None,
+        description='a list of steps such as [200, 400], or a table such as { steps = [200, 400], states = "reset" }',
+    )
     truth: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture or .npy file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
 
 
@@ -153,7 +158,13 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             preconditioner = components.make(components.PRECONDITIONERS, model.preconditioner)
         except InputError as error:
             raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
-    return Parameter(model.key, _value(model.initial, folder), model.bounds, model.learning_rate, preconditioner)
+    way = None
+    if model.coarse_to_fine is not None:
+        try:
+            way = coarse_to_fine.of(model.coarse_to_fine)
+        except InputError as error:
+            raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
+    return Parameter(model.key, _value(model.initial, folder), model.bounds, model.learning_rate, preconditioner, way)
 
 
 def _located(description: str | dict[str, Any], folder: Path) -> str | dict[str, Any]:

@@ -63,6 +63,8 @@ def _take(problem: Problem) -> dict[str, str]:
         found[f"parameter {key}: bounds"] = str(problem.bounds[key])
         found[f"parameter {key}: learning_rate"] = str(problem.learning_rates.get(key))
         found[f"parameter {key}: preconditioner"] = repr(problem.preconditioners.get(key))
+        if key in problem.coarse_to_fine:
+            found[f"parameter {key}: coarse_to_fine"] = repr(problem.coarse_to_fine[key])
     for index, view in enumerate(problem.views):
         found[f"view {index}: sensor"] = str(view.sensor)
         found[f"view {index}: weight"] = str(view.weight)

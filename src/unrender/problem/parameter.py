@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.preconditioners.base import Preconditioner
+from unrender.problem.coarse_to_fine import CoarseToFine
 
 
 @dataclass(frozen=True)
@@ -17,12 +19,14 @@ class Parameter:
 
     Args:
         key: as `mitsuba.traverse` names it, e.g. ``"back.bsdf.reflectance.data"``.
-        initial: where the descent starts: a number, a colour, an image file, an array of the parameter's shape (a number
-            or a colour fills it), or None for the scene's own value. An image file is scaled to the parameter's resolution;
-            8-bit files are taken as sRGB and linearised.
+        initial: where the descent starts: a number, a colour, an image or grid file, an array of the parameter's shape (a number
+            or a colour fills it), or None for the scene's own value. An image file is scaled to the resolution of a texture (H, W, C),
+            a `.vol` file to that of a grid (Z, Y, X, C); 8-bit images are taken as sRGB and linearised. A `.npy` file, or an `.npz`
+            archive of one array, must have the parameter's shape; a last axis of length 1 may be missing.
         bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
+        coarse_to_fine: `CoarseToFine`, or its steps alone, for a texture or grid that is coarse at first; None for one resolution.
     """
 
     key: str
@@ -30,3 +34,4 @@ class Parameter:
     bounds: tuple[float | None, float | None] | None = None
     learning_rate: float | None = None
     preconditioner: Preconditioner | None = None
+    coarse_to_fine: CoarseToFine | Sequence[int] | None = None

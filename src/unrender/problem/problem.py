@@ -16,7 +16,8 @@ from unrender.errors import InputError
 from unrender.losses import L2, Loss
 from unrender.names import did_you_mean
 from unrender.preconditioners.base import Preconditioner
-from unrender.problem import pictures, scene_files, values
+from unrender.problem import coarse_to_fine, pictures, scene_files, values
+from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.field import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
@@ -66,6 +67,7 @@ class Problem:
         bounds: {key: (low, high)}, the parameter's own or the physical range that the renderer knows; None is open.
         learning_rates: {key: rate} of the parameters that have their own.
         preconditioners: {key: preconditioner} of the parameters that have one.
+        coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
         references: the views' pictures, looked up pixel by pixel.
         truth: {key: array} of the parameters' shapes.
 
@@ -101,6 +103,7 @@ class Problem:
         self.bounds: dict[str, Bounds] = {}
         self.learning_rates: dict[str, float] = {}
         self.preconditioners: dict[str, Preconditioner] = {}
+        self.coarse_to_fine: dict[str, CoarseToFine] = {}
         self._initial: dict[str, np.ndarray] = {}
         for index, parameter in enumerate(self.parameters):
             self._take_parameter(index, parameter, known)
@@ -120,8 +123,28 @@ class Problem:
     # ------------------------------------------------------------------ what methods ask
 
     def initial(self) -> Tree:
-        """Where the descent starts: the renderer's arrays, inside the bounds."""
+        """Where the descent starts: the renderer's arrays, inside the bounds, at the scene's own resolutions."""
         return {key: self.renderer.array(value) for key, value in self._initial.items()}
+
+    def start(self, step: int = 0) -> Tree:
+        """`initial()` at the resolutions that parameters have at a step."""
+        coarse = {key: way.coarsened(self._initial[key], step) for key, way in self.coarse_to_fine.items()}
+        return {key: self.renderer.array(coarse.get(key, value)) for key, value in self._initial.items()}
+
+    def shapes(self, step: int | None = None) -> dict[str, tuple[int, ...]]:
+        """Of each parameter at a step; None for the scene's own."""
+        found = {key: value.shape for key, value in self._initial.items()}
+        if step is None:
+            return found
+        return found | {key: way.shape(found[key], step) for key, way in self.coarse_to_fine.items()}
+
+    def full(self, parameters: Mapping[str, Array]) -> dict[str, np.ndarray]:
+        """The parameters as NumPy arrays, those that are still coarse interpolated at the scene's own resolution."""
+        found = {key: arrays.numpy(value) for key, value in parameters.items()}
+        for key, way in self.coarse_to_fine.items():
+            if key in found and found[key].shape in way.shapes(self._initial[key].shape):
+                found[key] = way.refined(found[key], self._initial[key].shape)
+        return found
 
     def reference(self, view: int) -> Array:
         """The view's picture as the renderer's array (H, W, 3)."""
@@ -168,8 +191,9 @@ class Problem:
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
         """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""
+        found = self.full({key: parameters[key] for key in self.truth})
         return {
-            key: float(np.sqrt(np.mean(np.square(arrays.numpy(parameters[key]) - truth, dtype=np.float64))))
+            key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))
             for key, truth in self.truth.items()
         }
 
@@ -206,6 +230,17 @@ class Problem:
             except InputError as error:
                 raise wrong("preconditioner", str(error).removeprefix(f"{key}: preconditioner ")) from error
             self.preconditioners[key] = preconditioner
+        if parameter.coarse_to_fine is not None:
+            try:
+                way = coarse_to_fine.of(parameter.coarse_to_fine)
+                if not info.resizable:
+                    raise InputError("its resolution is fixed; expected the data of a bitmap texture or a grid volume")
+                way.check(info.shape)
+                if preconditioner is not None:
+                    preconditioner.check(key, way.shape(info.shape, 0))
+            except InputError as error:
+                raise wrong("coarse_to_fine", error) from error
+            self.coarse_to_fine[key] = way
         try:
             if parameter.initial is None:
                 start, notice = arrays.numpy(self.renderer.values([key])[key]).astype(np.float32), ""

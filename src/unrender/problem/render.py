@@ -28,7 +28,8 @@ def render(
 
     Args:
         problem: whose scene.
-        parameters: {key: array} of all the problem's parameters; None for the initial ones.
+        parameters: {key: array} of all the problem's parameters, also at one of the coarser resolutions that they have in the course of
+            a descent; None for the initial ones.
         view: index of the view.
         spp: samples per pixel, >= 1.
         seed: of the random numbers.
@@ -87,6 +88,7 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
         return point
     if set(parameters) != set(point):
         raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
+    parameters = problem.full(parameters)
     for key, value in parameters.items():
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")

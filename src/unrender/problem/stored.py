@@ -73,6 +73,8 @@ def _parameter(problem: Problem, index: int, parameter: Parameter, keep: _Arrays
         said["learning_rate"] = float(parameter.learning_rate)
     if parameter.preconditioner is not None:
         said["preconditioner"] = _component(parameter.preconditioner, PRECONDITIONERS)
+    if parameter.key in problem.coarse_to_fine:
+        said["coarse_to_fine"] = _fields(problem.coarse_to_fine[parameter.key])
     if parameter.key in problem.truth:
         said |= keep.field("truth", problem.truth[parameter.key], f"parameter{index}-truth")
     return said
@@ -109,5 +111,9 @@ def _component(value: Any, kinds: Mapping[str, type]) -> Any:
         return dict(value)
     if kinds.get(type(value).__name__) is not type(value):
         return repr(value)
+    return {"type": type(value).__name__, **_fields(value)}
+
+
+def _fields(value: Any) -> dict[str, Any]:
     fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    return {"type": type(value).__name__, **{k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}

@@ -1,4 +1,4 @@
-"""What a parameter starts from: a number, a colour, a picture or an array becomes an array of its shape."""
+"""What a parameter starts from: a number, a colour, a picture, a grid or an array becomes an array of its shape."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from unrender import files
 from unrender.errors import InputError
-from unrender.problem import pictures
+from unrender.problem import grids, pictures, resampling
 
 
 def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     """`initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
 
-    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C); an array must have
-    the shape.
+    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C), a .vol file to (Z, Y, X, C); an
+    array, also of a .npy file or the only one of an .npz archive, must have the shape, but for the last axis where that is of length 1.
 
     Raises:
         InputError: it does not fit, cannot be read, or is not finite.
@@ -30,7 +29,9 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
         with np.errstate(over="ignore"):
             array = array.astype(np.float32)
     except (TypeError, ValueError) as error:
-        raise InputError(f"expected a number, a colour, a picture file or an array, got {_short(initial)}") from error
+        raise InputError(
+            f"expected a number, a colour, a picture or grid file or an array, got {_short(initial)}"
+        ) from error
     if not np.isfinite(array).all():
         raise InputError("must be finite, got NaN or infinite values")
     if array.shape == shape:
@@ -43,12 +44,12 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
 
 def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
-    if Path(path).suffix.lower() == ".npy" and Path(path).is_file():
-        array = files.read_array(Path(path))
-        try:
-            return fill(array, shape)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+    ending = Path(path).suffix.lower()
+    if ending == ".vol":
+        return _from_grid(Path(path), shape)
+    if ending in (".npy", ".npz"):
+        array = grids.read_numpy(Path(path), lambda found: _check_shape(found, shape))
+        return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape)
     picture = pictures.read(path)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
@@ -67,6 +68,28 @@ def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, st
         remarks.append(f"scaled from {values.shape[1]}x{values.shape[0]} to {width}x{height}")
         values = pictures.resize(values, height, width)
     return np.ascontiguousarray(values, np.float32), f"{Path(path).name}: {', '.join(remarks)}" if remarks else ""
+
+
+def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+    def check(found: tuple[int, ...]) -> None:
+        if len(shape) != 4:
+            raise InputError(f"a grid cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
+        if found[-1] != shape[-1]:
+            raise InputError(f"a grid of {found[-1]} channels cannot fill a parameter of {shape[-1]}")
+
+    grid = grids.read_grid(path, check).values
+    if grid.shape == shape:
+        return grid, ""
+    sizes = ["x".join(map(str, reversed(size[:-1]))) for size in (grid.shape, shape)]
+    return resampling.resize(grid, shape[:-1]), f"{path.name}: scaled from {sizes[0]} to {sizes[1]} voxels"
+
+
+def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    """Raise `InputError` where no array of this shape fills the parameter's, before it is read."""
+    number, colour = found in ((), (1,)), len(found) == 1 and len(shape) > 1 and found[0] == shape[-1]
+    bare = len(shape) > 1 and shape[-1] == 1 and found == shape[:-1]
+    if not (number or colour or bare or found == shape):
+        raise InputError(f"expected {_expected(shape)}, got an array of shape {found}")
 
 
 def _expected(shape: tuple[int, ...]) -> str:

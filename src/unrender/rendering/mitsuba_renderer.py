@@ -320,7 +320,9 @@ class MitsubaRenderer:
         """Call the frozen kernel for shots of this form: traced once, replayed at each step."""
         count = self._count(shot)
         several = shot.sensors is not None
-        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None, several, copies)
+        # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
+        sizes = tuple(tuple(value.shape) for value in self._loaded.values())
+        key = (what, shot.sensor, shot.spp, shot.groups, count, shot.pixels is None, several, copies, sizes)
         trace = self._trace_poses if what == "poses" else self._trace
         if key not in self._frozen:
             traced = trace(what, shot.sensor, shot.spp, count, copies)

@@ -32,6 +32,7 @@ class ParameterInfo:
         highest: the largest, or None.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
+        resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
     """
 
     shape: tuple[int, ...]
@@ -42,6 +43,7 @@ class ParameterInfo:
     highest: float | None = None
     perturbable: bool = True
     compiled: bool = False
+    resizable: bool = False
 
 
 @dataclass(frozen=True)

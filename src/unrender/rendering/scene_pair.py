@@ -240,7 +240,15 @@ class ScenePair:
         low, high = _physical_range(self.current_parameters, key)
         if ride.blind:
             return ParameterInfo(shape, False, False, ride.reason, low, high)
-        return ParameterInfo(shape, True, not ride.reason, ride.reason, low, high)
+        return ParameterInfo(
+            shape, True, not ride.reason, ride.reason, low, high, resizable=self._resizable(key, shape)
+        )
+
+    def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
+        """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
+        node = self.current_parameters.properties[key][2]
+        axes = 4 if isinstance(node, mi.Volume) else 3 if isinstance(node, mi.Texture) else 0
+        return key.endswith("data") and len(shape) == axes
 
 
 def media(scene: Any) -> list[Any]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from unrender import arrays, files, trees
+from unrender import arrays, files
 from unrender.errors import InputError
 from unrender.thumbnails import reduced, stretched
 from unrender.training.callbacks import Callback
@@ -166,14 +166,14 @@ class Live(Callback):
             views = {**_references(run), **{f"{name}/initial": image for name, image in _images(run).items()}}
             files.write_arrays(self._live / "start.npz", views, compress=False)
         files.write_arrays(self._live / "views.npz", _views(run), compress=False)
-        files.write_arrays(self._live / "parameters.npz", _small(trees.numpy(run.parameters)), compress=False)
+        files.write_arrays(self._live / "parameters.npz", _small(run.full()), compress=False)
         self._history.write(self._live)
         self._write_status(run, status, record)
         self._cost = time.monotonic() - began
         self._next_update = began + max(_INTERVAL, self._cost / _SHARE)
 
     def _write_start(self, run: Run) -> None:
-        initial = trees.numpy(run.parameters)
+        initial = run.full()
         self._initial_error = run.problem.parameter_error(initial)
         files.write_arrays(self._live / "start.npz", _references(run), compress=False)
         files.write_arrays(self._live / "initial.npz", _small(initial), compress=False)
@@ -210,7 +210,7 @@ class Live(Callback):
             "host": platform.node(),
             "update_seconds": self._cost,
             "initial_error": self._initial_error,
-            "shapes": trees.shapes(run.parameters),
+            "shapes": run.problem.shapes(),
         }
         _write_json(self._live / "status.json", found)
 

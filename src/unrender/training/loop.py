@@ -21,7 +21,7 @@ from unrender.problem.fingerprint import fingerprint
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.problem.stored import origin
-from unrender.training import method_file
+from unrender.training import method_file, refining
 from unrender.training.callbacks import Callback
 from unrender.training.folder import Keeper
 from unrender.training.noise import GradientNoise
@@ -96,7 +96,7 @@ def optimize(
         checks.whole("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     about = about or About()
     run, memory = prepare(problem, estimator, optimizer, steps, seconds, seed)
-    labels = Labels(describe_run(run, about), trees.numpy(run.parameters), about.final_spp)
+    labels = Labels(describe_run(run, about), run.full(), about.final_spp)
     if run_directory is None:
         return descend(run, memory, callbacks, labels)
     run.folder = Path(run_directory)
@@ -132,14 +132,14 @@ class Labels:
     def result(self, run: Run, info: bool = False) -> Result:
         """What the run has reached so far; with `info`, what the last estimate tells besides."""
         return Result(
-            parameters=trees.numpy(run.parameters),
+            parameters=run.full(),
             initial=self.initial,
             history=self.history,
             seconds=run.clock,
             warmup_seconds=self.warmup,
             stopped=run.stopped,
             skipped=run.skipped,
-            warnings=run.warnings,
+            warnings=[*run.warnings, *(refining.unfinished(run) if run.stopped else [])],
             info=_as_numpy(run.estimate.info) if info and run.estimate else {},
             **self.facts,
         )
@@ -154,15 +154,18 @@ def prepare(
     seed: int,
 ) -> tuple[Run, Memory]:
     """A run before its first step."""
-    parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.initial().items()}
-    state = estimator.init(problem, parameters)
-    memory = Memory(
-        state,
-        optimizer.init(parameters, problem.learning_rates),
-        GradientNoise(),
-        dict.fromkeys(parameters, True),
-    )
-    return Run(problem, estimator, optimizer, seed, steps, seconds, parameters), memory
+    run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
+    memory = Memory(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
+    place(run, memory, 0)
+    return run, memory
+
+
+def place(run: Run, memory: Memory, step: int) -> None:
+    """Bring a run that has not begun to the resolutions that parameters have at a step: the start, and states that know nothing."""
+    problem = run.problem
+    run.parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.start(step).items()}
+    memory.estimator = run.estimator.init(problem, run.parameters)
+    memory.optimizer = run.optimizer.init(run.parameters, problem.learning_rates)
 
 
 def descend(
@@ -183,6 +186,7 @@ def descend(
         take_up: brings the run to where it goes on from, called after the warm-up; it is shown the snapshots of a fresh run and of one
             after two steps, which tell the form of states.
     """
+    problem = run.problem
     try:
         fresh = snapshot(run, memory)
         seconds, warm = _warm_up(run, memory)
@@ -194,7 +198,12 @@ def descend(
             for callback in callbacks:
                 callback.on_start(run)
             while not run.stopped:
+                finer = refining.is_due(run)
+                if finer:
+                    labels.warmup += refining.refine(run, memory) + _warm_up(run, memory)[0]
                 record = _step(run, memory)
+                if finer or (run.step == 1 and problem.coarse_to_fine):
+                    record["resolution"] = {key: run.parameters[key].shape[:-1] for key in problem.coarse_to_fine}
                 labels.history.append(record)
                 if keeper is not None:
                     keeper.step(record)

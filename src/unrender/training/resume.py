@@ -85,7 +85,7 @@ def go_on(
     run, memory = loop.prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
     run.folder = folder
     about = loop.About(past.method, _own_settings(past), past.command, method.final_spp)
-    labels = loop.Labels(loop.describe_run(run, about), trees.numpy(run.parameters), method.final_spp)
+    labels = loop.Labels(loop.describe_run(run, about), run.full(), method.final_spp)
     now = loop.fingerprint_of(run)
     labels.facts["problem"] |= {"fingerprint": now, "origin": origin(problem)}
     said = method_file.said(run, method.name, method.checkpoint_every, method.final_spp)
@@ -109,6 +109,8 @@ def go_on(
             what = "; ".join(changed[:_MOST_SHOWN]) + more
             raise InputError(f"run folder {folder}: not as it was: {what}; to go on nevertheless, force it")
         _check_room(folder, method, found)
+        if found is not None:
+            loop.place(run, memory, max(found.manifest.step - 1, 0))
 
         def take_up(fresh: dict[str, Any], warm: dict[str, Any]) -> None:
             kept = fresh if found is None else _unpacked(found, fresh, warm)

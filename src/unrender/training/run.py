@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from unrender.gradients.estimate import Estimate, Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
@@ -27,7 +29,7 @@ class Run:
         folder: the run folder; None where the run keeps none.
         step: how many steps are done.
         clock: seconds of optimization so far.
-        parameters: the current ones (the renderer's arrays).
+        parameters: the current ones (the renderer's arrays), at the present resolution where they are coarse at first.
         estimate: the last one.
         skipped: steps not applied so far.
         warnings: one line each.
@@ -52,6 +54,10 @@ class Run:
     def stop(self, reason: str = "callback") -> None:
         """End the run after the present step."""
         self.stopped = self.stopped or reason
+
+    def full(self) -> dict[str, np.ndarray]:
+        """The parameters as NumPy arrays at the scene's own resolution."""
+        return self.problem.full(self.parameters)
 
     def progress(self) -> float:
         """The share of the budget used, in [0, 1]."""

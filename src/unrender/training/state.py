@@ -26,6 +26,7 @@ _DEVICE = (
     *(f"TensorX{kind}" for kind in ("f", "f16", "f64", "i", "i64", "u", "u64", "b")),
     *("Float", "Float16", "Float64", "Int", "Int64", "UInt", "UInt64", "Bool"),
 )
+_FLOATS = (float, np.floating)
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -76,7 +77,10 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
     """
     if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
         return
-    fitting = [pattern for pattern in patterns if _kind(pattern) is _kind(state)]
+    # A number may be NumPy's or Python's: where arrays are NumPy's, one that was not yet summed to is still Python's.
+    if isinstance(state, _FLOATS) and any(isinstance(pattern, _FLOATS) for pattern in patterns):
+        return
+    fitting = [pattern for pattern in patterns if type(pattern) is type(state)]
     if not fitting:
         expected = " or ".join(sorted({type(pattern).__name__ for pattern in patterns}))
         raise InputError(f"{where}: expected {expected}, got {type(state).__name__}")
@@ -98,11 +102,6 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
             check_alike(value, [pattern[index] for pattern in fitting], f"{where}[{index}]")
     elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
         _check_array(state, fitting, where)
-
-
-def _kind(state: Any) -> type:
-    """Its type. A number from NumPy is as good as Python's: which of them a state holds can depend on what has happened."""
-    return float if isinstance(state, float) else type(state)
 
 
 def _check_array(array: Any, patterns: list[Any], where: str) -> None:
