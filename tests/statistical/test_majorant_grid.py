@@ -122,4 +122,4 @@ def test_gradients_are_those_of_one_majorant(monkeypatch: pytest.MonkeyPatch) ->
     error = np.sqrt((ours.var(0, ddof=1) + one.var(0, ddof=1)) / 24)
     score = np.abs(ours.mean(0) - one.mean(0)) / error
     assert (score < 4).all(), score
-    assert (np.abs(1.3 * ours.mean(0) - one.mean(0)) > 4 * error).all(), "too noisy to see three tenths"
+    assert (np.abs(1.6 * ours.mean(0) - one.mean(0)) > 4 * error).all(), "too noisy to see six tenths"

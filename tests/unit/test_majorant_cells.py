@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from kernels import on_device, recorded
 
 import unrender as ur
 from unrender.rendering import emissive, majorant_grid
@@ -186,6 +187,20 @@ def test_new_values_are_seen_and_old_ones_are_not_worked_out_again() -> None:
     parameters["sigma_t.data"] = mi.TensorXf(3 * values())
     parameters.update()
     np.testing.assert_allclose(grids.values().numpy(), 3 * before.numpy(), rtol=1e-6)
+
+
+def test_new_values_compile_no_kernels() -> None:
+    cloud = medium()
+    grids = MajorantGrids({number(cloud): cloud})
+    parameters = mi.traverse(cloud)
+    for seed in range(4):
+        parameters["sigma_t.data"] = on_device(values(seed=seed))
+        parameters.update()
+        with recorded() as found:
+            dr.eval(grids.values())
+            dr.sync_thread()
+        assert found
+        assert seed < 2 or not any(found)
 
 
 def test_media_without_a_grid_that_pays_keep_one_majorant() -> None:

@@ -31,7 +31,9 @@ _LEAST = 2
 """Voxels of a cell along an axis, at least."""
 
 _FINE = 16
-"""Voxels along some axis from which on a coarse grid pays."""
+"""Voxels along some axis from which on there is a coarse grid: the fewest that were measured. On two CPU cores, against one majorant, a
+pair of `smoke` took 0.6 of the time at 16³ voxels and 0.66 at 32³, the primal 0.7 and 0.9, at 4 to 13 % more variance of images. A
+sparse grid of 64³ took 0.14 and 0.23, at 29 to 35 % more."""
 
 _MARGIN = 1.25
 """Majorants are as much above the greatest extinction of a cell, up to that of the whole grid: where a majorant is hardly above the
