@@ -3,9 +3,10 @@
 
 """What primal, pair and adjoint cost on a grid, against Mitsuba's `volpath` and `prbvolpath`, as ratios within one run.
 
-    python benchmarks/volumes/cost/run.py [--resolution 64] [--grid 32] [--spp 16]
+    python benchmarks/volumes/cost/run.py [--resolution 64] [--grid 32] [--spp 16] [--sparse]
 
-On one view of `smoke`. Everything is timed in turns, so that what else the machine does falls on all alike.
+On one view of `smoke`; with `--sparse`, of a small dense core and a thin shell in a wide empty box. Everything
+is timed in turns, so that what else the machine does falls on all alike.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import mitsuba_renderer, write
 
 import unrender as ur
+from unrender.gallery import volumes
 from unrender.rendering.port import Shot
 
 HERE = Path(__file__).resolve().parent
@@ -44,12 +46,24 @@ def turns(contenders: dict[str, Callable[[int], Any]], repeats: int, warm: int =
     return times
 
 
-def contenders(problem: ur.Problem, spp: int) -> dict[str, Callable[[int], Any]]:
+def core(resolution: int) -> np.ndarray:
+    """Extinction (Z, Y, X, 1) of a small dense ball, and a thin open shell beside it."""
+    x, y, z = volumes.positions(resolution)
+    ball = 40 * np.clip(1 - np.sqrt((x + 0.4) ** 2 + (y + 0.3) ** 2 + z**2) / 0.2, 0, 1)
+    shell = 3 * (np.abs(np.hypot(x - 0.3, z) - 0.35) < 0.06) * (y > 0.2)
+    return (ball + shell)[..., None]
+
+
+def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callable[[int], Any]]:
     """What is compared, each a function of a seed."""
     renderer = mitsuba_renderer(problem)
     keys = list(problem.truth)
     renderer.select(keys, "path")
-    current = {key: renderer.array(value) for key, value in problem.truth.items()}
+    values = {
+        key: core(len(value)) if sparse and key.endswith("sigma_t.data") else value
+        for key, value in problem.truth.items()
+    }
+    current = {key: renderer.array(value) for key, value in values.items()}
     previous = {key: value * 0.98 for key, value in current.items()}
     size = np.asarray(problem.views[0].reference).shape
     weight = renderer.array(np.ones((1, *size)))
@@ -60,6 +74,9 @@ def contenders(problem: ur.Problem, spp: int) -> dict[str, Callable[[int], Any]]
     assert callable(description)
     stock = mi.load_dict(description())
     parameters = mi.traverse(stock)
+    for key, value in current.items():
+        parameters[key] = mi.TensorXf(value)
+    parameters.update()
     depth = problem.max_depth
     volpath, prbvolpath = (mi.load_dict({"type": kind, "max_depth": depth}) for kind in ("volpath", "prbvolpath"))
 
@@ -92,13 +109,14 @@ def main() -> None:
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--grid", type=int, default=32)
     parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--sparse", action="store_true")
     parser.add_argument("--repeats", type=int, default=9)
     asked = parser.parse_args()
     print(ur.use())
     problem = ur.gallery.problem(
         "smoke", resolution=asked.resolution, grid_resolution=asked.grid, views=1, reference_spp=1
     )
-    times = turns(contenders(problem, asked.spp), asked.repeats)
+    times = turns(contenders(problem, asked.spp, asked.sparse), asked.repeats)
     medians = {name: float(np.median(found)) for name, found in times.items()}
 
     def ratio(a: str, b: str) -> list[float]:
@@ -114,7 +132,7 @@ def main() -> None:
     }
     for name, found in (medians | ratios).items():
         print(name, found)
-    write(HERE, {**vars(asked), "median_ms": medians, "ratios": ratios})
+    write(HERE / "sparse" if asked.sparse else HERE, {**vars(asked), "median_ms": medians, "ratios": ratios})
 
 
 if __name__ == "__main__":

@@ -335,7 +335,9 @@ class MitsubaRenderer:
         living = [self.pair.current, *self.pair.others()]
         chosen = (self._films(), shot.sensors) if several else None
         if self.pair.volumetric:
-            tables = {**(tables or {}), **self.pair.media(what.startswith("previous"), shot.sensor)}
+            previous = what.startswith("previous")
+            majorants = self.pair.majorants(previous, what.endswith("pair"))
+            tables = {**(tables or {}), **self.pair.media(previous, shot.sensor), **majorants}
         arguments = (scene, living, tables, mi.UInt32(shot.seed), shot.pixels, chosen, *more)
 
         def launch() -> Any:

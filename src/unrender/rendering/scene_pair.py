@@ -22,6 +22,7 @@ import numpy as np
 
 from unrender.errors import InputError
 from unrender.rendering import emissive
+from unrender.rendering.majorant_grid import MajorantGrids
 from unrender.rendering.path_pair import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.port import ParameterInfo
 from unrender.variant import ensure
@@ -124,6 +125,7 @@ class ScenePair:
         self._previous_parameters: Any = None
         self._tables: dict[str, Any] | None = None
         self._media: dict[tuple[bool, int], dict[str, Any]] = {}
+        self._majorants: dict[bool, MajorantGrids] = {}
         _living.add(self)
 
     @property
@@ -180,6 +182,27 @@ class ScenePair:
             tables = {"camera": dr.opaque(mi.UInt32, _id(camera)), "emits": mi.UInt32(emits)}
             self._media[previous, sensor] = tables
         return self._media[previous, sensor]
+
+    def majorants(self, previous: bool, both: bool) -> dict[str, Any]:
+        """The coarse grids of majorants of one of the two scenes, by its registry ids, from the values that it holds now; of `both`,
+        bounds of both. {"frames" | "layout" | "every"} as in `MajorantGrids`, "majorants": its values; nothing where no medium
+        has such a grid."""
+        grids = self._grids(previous)
+        if not grids:
+            return {}
+        majorants = grids.values()
+        if both:
+            other = self._grids(not previous)
+            if grids.shapes() != other.shapes():
+                return {}
+            majorants = dr.maximum(majorants, other.values())
+        return {"frames": grids.frames, "layout": grids.layout, "every": grids.every, "majorants": majorants}
+
+    def _grids(self, previous: bool) -> MajorantGrids:
+        if previous not in self._majorants:
+            scene = self.previous if previous else self.current
+            self._majorants[previous] = MajorantGrids({_id(medium): medium for medium in media(scene)})
+        return self._majorants[previous]
 
     def _check_media(self) -> None:
         """Raise `InputError` where the scene itself gives a medium values that make no sense: Mitsuba takes them as they are."""

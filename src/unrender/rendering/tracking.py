@@ -3,9 +3,9 @@
 
 """Steps through a participating medium: where a ray collides, what passes, and where its derivative is looked for.
 
-Symbols: σ̄ majorant (one number per lane that bounds all channels, of both states), σₜ extinction, σₛ scattering, β throughput,
-T transmittance. A subscript ₚ marks the previous state. With `pair` false its arguments are not looked at, and what is
-returned for it is to be ignored.
+Symbols: σ̄ majorant (one number per lane that bounds all channels, of both states, see `majorant_grid.py`), σₜ extinction,
+σₛ scattering, β throughput, T transmittance. A subscript ₚ marks the previous state. With `pair` false its arguments are not looked
+at, and what is returned for it is to be ignored.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from unrender.rendering.majorant_grid import Cells, Uniform
 
 _FAINT = 0.1
 """Below this transmittance, roulette decides whether a walk through a medium goes on."""
@@ -43,18 +45,25 @@ def extent(medium: Any, ray: Any, reach: Any, active: Any) -> tuple[Any, Any]:
     return dr.select(inside, near, 0), dr.select(inside, far, 0)
 
 
-def majorant(medium: Any, mediumₚ: Any, ray: Any, active: Any, pair: bool) -> Any:
-    """A bound of the extinction of all channels, of both states with `pair`."""
-    mei = at(ray, mi.Float(0))
-    bound = dr.max(medium.get_majorant(mei, active))
-    if pair:
-        bound = dr.maximum(bound, dr.max(mediumₚ.get_majorant(mei, active)))
-    return dr.select(active, dr.detach(bound), 0)
+def bounds(
+    tables: Any, medium: Any, mediumₚ: Any, ray: Any, near: Any, far: Any, active: Any, pair: bool
+) -> Uniform | Cells:
+    """Bounds of the extinction of all channels from `near` to `far`, of both states with `pair`: by the coarse grids in `tables`, where it
+    has them, else by the medium's own majorant."""
+    grids = "majorants" in tables
+    σ̄ = None
+    if not (grids and tables["every"]):
+        mei = at(ray, mi.Float(0))
+        σ̄ = dr.max(medium.get_majorant(mei, active))
+        if pair:
+            σ̄ = dr.maximum(σ̄, dr.max(mediumₚ.get_majorant(mei, active)))
+        σ̄ = dr.select(active, dr.detach(σ̄), 0)
+    return Cells(tables, medium, ray, near, far, σ̄, active) if grids else Uniform(σ̄, near, far)
 
 
-def step(σ̄: Any, u: Any) -> Any:
-    """The distance to the next tentative collision; infinite where there is no medium."""
-    return dr.select(σ̄ > 0, -dr.log(1 - u) / σ̄, dr.inf)
+def free_depth(u: Any) -> Any:
+    """The optical depth of majorants to the next tentative collision."""
+    return -dr.log(1 - u)
 
 
 @dr.syntax
@@ -62,16 +71,14 @@ def collide(
     medium: Any,
     mediumₚ: Any,
     ray: Any,
-    near: Any,
-    far: Any,
-    σ̄: Any,
+    bound: Uniform | Cells,
     β: Any,
     βₚ: Any,
     sampler: Any,
     active: Any,
     pair: bool,
 ) -> tuple[Any, Any, Any, Any]:
-    """Delta tracking from `near` to `far`.
+    """Delta tracking through a segment.
 
     A tentative collision is real with a probability that weighs all channels of both states by their throughput: the
     sum of all throughputs then stays as it is at every null collision, so none of them explodes.
@@ -79,35 +86,42 @@ def collide(
     Returns:
         distance of the real collision, whether there is one, and the throughputs, σₛ over its density included.
     """
-    t = mi.Float(near)
+    place = bound.start()
     real = mi.Bool(False)
-    flying = active & (near < far) & (σ̄ > 0)
+    flying = active & (bound.near < bound.far)
     while dr.hint(flying, label="free flight"):
-        t += step(σ̄, sampler.next_1d())
-        flying &= t < far
-        mei = at(ray, t)
-        σₛ, _, σₜ = medium.get_scattering_coefficients(mei, flying)
+        place = bound.advance(place, free_depth(sampler.next_1d()), flying)
+        flying &= place.t < bound.far
+        σ̄ = place.σ̄
+        mei = at(ray, place.t)
+        σₜ = medium.get_scattering_coefficients(mei, flying)[2]
         share, total = dr.sum(β * σₜ), dr.sum(β)
         if dr.hint(pair, mode="scalar"):
-            σₛₚ, _, σₜₚ = mediumₚ.get_scattering_coefficients(mei, flying)
+            σₜₚ = mediumₚ.get_scattering_coefficients(mei, flying)[2]
             share += dr.sum(βₚ * σₜₚ)
             total += dr.sum(βₚ)
         p = dr.clip(share / (σ̄ * total), 0, 1)
         real = flying & (sampler.next_1d() < p)
         null = flying & ~real
         scale = dr.rcp(dr.select(real, p, 1 - p) * σ̄)
-        β = dr.select(flying, β * scale * dr.select(real, σₛ, dr.maximum(σ̄ - σₜ, 0)), β)
+        β = dr.select(flying, β * scale * dr.select(real, 1, dr.maximum(σ̄ - σₜ, 0)), β)
         if dr.hint(pair, mode="scalar"):
-            βₚ = dr.select(flying, βₚ * scale * dr.select(real, σₛₚ, dr.maximum(σ̄ - σₜₚ, 0)), βₚ)
+            βₚ = dr.select(flying, βₚ * scale * dr.select(real, 1, dr.maximum(σ̄ - σₜₚ, 0)), βₚ)
         flying = null
-    return t, real, β, βₚ
+    # Only here, since an albedo is dear to look up and null collisions need none.
+    mei = at(ray, place.t)
+    β *= dr.select(real, medium.get_scattering_coefficients(mei, real)[0], 1)
+    if dr.hint(pair, mode="scalar"):
+        βₚ *= dr.select(real, mediumₚ.get_scattering_coefficients(mei, real)[0], 1)
+    return place.t, real, β, βₚ
 
 
 @dr.syntax
 def transmit(
-    medium: Any, mediumₚ: Any, ray: Any, near: Any, far: Any, σ̄: Any, sampler: Any, active: Any, pair: bool
+    medium: Any, mediumₚ: Any, ray: Any, bound: Uniform | Cells, sampler: Any, active: Any, pair: bool
 ) -> tuple[Any, Any]:
-    """Transmittance from `near` to `far` of both states: in closed form where the medium is homogeneous, else by ratio tracking."""
+    """Transmittance of a segment in both states: in closed form where the medium is homogeneous, else by ratio tracking."""
+    near, far = bound.near, bound.far
     active = active & (near < far)
     closed = active & medium.is_homogeneous()
     mei = at(ray, near)
@@ -115,12 +129,13 @@ def transmit(
     Tₚ = mi.Spectrum(T)
     if dr.hint(pair, mode="scalar"):
         Tₚ = dr.select(closed, dr.exp(-mediumₚ.get_scattering_coefficients(mei, closed)[2] * (far - near)), 1)
-    t = mi.Float(near)
-    walking = active & ~closed & (σ̄ > 0)
+    place = bound.start()
+    walking = active & ~closed
     while dr.hint(walking, label="ratio tracking"):
-        t += step(σ̄, sampler.next_1d())
-        walking &= t < far
-        mei = at(ray, t)
+        place = bound.advance(place, free_depth(sampler.next_1d()), walking)
+        walking &= place.t < far
+        σ̄ = place.σ̄
+        mei = at(ray, place.t)
         T = dr.select(walking, T * dr.maximum(1 - medium.get_scattering_coefficients(mei, walking)[2] / σ̄, 0), T)
         most = dr.max(T)
         if dr.hint(pair, mode="scalar"):
@@ -174,9 +189,7 @@ def offer(
     medium: Any,
     mediumₚ: Any,
     ray: Any,
-    near: Any,
-    far: Any,
-    σ̄: Any,
+    bound: Uniform | Cells,
     depth: Any,
     β: Any,
     βₚ: Any,
@@ -184,30 +197,32 @@ def offer(
     active: Any,
     pair: bool,
 ) -> Reservoir:
-    """Differential ratio tracking (Nimier-David et al. 2022): points from `near` to `far` in proportion to transmittance alone.
+    """Differential ratio tracking (Nimier-David et al. 2022): points of a segment in proportion to transmittance alone.
 
     The whole segment is walked with a majorant; each tentative point is offered to the reservoir with the ratio-tracked
     transmittance up to it, whatever the density at the point itself. So points are found where the medium is empty, and
     none is weighted by 1/σₜ.
     """
+    near, far = bound.near, bound.far
     active = active & (near < far)
     c = balance(near, far)
-    bound = dr.maximum(σ̄, dr.select(active, _POINTS / (far - near), 0))
-    t = mi.Float(near)
+    bound = bound.at_least(dr.select(active, _POINTS / (far - near), 0))
+    place = bound.start()
     β = mi.Spectrum(β)
     βₚ = mi.Spectrum(βₚ)
     walking = active & (c > 0)
     while dr.hint(walking, label="differential ratio tracking"):
-        t += step(bound, noise.next_1d())
-        walking &= t < far
+        place = bound.advance(place, free_depth(noise.next_1d()), walking)
+        walking &= place.t < far
+        t, σ̄ = place.t, place.σ̄
         mei = at(ray, t)
         σₛ, _, σₜ = medium.get_scattering_coefficients(mei, walking)
-        offered = β * complement(σₛ, c) / bound
+        offered = β * complement(σₛ, c) / σ̄
         weight = dr.mean(offered)
         offeredₚ = mi.Spectrum(0)
         if dr.hint(pair, mode="scalar"):
             σₛₚ, _, σₜₚ = mediumₚ.get_scattering_coefficients(mei, walking)
-            offeredₚ = βₚ * complement(σₛₚ, c) / bound
+            offeredₚ = βₚ * complement(σₛₚ, c) / σ̄
             weight += dr.mean(offeredₚ)
         weight = dr.select(walking, weight, 0)
         kept.total += weight
@@ -220,10 +235,10 @@ def offer(
         kept.βₚ = dr.select(take, offeredₚ, kept.βₚ)
         kept.weight = dr.select(take, weight, kept.weight)
 
-        β *= dr.maximum(1 - σₜ / bound, 0)
+        β *= dr.maximum(1 - σₜ / σ̄, 0)
         most = dr.max(β)
         if dr.hint(pair, mode="scalar"):
-            βₚ *= dr.maximum(1 - σₜₚ / bound, 0)
+            βₚ *= dr.maximum(1 - σₜₚ / σ̄, 0)
             most = dr.maximum(most, dr.max(βₚ))
         # Roulette, relative to what the reservoir holds: points that would hardly be taken are not worth a walk.
         faint = most * (far - t) < _FAINT * kept.total

@@ -78,7 +78,7 @@ class VolumePair:
         stateₚ_in: Any = None,
         geometry: Any = None,
     ) -> tuple[Any, Any]:
-        """Trace one path per lane. See `PathPair.sample`; `tables` has also the entries of `ScenePair.media()`.
+        """Trace one path per lane. See `PathPair.sample`; `tables` has also the entries of `ScenePair.media()` and `.majorants()`.
 
         `geometry` must be None: posed shapes and media do not meet.
         """
@@ -149,16 +149,16 @@ class VolumePair:
                 mediumₚ = remap(mi.MediumPtr, tables["medium"], medium)
             inside = active & (medium != None)  # noqa: E711 (a comparison per lane)
             near, far = tracking.extent(medium, ray, si.t, inside)
-            σ̄ = tracking.majorant(medium, mediumₚ, ray, inside, pair)
+            bound = tracking.bounds(tables, medium, mediumₚ, ray, near, far, inside, pair)
             may_scatter = active & (depth + 1 < self.max_depth)
             shines = mi.Bool(False)
             if dr.hint(self.emission, mode="scalar"):
                 shines = dr.gather(mi.UInt32, tables["emits"], dr.reinterpret_array(mi.UInt32, medium), inside) != 0
             if dr.hint(follow_media, mode="scalar"):
                 offers = inside & (may_scatter | shines)
-                kept = tracking.offer(kept, medium, mediumₚ, ray, near, far, σ̄, depth, β, βₚ, noise, offers, pair)
+                kept = tracking.offer(kept, medium, mediumₚ, ray, bound, depth, β, βₚ, noise, offers, pair)
             flies = inside & ~forced
-            t, scatters, β, βₚ = tracking.collide(medium, mediumₚ, ray, near, far, σ̄, β, βₚ, sampler, flies, pair)
+            t, scatters, β, βₚ = tracking.collide(medium, mediumₚ, ray, bound, β, βₚ, sampler, flies, pair)
             if dr.hint(start.t is not None, mode="scalar"):
                 t = dr.select(forced, start.t, t)
                 scatters |= forced
@@ -336,8 +336,8 @@ class VolumePair:
                 mediumₚ = remap(mi.MediumPtr, tables["medium"], medium)
             inside = active & (medium != None)  # noqa: E711 (a comparison per lane)
             near, far = tracking.extent(medium, ray, dr.minimum(si.t, ray.maxt), inside)
-            σ̄ = tracking.majorant(medium, mediumₚ, ray, inside, pair)
-            passed, passedₚ = tracking.transmit(medium, mediumₚ, ray, near, far, σ̄, sampler, inside, pair)
+            bound = tracking.bounds(tables, medium, mediumₚ, ray, near, far, inside, pair)
+            passed, passedₚ = tracking.transmit(medium, mediumₚ, ray, bound, sampler, inside, pair)
             if dr.hint(follow, mode="scalar"):
                 length = far - near
                 way.length += length

@@ -1,0 +1,214 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""Coarse grids of majorants: they bound the extinction wherever a ray may look, and walks through them use up what they should."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from kernels import on_device, recorded
+
+import unrender as ur
+from unrender.rendering import emissive, majorant_grid
+from unrender.rendering.majorant_grid import Cells, MajorantGrids
+
+SHAPE = (17, 33, 22)
+POINTS = 200_000
+
+
+def turned() -> Any:
+    to = mi.ScalarTransform4f
+    return to().translate([3, -2, 1]).rotate([0.6, 0.0, 0.8], 40).scale([1.0, 2.0, 0.5]).translate([-0.5, -0.5, -0.5])
+
+
+def mirrored() -> Any:
+    to = mi.ScalarTransform4f
+    return to().translate([1, -3, 2]).rotate([0, 0, 1], 90).scale([2.0, -1.5, 3.0])
+
+
+PLACES = {
+    "cube": lambda: mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    "turned": turned,
+    "mirrored": mirrored,
+}
+
+
+def values(channels: int = 1, seed: int = 1) -> np.ndarray:
+    """Single voxels far above their neighbours, so that one that was forgotten is missed."""
+    rng = np.random.default_rng(seed)
+    return (rng.uniform(0, 1, (*SHAPE, channels)) + 20 * (rng.uniform(0, 1, (*SHAPE, channels)) < 0.01)).astype(
+        np.float32
+    )
+
+
+def medium(place: str = "cube", wrap: str = "clamp", channels: int = 1, scale: float = 1.0, **more: Any) -> Any:
+    grid = mi.VolumeGrid(values(channels))
+    volume = {"type": "gridvolume", "grid": grid, "raw": True, "to_world": PLACES[place](), "wrap_mode": wrap, **more}
+    return mi.load_dict({"type": "heterogeneous", "scale": scale, "sigma_t": volume, "albedo": 0.5})
+
+
+def number(of: Any) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(of)).numpy()[0])
+
+
+def volume(of: Any) -> Any:
+    return mi.traverse(of).properties["sigma_t.data"][2]
+
+
+def tables(of: Any) -> tuple[MajorantGrids, dict[str, Any]]:
+    grids = MajorantGrids({number(of): of})
+    return grids, {"frames": grids.frames, "layout": grids.layout, "majorants": grids.values()}
+
+
+def points(of: Any) -> np.ndarray:
+    """Anywhere in the medium's box, and crowded at its faces."""
+    box = volume(of).bbox()
+    low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+    shares = np.random.default_rng(2).beta(0.5, 0.5, (3, POINTS))
+    return low[:, None] + shares * (high - low)[:, None]
+
+
+def extinction(of: Any, where: np.ndarray) -> np.ndarray:
+    mei = dr.zeros(mi.MediumInteraction3f, where.shape[1])
+    mei.p = mi.Point3f(where)
+    return np.array(of.get_scattering_coefficients(mei, True)[2])
+
+
+def majorants(of: Any, where: np.ndarray) -> np.ndarray:
+    """Those that a walk finds which begins there."""
+    count = where.shape[1]
+    ray = mi.Ray3f(mi.Point3f(where), mi.Vector3f(0, 0, 1))
+    cells = Cells(tables(of)[1], mi.MediumPtr(of), ray, mi.Float(0), mi.Float(1e-6), None, mi.Bool(True))
+    return np.array(cells.start().σ̄) * np.ones(count)
+
+
+@pytest.fixture(autouse=True)
+def _variant() -> None:
+    ur.use()
+    emissive.register()
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("wrap", ["clamp", "repeat", "mirror"])
+def test_majorants_bound_the_extinction_everywhere(place: str, wrap: str) -> None:
+    for channels, filter_type in ((1, "trilinear"), (3, "trilinear"), (1, "nearest")):
+        cloud = medium(place, wrap, channels, scale=2.5, filter_type=filter_type)
+        where = points(cloud)
+        assert (extinction(cloud, where).max(axis=0) <= majorants(cloud, where) * (1 + 1e-5)).all()
+
+
+@pytest.mark.parametrize("fault", ["neighbours", "place"])
+def test_a_bound_that_forgets_something_is_seen(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So the test above can fail: cells that look no further than their own voxels, and a grid half a cell away."""
+    monkeypatch.setattr(majorant_grid, "_MARGIN", 1.0)
+    if fault == "neighbours":
+
+        def narrow(found: Any, shape: tuple[int, int, int], size: int, cells: int) -> Any:
+            outer, count, inner = shape
+            padded = np.zeros((outer, cells * size, inner), np.float32)
+            padded[:, :count] = np.array(found).reshape(shape)
+            return mi.Float(padded.reshape(outer, cells, size, inner).max(axis=2).ravel())
+
+        monkeypatch.setattr(majorant_grid, "_pool", narrow)
+    else:
+        found = majorant_grid.to_local
+        shift = np.array([[0, 0, 0, 0.05]] * 3)
+        monkeypatch.setattr(majorant_grid, "to_local", lambda volume: found(volume) + shift)
+    cloud = medium()
+    where = points(cloud)
+    assert not (extinction(cloud, where).max(axis=0) <= majorants(cloud, where)).all()
+
+
+def reached(cell: int, size: int, voxels: int) -> list[int]:
+    """Those that interpolation in a cell looks at, along one axis, whether the grid repeats, mirrors or clamps."""
+    found = range(cell * size - 1, (cell + 1) * size + 1)
+    mirrored = {-1 - n if n < 0 else 2 * voxels - 1 - n if n >= voxels else n for n in found}
+    return sorted({n % voxels for n in found} | mirrored)
+
+
+def test_majorants_are_those_of_a_loop_over_voxels() -> None:
+    grids, found = tables(medium(channels=3, scale=2.0))
+    x, y, z = (int(n) for n in found["layout"].numpy().reshape(-1, 4)[-1, :3])
+    data = 2.0 * values(3).max(axis=-1)
+    sizes = [majorant_grid.cell_size(n) for n in SHAPE]
+    expected = np.full((z + 2, y + 2, x + 2), data.max())
+    for cell in np.ndindex(z, y, x):
+        box = data[np.ix_(*[reached(c, k, n) for c, k, n in zip(cell, sizes, SHAPE, strict=True)])]
+        bound = min(majorant_grid._MARGIN * box.max(), data.max())
+        expected[cell[0] + 1, cell[1] + 1, cell[2] + 1] = bound
+    np.testing.assert_allclose(found["majorants"].numpy().reshape(expected.shape), expected, rtol=1e-6)
+    assert grids.every
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_walk_uses_up_the_optical_depth_that_it_was_given(place: str) -> None:
+    """Against sums of fine steps; some rays go along axes, some begin inside, some outside the grid."""
+    cloud = medium(place)
+    box = volume(cloud).bbox()
+    low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+    rng = np.random.default_rng(3)
+    count, steps = 64, 20_000
+    a, b = (low[:, None] + rng.uniform(0, 1, (3, count)) * (high - low)[:, None] for _ in range(2))
+    b[1:, :8] = a[1:, :8]
+    b[0, 8:16] = a[0, 8:16]
+    length = np.linalg.norm(b - a, axis=0)
+    ray = mi.Ray3f(mi.Point3f(a), mi.Vector3f((b - a) / length))
+    near, far = mi.Float(0.1 * length), mi.Float(length)
+    cells = Cells(tables(cloud)[1], mi.MediumPtr(cloud), ray, near, far, None, mi.Bool(True))
+    asked = rng.exponential(3, (2, count))
+    place_ = cells.start()
+    reached = []
+    for depth in asked:
+        place_ = cells.advance(place_, mi.Float(depth), place_.t < far)
+        reached.append(np.array(place_.t))
+    t = 0.1 * length + 0.9 * length * (np.arange(steps)[:, None] + 0.5) / steps
+    where = a[:, None] + t * ((b - a) / length)[:, None]
+    σ̄ = majorants(cloud, where.reshape(3, -1)).reshape(steps, count)
+    for end, total in zip(reached, np.cumsum(asked, axis=0), strict=True):
+        depth = np.where(t < end, σ̄, 0).sum(axis=0) * 0.9 * length / steps
+        stops = end < length * (1 - 1e-6)
+        assert stops.any()
+        np.testing.assert_allclose(depth[stops], total[stops], atol=0.03)
+        assert (depth[~stops] <= total[~stops] + 0.03).all()
+    assert (reached[1] > 0.9999 * length).any()
+
+
+def test_new_values_are_seen_and_old_ones_are_not_worked_out_again() -> None:
+    cloud = medium()
+    grids = MajorantGrids({number(cloud): cloud})
+    before = grids.values()
+    assert grids.values().index == before.index
+    parameters = mi.traverse(cloud)
+    parameters["sigma_t.data"] = mi.TensorXf(3 * values())
+    parameters.update()
+    np.testing.assert_allclose(grids.values().numpy(), 3 * before.numpy(), rtol=1e-6)
+
+
+def test_new_values_compile_no_kernels() -> None:
+    cloud = medium()
+    grids = MajorantGrids({number(cloud): cloud})
+    parameters = mi.traverse(cloud)
+    for seed in range(4):
+        parameters["sigma_t.data"] = on_device(values(seed=seed))
+        parameters.update()
+        with recorded() as found:
+            dr.eval(grids.values())
+            dr.sync_thread()
+        assert found
+        assert seed < 2 or not any(found)
+
+
+def test_media_without_a_grid_that_pays_keep_one_majorant() -> None:
+    small = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((4, 4, 4, 1), np.float32)), "raw": True}
+    for description in (
+        {"type": "homogeneous", "albedo": 0.5},
+        {"type": "heterogeneous", "sigma_t": small, "albedo": 0.5},
+        {"type": "heterogeneous", "sigma_t": {"type": "constvolume", "value": 2.0}, "albedo": 0.5},
+    ):
+        plain = mi.load_dict(description)
+        assert not MajorantGrids({number(plain): plain})
