@@ -7,8 +7,7 @@ from typing import Any
 from summaries.tables import table
 
 COST = """\
-Ratios of medians, 10th to 90th percentile; the machine was busy with other work, so they are rough. A pair costs more
-than the 1.35 that was hoped for: both states' coefficients are looked up at every tentative collision."""
+Ratios of medians, 10th to 90th percentile; the machine was busy with other work, so they are rough."""
 
 GRADIENTS = """\
 Derivative of the mean picture along one direction each, against finite differences: z-scores of the difference.
@@ -61,16 +60,12 @@ SMOKE = ""
 
 def smoke(found: dict[str, Any]) -> str:
     """Final errors by samples of the picture."""
-    rows = [
-        [
-            name,
-            *(
-                f"{found[b][name]['rate']:g}: {found[b][name]['final'][0]:.3f} ({found[b][name]['final'][1]:.3f} to {found[b][name]['final'][2]:.3f})"
-                for b in ("time", "steps")
-            ),
-        ]
-        for name in found["time"]
-    ]
+
+    def told(entry: dict[str, Any]) -> str:
+        middle, low, high = entry["final"]
+        return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f})"
+
+    rows = [[name, *(told(found[budget][name]) for budget in ("time", "steps"))] for name in found["time"]]
     settings = found["settings"]
     return (
         f"`smoke`, {settings['resolution']}², grids of {settings['grid']}³, {settings['seeds']} seeds. Learning rate, error over "
