@@ -16,6 +16,7 @@ from kernels import on_device, recorded
 import unrender as ur
 from unrender.rendering import emissive, majorant_grid
 from unrender.rendering.majorant_grid import Cells, MajorantGrids
+from unrender.rendering.port import Shot
 
 SHAPE = (17, 33, 22)
 POINTS = 200_000
@@ -212,3 +213,19 @@ def test_media_without_a_grid_that_pays_keep_one_majorant() -> None:
     ):
         plain = mi.load_dict(description)
         assert not MajorantGrids({number(plain): plain})
+
+
+def test_a_grid_that_changes_its_resolution_has_new_cells() -> None:
+    fine, coarse, small = (
+        ur.gallery.problem("smoke", resolution=8, grid_resolution=size, reference_spp=1) for size in (32, 16, 8)
+    )
+    truth = {key: fine.renderer.array(value) for key, value in fine.truth.items()}
+    shot = Shot(0, 4, 1)
+    fine.renderer.select(list(truth), None)
+    expected = np.array(fine.renderer.image(truth, shot).images[0])
+    for problem in (coarse, small):
+        before = problem.initial()
+        problem.renderer.select(list(before), None)
+        first = np.array(problem.renderer.image(before, shot).images[0])
+        np.testing.assert_allclose(np.array(problem.renderer.image(truth, shot).images[0]), expected, rtol=1e-4)
+        np.testing.assert_allclose(np.array(problem.renderer.image(before, shot).images[0]), first, rtol=1e-4)

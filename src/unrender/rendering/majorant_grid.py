@@ -57,6 +57,8 @@ class MajorantGrids:
     """
 
     def __init__(self, media: dict[int, Any]):
+        extinctions = [mi.traverse(medium) for medium in media.values()]
+        self._voxels = [(of, of["sigma_t.data"].shape) for of in extinctions if "sigma_t.data" in of]
         found = {number: Grid.of(medium) for number, medium in media.items()}
         self._grids = {number: grid for number, grid in found.items() if grid is not None}
         self.every = len(self._grids) == len(found)
@@ -72,6 +74,10 @@ class MajorantGrids:
 
     def __bool__(self) -> bool:
         return bool(self._grids)
+
+    def fits(self) -> bool:
+        """Whether all extinctions still have the resolutions that these grids were laid out for."""
+        return all(tuple(of["sigma_t.data"].shape) == tuple(shape) for of, shape in self._voxels)
 
     def shapes(self) -> list[tuple[int, ...]]:
         """What two states must have alike to be bounded together."""

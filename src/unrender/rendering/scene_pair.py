@@ -199,7 +199,7 @@ class ScenePair:
         return {"frames": grids.frames, "layout": grids.layout, "every": grids.every, "majorants": majorants}
 
     def _grids(self, previous: bool) -> MajorantGrids:
-        if previous not in self._majorants:
+        if previous not in self._majorants or not self._majorants[previous].fits():
             scene = self.previous if previous else self.current
             self._majorants[previous] = MajorantGrids({_id(medium): medium for medium in media(scene)})
         return self._majorants[previous]
