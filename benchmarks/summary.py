@@ -553,6 +553,8 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ("Participating media: gradients", "volumes/gradients", media.gradients, media.GRADIENTS),
     ("Participating media: where noise pushes a loss (Figs 5 and 6)", "volumes/fig5_drift", media.drift, media.DRIFT),
     ("Participating media: what a control variate saves (Fig. 11)", "volumes/fig11_smoke", media.smoke, media.SMOKE),
+    ("Participating media: what sparse ones cost", "volumes/cost/sparse", media.cost, ""),
+    ("Coarse to fine", "coarse_to_fine", life.coarse_to_fine, life.COARSE),
     ("What checkpoints cost", "checkpoints", life.checkpoints, life.CHECKPOINTS),
     ("What watching costs", "watch", life.watching, life.WATCHING),
 ]

@@ -18,8 +18,9 @@ majorant."""
 def cost(found: dict[str, Any]) -> str:
     """Ratios."""
     rows = [[name, f"{m:.2f}", f"{low:.2f} to {high:.2f}"] for name, (low, m, high) in found["ratios"].items()]
+    what = "A sparse grid" if found.get("sparse") else "`smoke`"
     size = (
-        f"`smoke`, {found['resolution']}², a grid of {found['grid']}³, {found['spp']} spp, {found['repeats']} repeats."
+        f"{what}, {found['resolution']}², a grid of {found['grid']}³, {found['spp']} spp, {found['repeats']} repeats."
     )
     return f"{size}\n\n{table(['ratio', 'median', 'range'], rows)}"
 
@@ -65,10 +66,12 @@ def smoke(found: dict[str, Any]) -> str:
         middle, low, high = entry["final"]
         return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f})"
 
-    rows = [[name, *(told(found[budget][name]) for budget in ("time", "steps"))] for name in found["time"]]
     settings = found["settings"]
+    heads = {"time": f"{settings['seconds']:g} s", "steps": f"{settings['steps']} steps"}
+    budgets = [budget for budget in heads if budget in found]
+    rows = [[name, *(told(found[budget][name]) for budget in budgets)] for name in found[budgets[0]]]
     return (
         f"`smoke`, {settings['resolution']}², grids of {settings['grid']}³, {settings['seeds']} seeds. Learning rate, error over "
         f"the initial one: median (range).\n\n"
-        f"{table(['picture, paths per pixel', str(settings['seconds']) + ' s', str(settings['steps']) + ' steps'], rows)}"
+        f"{table(['picture, paths per pixel', *(heads[budget] for budget in budgets)], rows)}"
     )

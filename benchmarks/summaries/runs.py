@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from summaries.tables import table
 
 CHECKPOINTS = """\
@@ -14,6 +16,31 @@ where it would."""
 WATCHING = """\
 Blocks by turns: alone, with the live files, with the page open in a browser. The machine was busy, so the error is as
 large as what was to be shown."""
+
+
+COARSE = """\
+Counts are of steps, so the machine's load does not matter. The default carries what the estimator remembers and
+begins the optimizer's state anew. A whole texture, seen well from the start, gains nothing by being coarse at first; the smoke's
+extinction does."""
+
+
+def coarse_to_fine(found: dict[str, Any]) -> str:
+    """Errors at the end, by what becomes of states."""
+    rows = []
+    for name, entry in found["problems"].items():
+        for by, ways in entry["methods"].items():
+            for key in next(iter(ways.values()))["errors"]:
+                told = [
+                    f"{np.mean(way['errors'][key]):.4f} ± {np.std(way['errors'][key]):.4f}, {way['jump']:.2f}"
+                    for way in ways.values()
+                ]
+                rows.append([f"{name}, {by}", key, *told])
+    head = ["problem, method", "parameter", *next(iter(next(iter(found["problems"].values()))["methods"].values()))]
+    sizes = "; ".join(
+        f"`{name}`: {entry['steps']} steps, finer at {entry['changes'][0]} and {entry['changes'][1]}"
+        for name, entry in found["problems"].items()
+    )
+    return f"{sizes}; {found['seeds']} seeds. Error, mean ± spread, and the jump of the loss.\n\n{table(head, rows)}"
 
 
 def checkpoints(found: dict[str, Any]) -> str:
