@@ -554,6 +554,13 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ("Participating media: where noise pushes a loss (Figs 5 and 6)", "volumes/fig5_drift", media.drift, media.DRIFT),
     ("Participating media: what a control variate saves (Fig. 11)", "volumes/fig11_smoke", media.smoke, media.SMOKE),
     ("Participating media: what sparse ones cost", "volumes/cost/sparse", media.cost, ""),
+    (
+        "Participating media: meta-estimation of a radiance field (Figs 7 and 8)",
+        "volumes/fig7_nerf",
+        media.nerf,
+        media.NERF,
+    ),
+    ("Participating media: memory of grids", "volumes/memory", media.memory, ""),
     ("Coarse to fine", "coarse_to_fine", life.coarse_to_fine, life.COARSE),
     ("What checkpoints cost", "checkpoints", life.checkpoints, life.CHECKPOINTS),
     ("What watching costs", "watch", life.watching, life.WATCHING),

@@ -58,6 +58,8 @@ def drift(found: dict[str, Any]) -> str:
 
 SMOKE = ""
 
+NERF = ""
+
 
 def smoke(found: dict[str, Any]) -> str:
     """Final errors by samples of the picture."""
@@ -74,4 +76,28 @@ def smoke(found: dict[str, Any]) -> str:
         f"`smoke`, {settings['resolution']}², grids of {settings['grid']}³, {settings['seeds']} seeds. Learning rate, error over "
         f"the initial one: median (range).\n\n"
         f"{table(['picture, paths per pixel', *(heads[budget] for budget in budgets)], rows)}"
+    )
+
+
+def nerf(found: dict[str, Any]) -> str:
+    """Final errors at equal time."""
+    rows = [
+        [name, f"{e['rate']:g}", "{:.3f} ({:.3f} to {:.3f})".format(*e["final"]), str(len(e["runs"][0]))]
+        for name, e in found["methods"].items()
+    ]
+    s = found["settings"]
+    head = ["method", "learning rate", "error over the initial one", "points on the curve"]
+    return f"`nerf-volume`, {s['resolution']}², grids of {s['grid']}³, {s['seconds']:g} s, {s['seeds']} seeds.\n\n{table(head, rows)}"
+
+
+def memory(found: dict[str, Any]) -> str:
+    """Gigabytes, and copies of the unknowns."""
+    grids = [key for key in next(iter(found["methods"].values())) if key.isdigit()]
+    rows = [
+        [by, *(f"{entry[grid]['bytes'] / 1e9:.2f} GB, {entry[grid]['copies']:.1f}" for grid in grids)]
+        for by, entry in found["methods"].items()
+    ]
+    return (
+        "Greatest resident size of the process, and what it has more than at 16³ in copies of the unknowns (extinction and "
+        f"emission, 16 bytes a voxel).\n\n{table(['method', *(f'{grid}³' for grid in grids)], rows)}"
     )
