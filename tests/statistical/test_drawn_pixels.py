@@ -72,7 +72,12 @@ def whole() -> tuple[ur.Problem, np.ndarray]:
     return asked, gradients(asked, ur.PathGradient(spp=16), 400)
 
 
-@pytest.mark.parametrize("name", SCHEMES)
+PLAINEST = ("uniform", "loss")  # the contract's tests see these every time, of fewer steps
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in PLAINEST else []) for name in SCHEMES]
+)
 def test_mini_batches_are_unbiased(name: str, whole: tuple[ur.Problem, np.ndarray]) -> None:
     asked, expected = whole
     rows = gradients(asked, SCHEMES[name](), RUNS)

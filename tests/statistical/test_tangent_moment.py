@@ -95,7 +95,7 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
 @pytest.mark.parametrize("name", ["smoke", "three-bodies", "nerf-volume"])
 def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str) -> None:
     """Collisions are chosen by chance apart from what they bring, so no finite difference sees a path's derivative; its adjoint does."""
-    problem = ur.gallery.problem(name, resolution=6, reference_spp=1)
+    problem = ur.gallery.problem(name, resolution=5, reference_spp=1)
     renderer, values = problem.renderer, problem.initial()
     renderer.select(list(values), None)
     rng = np.random.default_rng(0)

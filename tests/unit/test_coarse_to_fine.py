@@ -451,7 +451,7 @@ class Scenes(ur.Callback):
         self.seen.append([(state[WALL].shape[0], state[SMOKE].shape[0]) for state in states])
 
 
-@pytest.mark.parametrize("name", ["rcv", "coupled"])
+@pytest.mark.parametrize("name", ["rcv", pytest.param("coupled", marks=pytest.mark.slow)])
 def test_the_scene_takes_each_resolution(folder: Path, name: str) -> None:
     found = ur.Problem.from_file(folder / "problem.toml")
     assert found.coarse_to_fine[WALL] == ur.CoarseToFine((2, 4))
