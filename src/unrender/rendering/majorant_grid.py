@@ -57,9 +57,9 @@ class MajorantGrids:
     """
 
     def __init__(self, media: dict[int, Any]):
-        extinctions = [mi.traverse(medium) for medium in media.values()]
-        self._voxels = [(of, of["sigma_t.data"].shape) for of in extinctions if "sigma_t.data" in of]
-        found = {number: Grid.of(medium) for number, medium in media.items()}
+        parameters = {number: mi.traverse(medium) for number, medium in media.items()}
+        self._voxels = [(of, of["sigma_t.data"].shape) for of in parameters.values() if "sigma_t.data" in of]
+        found = {number: Grid.of(medium, parameters[number]) for number, medium in media.items()}
         self._grids = {number: grid for number, grid in found.items() if grid is not None}
         self.every = len(self._grids) == len(found)
         size = max(found, default=0) + 1
@@ -111,11 +111,11 @@ class Grid:
         self._known: tuple[Any, Any] | None = None
 
     @staticmethod
-    def of(medium: Any) -> Grid | None:
-        """None where the medium is to have one majorant: homogeneous ones, small grids, grids whose place is not known."""
+    def of(medium: Any, parameters: Any) -> Grid | None:
+        """From what `mi.traverse` finds in a medium. None where it is to have one majorant: homogeneous ones, small grids, grids whose
+        place is not known."""
         if medium.class_name() != "HeterogeneousMedium" and not emissive.emits(medium):
             return None
-        parameters = mi.traverse(medium)
         if "sigma_t.data" not in parameters:
             return None
         volume = parameters.properties["sigma_t.data"][2]
