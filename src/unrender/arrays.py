@@ -45,6 +45,16 @@ def sqrt(x: Array) -> Array:
     return dr.sqrt(x) if is_drjit(x) else np.sqrt(x)
 
 
+def log(x: Array) -> Array:
+    """The natural logarithm, per element."""
+    return dr.log(x) if is_drjit(x) else np.log(x)
+
+
+def exp(x: Array) -> Array:
+    """e to the power of each element."""
+    return dr.exp(x) if is_drjit(x) else np.exp(x)
+
+
 def absolute(x: Array) -> Array:
     """The magnitude, per element."""
     return dr.abs(x) if is_drjit(x) else np.abs(x)

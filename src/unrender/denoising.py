@@ -48,7 +48,11 @@ def choose(by: Denoiser = "auto") -> Denoiser:
 
 
 def denoise(
-    image: np.ndarray, albedo: np.ndarray | None = None, normals: np.ndarray | None = None, by: Denoiser = "auto"
+    image: np.ndarray,
+    albedo: np.ndarray | None = None,
+    normals: np.ndarray | None = None,
+    by: Denoiser = "auto",
+    fast: bool = False,
 ) -> np.ndarray:
     """`image` without its noise. Biased; deterministic on the CPU.
 
@@ -59,6 +63,7 @@ def denoise(
         albedo: (H, W, 3) in [0, 1], of what the pixels see first; guides where edges are. Not for "variation".
         normals: (H, W, 3) in [-1, 1], in the sensor's frame; only beside `albedo`. Not for "variation".
         by: see `Denoiser`.
+        fast: of oidn, the smaller network: half the time, for maps that only steer. The others have one quality.
 
     Returns:
         float32 of the shape of `image`, >= 0.
@@ -80,7 +85,7 @@ def denoise(
     scale = float(picture.mean(dtype=np.float64))
     if scale == 0:
         return picture
-    found = np.maximum(_DENOISERS[by](picture / np.float32(scale), guides), 0)
+    found = np.maximum(_DENOISERS[by](picture / np.float32(scale), guides, fast), 0)
     return np.ascontiguousarray(found * np.float32(scale), np.float32)
 
 
@@ -97,19 +102,20 @@ def _checked(name: str, given: Any) -> np.ndarray:
     return array
 
 
-def _oidn(picture: np.ndarray, guides: dict[str, np.ndarray]) -> np.ndarray:
+def _oidn(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
     try:
         import pyoidn  # pyright: ignore[reportMissingImports]
     except (ImportError, OSError) as error:
         raise InputError(f"denoising needs pyoidn, which cannot be loaded here: {error}") from error
     names = {"albedo": "albedo", "normals": "normal"}
     given: dict[str, Any] = {names[name]: _continued(guide) for name, guide in guides.items()}
-    return _as(pyoidn.denoise(_continued(picture), **given, hdr=True), picture)
+    return _as(pyoidn.denoise(_continued(picture), **given, hdr=True, quality="fast" if fast else "high"), picture)
 
 
-def _optix(picture: np.ndarray, guides: dict[str, np.ndarray]) -> np.ndarray:
+def _optix(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
     import mitsuba as mi
 
+    del fast
     noisy = _continued(picture)
     denoiser = _optix_denoiser(noisy.shape[1], noisy.shape[0], "albedo" in guides, "normals" in guides)
     given = {name: mi.TensorXf(_continued(guide)) for name, guide in guides.items()}
@@ -123,9 +129,9 @@ def _optix_denoiser(width: int, height: int, albedo: bool, normals: bool) -> Any
     return mi.OptixDenoiser(mi.ScalarVector2u(width, height), albedo=albedo, normals=normals)
 
 
-def _variation(picture: np.ndarray, guides: dict[str, np.ndarray]) -> np.ndarray:
+def _variation(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
     """Rudin, Osher and Fatemi's model, with the noise seen in the differences between neighbours as its weight."""
-    del guides
+    del guides, fast
     from skimage.restoration import denoise_tv_chambolle
 
     steps = np.concatenate([np.abs(np.diff(picture, axis=axis)).reshape(-1) for axis in (0, 1)])
@@ -139,7 +145,7 @@ def _variation(picture: np.ndarray, guides: dict[str, np.ndarray]) -> np.ndarray
     return np.asarray(denoise_tv_chambolle(picture, weight=noise, channel_axis=channels))
 
 
-_DENOISERS: dict[str, Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]] = {
+_DENOISERS: dict[str, Callable[[np.ndarray, dict[str, np.ndarray], bool], np.ndarray]] = {
     "oidn": _oidn,
     "optix": _optix,
     "variation": _variation,

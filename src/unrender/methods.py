@@ -97,7 +97,7 @@ class AdaptiveOptions(AdamOptions):
         description="pixels where the gradient's variance is, or in proportion to the loss derivative, or all alike",
     )
     spp: PositiveInt = Field(2, description="samples per drawn pixel; from 2 on, the adjoint shares their paths")
-    levels: NonNegativeInt = Field(4, description="coarser resolutions that the probabilities look at, of adaptive")
+    levels: NonNegativeInt = Field(0, description="coarser resolutions that the probabilities look at, of adaptive")
     refresh: PositiveInt = Field(20, description="steps between estimates of the probabilities")
     uniform: PositiveFloat = Field(0.1, le=1, description="share of the draws that all pixels have equally")
     image: Literal["plain", "rcv"] = Field(

@@ -26,7 +26,9 @@ class Adaptive:
 
     With `levels` = D > 0 the probabilities of D + 1 resolutions are averaged (Eq. 18), each compared with references averaged over
     blocks of 2^d × 2^d cells, which draws more pixels to what varies within a block. (The paper's blocks are of pixels; the two
-    are the same where there are as many cells as pixels.)
+    are the same where there are as many cells as pixels.) The paper has D = 4, against plain things that outweigh textured ones in a sum of
+    plain variances; relative ones need it less, and without levels the variance is smaller: `Adaptive(count, levels=4, relative=False)`
+    is the paper's.
 
     Args:
         count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
@@ -43,7 +45,7 @@ class Adaptive:
     """
 
     count: int
-    levels: int = 4
+    levels: int = 0
     refresh: int = 20
     samples: int | None = None
     uniform: float = 0.1

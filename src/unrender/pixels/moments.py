@@ -19,6 +19,10 @@ ROUNDS = 16
 """Sign patterns of an estimate at most: the squares of single derivatives are what is left when their products average out."""
 
 
+_FLOOR, _LEAST = 0.1, 1e-30
+"""Of an element's energy: in shares of its parameter's typical one, and at all."""
+
+
 @dataclass(frozen=True)
 class Slopes:
     """What a few paths in each cell tell; every map (cells, 3), float64, means over the cell's pixels.
@@ -129,14 +133,16 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
 def scales(parameters: Tree, energy: Tree) -> Tree:
     """What an element's derivative is multiplied by: one, or one over the root of its mean squared gradient where that is known.
 
-    Elements that hardly any path has met yet do not count as much as they might: a hundredth of the mean energy of their parameter is
-    added.
+    Elements that hardly any path has met yet do not count as much as they might: a tenth of their parameter's typical energy is added,
+    the geometric mean of those met. (The mean would be that of a few elements that saw a rare bright path.)
     """
     if not energy or trees.shapes(energy) != trees.shapes(parameters):
         return trees.map(lambda x: x * 0.0 + 1.0, parameters)
 
     def scale(x: Array) -> Array:
-        floor = arrays.mean(x) * 0.01 + 1e-30
-        return 1.0 / arrays.sqrt(x + floor)
+        met = arrays.where(x > 0, x * 0.0 + 1.0, x * 0.0)
+        logarithms = arrays.log(arrays.maximum(x, _LEAST)) * met
+        typical = arrays.exp(arrays.total(logarithms) / arrays.maximum(arrays.total(met), 1.0))
+        return 1.0 / arrays.sqrt(x + typical * _FLOOR + _LEAST)
 
     return trees.map(scale, energy)
