@@ -1,11 +1,13 @@
-"""Drawn pixels at equal time (Figs 4, 5 and 8 of the paper): `sun-glossy` with two losses, `plain-and-textured`, `two-planets`.
+"""Drawn pixels at equal time (Figs 4, 5 and 8 of the paper, and its smoke): `sun-glossy` with two losses, `plain-and-textured`,
+`two-planets`, `smoke`.
 
-    python benchmarks/adaptive/equal_time/run.py [--problem two-planets] [--seconds 10] [--seeds 5] [--resolution 64]
+    python benchmarks/adaptive/equal_time/run.py [--problem two-planets] [--seconds 10] [--seeds 5] [--resolution 192]
 
 Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many pixels for all, Adam,
-the learning rate of each tuned on a seed of its own for the whole budget. On `plain-and-textured` also without levels; on `two-planets`
-also with a control variate and with coupled meta-estimation, drawn and whole. Error is each parameter's RMSE relative to where
-it began, averaged over parameters; ratios are to uniform mini-batches, at ten checkpoints, medians over seeds.
+the learning rate of each tuned on a seed of its own for the whole budget. Pictures and textures have fewer pixels drawn per texel than
+texels, as in the paper. On `plain-and-textured` also five levels; `two-planets, memories` adds, on small pictures, a control variate and
+coupled meta-estimation, drawn and whole. Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios
+are to uniform mini-batches, at ten checkpoints, medians over seeds, at equal time and at equal samples.
 """
 
 from __future__ import annotations
@@ -27,20 +29,23 @@ from schemes import COLOURS, pixels
 import unrender as ur
 
 HERE = Path(__file__).resolve().parent
-TASKS: dict[str, tuple[str, dict[str, Any]]] = {
-    "sun-glossy L2": ("sun-glossy", {"loss": "L2"}),
-    "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2"}),
-    "plain-and-textured": ("plain-and-textured", {}),
-    "two-planets": ("two-planets", {}),
+FINE = {"resolution": 192, "texture_resolution": 192}
+TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
+    "sun-glossy L2": ("sun-glossy", {"loss": "L2", **FINE}, 8192),
+    "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2", **FINE}, 8192),
+    "plain-and-textured": ("plain-and-textured", FINE, 8192),
+    "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 8192),
+    "two-planets, memories": ("two-planets", {}, 2048),
+    "smoke": ("smoke", {"resolution": 64, "grid_resolution": 32, "loss": "L2"}, 2048),
 }
-COUNTS = {"sun-glossy": 2048, "plain-and-textured": 1024, "two-planets": 2048}
+"""Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
 META_RATES = (0.001, 0.003)
 CHECKPOINTS = 10
 CV = ur.images.RecursiveControlVariate
 
 
-def entrants(name: str, count: int) -> list[Entrant]:
+def entrants(task: str, count: int) -> list[Entrant]:
     """Who races."""
     adam = ur.optimizers.Adam
 
@@ -48,10 +53,11 @@ def entrants(name: str, count: int) -> list[Entrant]:
         return Entrant(label, label, ur.PathGradient(pixels=pixels(scheme, count, **options), spp=2), adam, RATES)
 
     found = [drawn("uniform", "uniform"), drawn("loss", "loss"), drawn("adaptive", "adaptive")]
-    found.append(drawn("adaptive, paper's variance", "adaptive", relative=False))
-    if name == "plain-and-textured":
-        found.append(drawn("adaptive, one level", "adaptive", levels=0))
-    if name == "two-planets":
+    if task in ("plain-and-textured", "sun-glossy L2"):
+        found.append(drawn("adaptive, as the paper", "adaptive", relative=False, levels=4))
+    if task == "plain-and-textured":
+        found.append(drawn("adaptive, five levels", "adaptive", levels=4))
+    if task == "two-planets, memories":
         adaptive = pixels("adaptive", count)
         meta = ur.optimizers.MetaAdam
         found += [
@@ -69,11 +75,15 @@ def entrants(name: str, count: int) -> list[Entrant]:
     return found
 
 
-def checkpoints(entry: dict[str, Any], seconds: float) -> list[float]:
-    """The median error over runs at each tenth of the time."""
-    times = seconds * np.arange(1, CHECKPOINTS + 1) / CHECKPOINTS
-    curves = [np.interp(times, np.array(run)[:, 0], np.array(run)[:, 2]) for run in entry["runs"]]
-    return [float(x) for x in np.median(curves, axis=0)]
+def checkpoints(methods: dict[str, Any], column: int) -> dict[str, list[float]]:
+    """Per method its error over uniform's at each tenth of the seconds (column 0) or samples (1) that all reached, medians over runs."""
+    end = min(run[-1][column] for entry in methods.values() for run in entry["runs"])
+    where = end * np.arange(1, CHECKPOINTS + 1) / CHECKPOINTS
+
+    def middle(entry: dict[str, Any]) -> np.ndarray:
+        return np.median([np.interp(where, *np.array(run)[:, [column, 2]].T) for run in entry["runs"]], axis=0)
+
+    return {name: (middle(entry) / middle(methods["uniform"])).tolist() for name, entry in methods.items()}
 
 
 def plot(results: dict[str, Any]) -> None:
@@ -103,26 +113,23 @@ def main() -> None:
         ur.use()
         entries: dict[str, Any] = read(HERE)["entries"] if (HERE / "results.json").is_file() else {}
         for task in asked.problem or TASKS:
-            name, options = TASKS[task]
+            name, options, count = TASKS[task]
             options = {**options, **({"resolution": asked.resolution} if asked.resolution else {})}
             problem = ur.gallery.problem(name, **options)
-            count = asked.count or COUNTS[name]
-            chosen = [e for e in entrants(name, count) if not asked.only or e.name in asked.only]
+            count = asked.count or count
+            chosen = [e for e in entrants(task, count) if not asked.only or e.name in asked.only]
             kept = entries.get(task, {}).get("methods", {}) if asked.only else {}
             methods = {**kept, **race(problem, chosen, asked.seeds, seconds=asked.seconds)}
-            marks = {method: checkpoints(entry, asked.seconds) for method, entry in methods.items()}
-            ratios = {
-                method: [a / b for a, b in zip(mark, marks["uniform"], strict=True)] for method, mark in marks.items()
-            }
-            for method, ratio in ratios.items():
-                print(task, method, [round(r, 3) for r in ratio], flush=True)
+            ratios = {by: checkpoints(methods, column) for by, column in (("time", 0), ("samples", 1))}
+            for by, found in ratios.items():
+                for method, ratio in found.items():
+                    print(task, by, method, [round(r, 3) for r in ratio], flush=True)
             entries[task] = {
                 "options": options,
                 "count": count,
                 "seconds": asked.seconds,
                 "seeds": asked.seeds,
                 "methods": methods,
-                "checkpoints": marks,
                 "over uniform": ratios,
             }
             write(HERE, {"entries": entries})

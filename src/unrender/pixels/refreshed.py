@@ -20,7 +20,6 @@ from unrender.problem.problem import Problem
 from unrender.trees import Tree
 
 MapDenoiser = Literal["auto", "oidn", "optix", "variation", "none"]
-PATHS_PER_CELL = 2
 _MARGIN = 4
 """Cells between maps that are denoised together."""
 
@@ -30,8 +29,8 @@ _FEWEST_PATHS = 4096
 _OBSERVED, _DECAY = 4, 0.9
 """Every how many steps the gradient's squares are looked at, and how much of what was seen stays."""
 
-_MEMORY = 0.5
-"""What a refresh keeps of the last one's maps: the scene changes little in between, and noise averages out."""
+_MEMORY = 0.8
+"""What a refresh keeps of the maps before it at most, the first ones less: the scene changes little in between, and noise averages out."""
 
 Maps = tuple[np.ndarray, ...]
 """Of each cell and channel, (cells, 3) each."""
@@ -52,6 +51,7 @@ class RefreshedState:
         table: of the draws; `spots` before the first.
         shares: how likely a pixel of each cell is, relative to equal probabilities, (cells,).
         references: mean references of the cells, (cells, 3).
+        refreshes: how many there were.
         energy: mean square of each element of the gradient, in the coordinates of the descent; empty where it was not observed.
     """
 
@@ -61,6 +61,7 @@ class RefreshedState:
     table: Table
     shares: np.ndarray
     references: np.ndarray
+    refreshes: int = 0
     energy: Tree = field(default_factory=dict)
 
 
@@ -132,7 +133,7 @@ class Refreshing:
         )
 
     def _cells(self, problem: Problem) -> Cells:
-        return cut(problem, max(self._budget() // PATHS_PER_CELL, len(problem.views)))
+        return cut(problem, max(self._budget(), len(problem.views)))
 
     def _budget(self) -> int:
         """Paths of a refresh: by default half as many as a step's pixels, for each twenty steps that it serves; at least 4096, or for
@@ -143,7 +144,7 @@ class Refreshing:
 
     def _renew(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[RefreshedState, int]:
         cells = self._cells(problem)
-        spp = max(PATHS_PER_CELL, self._budget() // len(cells.views))
+        spp = max(1, self._budget() // len(cells.views))
         references = [
             problem.renderer.array(cells.coarser(state.references, level)) for level in range(1, self.levels + 1)
         ]
@@ -151,10 +152,12 @@ class Refreshing:
         seen = moments.look(problem, parameters, cells, state.spots, spp, key, references, scales)
         maps = self.make(seen)
         if state.maps:
-            maps = tuple(_MEMORY * old + (1 - _MEMORY) * new for old, new in zip(state.maps, maps, strict=True))
+            kept = min(_MEMORY, state.refreshes / (state.refreshes + 1))
+            maps = tuple(kept * old + (1 - kept) * new for old, new in zip(state.maps, maps, strict=True))
         shares = self._shares(cells, maps)
         table = Table.of(cells, shares * cells.sizes, problem.renderer.array)
-        return replace(state, age=0, maps=maps, table=table, shares=shares), seen.samples
+        found = replace(state, age=0, maps=maps, table=table, shares=shares, refreshes=state.refreshes + 1)
+        return found, seen.samples
 
     def _shares(self, cells: Cells, maps: Maps) -> np.ndarray:
         """How likely a pixel of each cell is, relative to equal probabilities."""
