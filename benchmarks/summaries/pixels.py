@@ -53,13 +53,19 @@ def equal_time(found: dict[str, Any]) -> str:
     for name, entry in found["entries"].items():
         rows = []
         for method, run in entry["methods"].items():
-            ratio = entry["over uniform"][method]
             middle, least, most = run["final"]
             rows.append([method, f"{run['rate']:g}", f"{middle:.3f} ({least:.3f} to {most:.3f})"])
-            rows[-1].append(" ".join(f"{x:.2f}" for x in ratio))
-        head = ["pixels", "rate", "final error", "over uniform, at each tenth of the time"]
+            for ratios in entry["over uniform"].values():
+                rows[-1].append(" ".join(f"{x:.2f}" for x in ratios[method]))
+        head = [
+            "pixels",
+            "rate",
+            "final error",
+            *(f"over uniform, at tenths of the {by}" for by in entry["over uniform"]),
+        ]
+        sizes = ", ".join(f"{key}={value}" for key, value in entry["options"].items())
         told = f"{entry['count']} pixels a step, {entry['seconds']:g} s, {entry['seeds']} seeds"
-        parts.append(f"**{name}**, {told}.\n\n{table(head, rows)}")
+        parts.append(f"**{name}**{f' ({sizes})' if sizes else ''}, {told}.\n\n{table(head, rows)}")
     return "\n\n".join(parts)
 
 

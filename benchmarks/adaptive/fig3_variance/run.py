@@ -29,7 +29,7 @@ import unrender as ur
 from unrender.gradients.path import PathGradient
 
 HERE = Path(__file__).resolve().parent
-ONE_LEVEL = "adaptive, one level"
+FIVE_LEVELS = "adaptive, five levels"
 CROSSED = {1: "", 2: ", crossed"}
 """By the estimator's `spp`."""
 
@@ -52,8 +52,8 @@ def main() -> None:
     exact = rows.mean(axis=0)
     maps = {}
     for spp, stratified in ((1, False), (2, False), (1, True), (2, True)):
-        for label, levels in (*((scheme, {}) for scheme in SCHEMES), (ONE_LEVEL, {"levels": 0})):
-            scheme = "adaptive" if label == ONE_LEVEL else label
+        for label, levels in (*((scheme, {}) for scheme in SCHEMES), (FIVE_LEVELS, {"levels": 4})):
+            scheme = "adaptive" if label == FIVE_LEVELS else label
             options: dict[str, Any] = {"stratified": stratified, "samples": asked.samples, "refresh": 10 * asked.runs}
             rows, samples, probability = gradients(
                 problem, PathGradient(pixels=pixels(scheme, asked.count, **options, **levels), spp=spp), asked.runs
@@ -69,7 +69,7 @@ def main() -> None:
     ratios = {
         f"{other}{end} / {ours}{end}": found[other + end]["variance"] / found[ours + end]["variance"]
         for end in ("", ", crossed", ", stratified", ", crossed, stratified")
-        for ours in ("adaptive", ONE_LEVEL)
+        for ours in ("adaptive", FIVE_LEVELS)
         for other in ("uniform", "loss")
     }
     for crossed in CROSSED.values():

@@ -2,7 +2,7 @@
 
     python benchmarks/adaptive/fig7_failure/run.py [--resolution 64] [--many 1024]
 
-Probabilities estimated from 4 paths per pixel, as they come and denoised, and from many, without levels: the variance of the gradient at
+Probabilities estimated from 4 paths per pixel, as they come and denoised, and from many: the variance of the gradient at
 the start, summed over parameters, when 512 pixels are drawn by them, two independent paths each, over that of uniform draws. Means over
 estimates of the probabilities, of 256 gradients each. The same on two problems whose light is found easily. And how far maps from few
 paths are from those of many: the correlation of their logarithms.
@@ -37,9 +37,7 @@ FEW, COUNT, RUNS = 4, 512, 256
 def maps(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     """Probabilities over uniform ones, one per pixel of view 0."""
     height, width = problem.renderer.resolutions()[problem.views[0].sensor]
-    scheme = ur.pixels.Adaptive(
-        256, levels=0, samples=spp * height * width * len(problem.views), denoiser="none", uniform=0.01
-    )
+    scheme = ur.pixels.Adaptive(256, samples=spp * height * width * len(problem.views), denoiser="none", uniform=0.01)
     at = problem.initial()
     problem.renderer.select(list(at), None)
     pick, _ = scheme.draw(problem, at, scheme.init(problem, at), Key(seed))
@@ -55,9 +53,7 @@ def variances(problem: ur.Problem, many: int, repeats: int) -> dict[str, Any]:
         return spread(gradients(problem, PathGradient(pixels=sampler, spp=1), RUNS, seed)[0])[0]
 
     def adaptive(spp: int, denoiser: MapDenoiser) -> PixelSampler:
-        return ur.pixels.Adaptive(
-            COUNT, levels=0, samples=spp * pixels, refresh=10 * RUNS, denoiser=denoiser, relative=False
-        )
+        return ur.pixels.Adaptive(COUNT, samples=spp * pixels, refresh=10 * RUNS, denoiser=denoiser, relative=False)
 
     uniform = float(np.mean([summed(ur.pixels.Uniform(COUNT), seed) for seed in range(repeats)]))
     found: dict[str, Any] = {}

@@ -34,8 +34,9 @@ class Adaptive:
         count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
         levels: D, >= 0.
         refresh: steps between estimates, >= 1.
-        samples: paths of an estimate, >= 1, which also says how fine the cells are: one path in each, or several where cells are pixels. None for half of
-            `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths of what the steps cost.
+        samples: paths of an estimate, >= 1, which also says how fine the cells are: one path in each, or several where cells are
+            pixels. None for half of `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths
+            of what the steps cost.
         uniform: share of the draws that every pixel has equally, in (0, 1].
         stratified: spread the draws evenly over the probabilities (`cells.Table.draw`); otherwise they are independent, as in the paper.
         relative: weigh each parameter element's variance by one over its mean squared gradient, which is what Adam divides by: noise counts

@@ -179,7 +179,9 @@ class Refreshing:
         found: list[np.ndarray] = [np.empty(0)] * len(maps)
         for shape in {part.shape for part in maps}:
             alike = [index for index, part in enumerate(maps) if part.shape == shape]
-            cleaned = _together(np.stack([maps[index] for index in alike]), lambda x: denoising.denoise(x, by=by, fast=True))
+            cleaned = _together(
+                np.stack([maps[index] for index in alike]), lambda x: denoising.denoise(x, by=by, fast=True)
+            )
             for index, part in zip(alike, cleaned, strict=True):
                 found[index] = part
         return cells.join(found).astype(np.float64)
