@@ -31,10 +31,10 @@ import unrender as ur
 HERE = Path(__file__).resolve().parent
 FINE = {"resolution": 192, "texture_resolution": 192}
 TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
-    "sun-glossy L2": ("sun-glossy", {"loss": "L2", **FINE}, 8192),
-    "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2", **FINE}, 8192),
-    "plain-and-textured": ("plain-and-textured", FINE, 8192),
-    "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 8192),
+    "sun-glossy L2": ("sun-glossy", {"loss": "L2", **FINE}, 2048),
+    "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2", **FINE}, 2048),
+    "plain-and-textured": ("plain-and-textured", FINE, 2048),
+    "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 2048),
     "two-planets, memories": ("two-planets", {}, 2048),
     "smoke": ("smoke", {"resolution": 64, "grid_resolution": 32, "loss": "L2"}, 2048),
 }

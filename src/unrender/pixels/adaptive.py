@@ -40,7 +40,8 @@ class Adaptive:
         uniform: share of the draws that every pixel has equally, in (0, 1].
         stratified: spread the draws evenly over the probabilities (`cells.Table.draw`); otherwise they are independent, as in the paper.
         relative: weigh each parameter element's variance by one over its mean squared gradient, which is what Adam divides by: noise counts
-            in units of its steps. The sum of plain variances, the paper's, looks most at what has the largest gradients.
+            in units of its steps, and the mean over each parameter's elements is what is summed. The sum of plain variances, the
+            paper's, looks most at what has the largest gradients.
         denoiser: of the estimated maps: "oidn", "optix", "variation" (see `unrender.denoising`), "none", or "auto": optix on a GPU, oidn
             where it is installed, else variation.
     """

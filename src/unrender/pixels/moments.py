@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -131,7 +132,8 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
 
 
 def scales(parameters: Tree, energy: Tree) -> Tree:
-    """What an element's derivative is multiplied by: one, or one over the root of its mean squared gradient where that is known.
+    """What an element's derivative is multiplied by: one, or, where mean squared gradients are known, one over the root of its own times
+    the elements of its parameter, so that a colour counts as much as a texture.
 
     Elements that hardly any path has met yet do not count as much as they might: a tenth of their parameter's typical energy is added,
     the geometric mean of those met. (The mean would be that of a few elements that saw a rare bright path.)
@@ -143,6 +145,6 @@ def scales(parameters: Tree, energy: Tree) -> Tree:
         met = arrays.where(x > 0, x * 0.0 + 1.0, x * 0.0)
         logarithms = arrays.log(arrays.maximum(x, _LEAST)) * met
         typical = arrays.exp(arrays.total(logarithms) / arrays.maximum(arrays.total(met), 1.0))
-        return 1.0 / arrays.sqrt(x + typical * _FLOOR + _LEAST)
+        return 1.0 / arrays.sqrt((x + typical * _FLOOR + _LEAST) * float(math.prod(arrays.shape(x))))
 
     return trees.map(scale, energy)
