@@ -336,6 +336,38 @@ def test_tangents_go_through_preconditioners() -> None:
     np.testing.assert_allclose(looks[1], looks[0] * 0.25)
 
 
+def test_relative_variances_are_not_ruled_by_one_bright_element() -> None:
+    """Elements of four times the energy weigh half, whatever a single path brought another element; one never met stays finite."""
+    energy = np.concatenate([np.full(500, 1.0), np.full(498, 4.0), [1e9, 0.0]])
+    scales = moments.scales({"a": energy}, {"a": energy})["a"]
+    assert scales[0] / scales[500] == pytest.approx(2.0, rel=0.1)
+    assert scales[0] / scales[-2] == pytest.approx(np.sqrt(1e9), rel=0.1)
+    assert scales[0] < scales[-1] < 5 * scales[0]
+
+
+def test_a_parameter_of_few_elements_counts_as_much_as_one_of_many() -> None:
+    energy = {"colour": np.full(3, 0.2), "texture": np.full((20, 20, 3), 7.0)}
+    scales = moments.scales(energy, energy)
+    shares = {name: float(np.sum(scales[name] ** 2 * energy[name])) for name in energy}
+    assert shares["colour"] == pytest.approx(shares["texture"], rel=1e-6)
+
+
+def test_maps_are_means_over_refreshes() -> None:
+    """At a standstill four of them have a quarter of the variance of one."""
+    asked = problem(noise=0.9)
+    scheme = ur.pixels.Adaptive(16, refresh=1, samples=64, denoiser="none")
+    at = asked.initial()
+    found: dict[int, list[np.ndarray]] = {1: [], 4: []}
+    for seed in range(200):
+        state = scheme.init(asked, at)
+        for step in range(1, 5):
+            _, state = scheme.draw(asked, at, state, Key(seed, step))
+            if step in found:
+                found[step].append(np.concatenate([part.ravel() for part in state.maps]))
+    one, four = (np.var(found[n], axis=0, ddof=1).sum() for n in (1, 4))
+    assert one / four == pytest.approx(4.0, rel=0.25)
+
+
 def test_a_control_variate_looks_at_whole_views_now_and_then() -> None:
     asked = problem(views=2, noise=0.9)
     image = ur.images.RecursiveControlVariate(whole_views=4)

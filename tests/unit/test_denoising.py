@@ -31,12 +31,13 @@ def noisy(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("by", KINDS)
 @pytest.mark.parametrize("channels", [(), (3,)])
-def test_noise_goes_and_the_light_stays(by: Any, channels: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("fast", [False, True])
+def test_noise_goes_and_the_light_stays(by: Any, channels: tuple[int, ...], fast: bool) -> None:
     """A step from 1 to 3 under noise: nearer the truth than the noise left it, on both sides of the edge."""
     truth = np.where(np.arange(64) < 32, 1.0, 3.0)[None, :].repeat(64, axis=0)
     truth = np.broadcast_to(truth.reshape(64, 64, *[1] * len(channels)), (64, 64, *channels))
     image = truth * noisy(truth.shape)
-    found = denoise(image, by=by)
+    found = denoise(image, by=by, fast=fast)
     assert found.shape == image.shape
     assert found.dtype == np.float32
     assert np.mean((found - truth) ** 2) < 0.3 * np.mean((image - truth) ** 2)
