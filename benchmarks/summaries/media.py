@@ -62,32 +62,109 @@ NERF = ""
 
 
 def smoke(found: dict[str, Any]) -> str:
-    """Final errors by samples of the picture."""
+    """Final errors by samples of the picture, and how many a control variate is worth."""
 
     def told(entry: dict[str, Any]) -> str:
-        middle, low, high = entry["final"]
-        return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f})"
+        middle, low, high = entry["final"]["both"]
+        return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f}), {entry['runs']['both'][0][-1][0]:.0f} s"
 
     settings = found["settings"]
-    heads = {"time": f"{settings['seconds']:g} s", "steps": f"{settings['steps']} steps"}
+    heads = {"steps": f"{settings['steps']} steps", "time": f"{settings['seconds']:g} s"}
     budgets = [budget for budget in heads if budget in found]
-    rows = [[name, *(told(found[budget][name]) for budget in budgets)] for name in found[budgets[0]]]
+    rows = [
+        [name, *(told(found[budget][name]) if name in found[budget] else "" for budget in budgets)]
+        for name in found[budgets[0]]
+    ]
+    needs = []
+    for name, need in found["needs"].items():
+        plain = f"more than {need['more_than']}" if "more_than" in need else f"{need['spp']:.1f}"
+        times = f"{'more than ' * ('more_than' in need)}{need['times']:.1f}"
+        needs.append(
+            f"For the error of {name} spp a plain picture needs {plain} spp at equal steps: {times} times the samples."
+        )
     return (
-        f"`smoke`, {settings['resolution']}², grids of {settings['grid']}³, {settings['seeds']} seeds. Learning rate, error over "
-        f"the initial one: median (range).\n\n"
-        f"{table(['picture, paths per pixel', *(heads[budget] for budget in budgets)], rows)}"
+        f"`smoke`, {settings['resolution']}², grids of {settings['grid']}³, {settings['seeds']} seeds. Learning rate of the albedo, "
+        f"error over the initial one: median (range), seconds of a run.\n\n"
+        f"{table(['picture, paths per pixel', *(heads[budget] for budget in budgets)], rows)}\n\n{' '.join(needs)}"
     )
 
 
 def nerf(found: dict[str, Any]) -> str:
     """Final errors at equal time."""
+    parts = []
+    for kind, methods in found["schedules"].items():
+        rows = [
+            [
+                name,
+                f"{e['rate']:g}",
+                *("{:.3f} ({:.3f} to {:.3f})".format(*e["final"][views]) for views in ("seen", "unseen")),
+                ", ".join(map(str, e["steps"])),
+            ]
+            for name, e in methods.items()
+        ]
+        s = found["settings"][kind]
+        head = ["method", "learning rate", "error of views seen", "of views unseen", "steps"]
+        parts.append(
+            f"`nerf-volume`, {s['resolution']}², grids of {s['grid']}³, {kind} rates, {s['seconds']:g} s, {s['seeds']} seeds. "
+            f"Errors over the initial ones.\n\n{table(head, rows)}"
+        )
+    return "\n\n".join(parts)
+
+
+WEIGHTS = ""
+
+LANDSCAPE = ""
+
+
+def weights(found: dict[str, Any]) -> str:
+    """Along one descent."""
+    steps = [n for n in (1, 5, 20, 50, 100, 200, 500) if n < len(found["weight"])] + [len(found["weight"]) - 1]
     rows = [
-        [name, f"{e['rate']:g}", "{:.3f} ({:.3f} to {:.3f})".format(*e["final"]), str(len(e["runs"][0]))]
-        for name, e in found["methods"].items()
+        [
+            str(n),
+            f"{found['weight'][n]:.3f}",
+            f"{found['weight_10_50_90'][1][n]:.3f}",
+            f"{found['variance_ratio'][n]:.3f} ± {found['variance_ratio_error'][n]:.3f}",
+        ]
+        for n in steps
     ]
+    keys = list(found["errors"]["rcv"])
+    ends = [[method, *(_median(runs[key]) for key in keys)] for method, runs in found["errors"].items()]
     s = found["settings"]
-    head = ["method", "learning rate", "error over the initial one", "points on the curve"]
-    return f"`nerf-volume`, {s['resolution']}², grids of {s['grid']}³, {s['seconds']:g} s, {s['seeds']} seeds.\n\n{table(head, rows)}"
+    return (
+        f"`three-bodies`, {s['resolution']}², {s['spp']} spp, L1, Adam at {s['rate']:g}, {s['steps']} steps; weights and variance over "
+        f"{s['runs']} runs along one descent's path.\n\n"
+        f"{table(['step', 'weight, mean over pixels', 'median', 'variance over that of a plain render'], rows)}\n\n"
+        f"Errors over the initial ones, mean of the last fifth of the steps: median of {s['seeds']} seeds (range).\n\n"
+        f"{table(['picture', *keys], ends)}"
+    )
+
+
+def _median(runs: list[list[float]]) -> str:
+    last = sorted(sum(run[-(len(run) // 5) :]) / (len(run) // 5) for run in runs)
+    return f"{last[len(last) // 2]:.3f} ({last[0]:.3f} to {last[-1]:.3f})"
+
+
+def landscape(found: dict[str, Any]) -> str:
+    """Where the mean loss is least, and where its mean derivative is zero."""
+
+    def told(name: str, spp: str, what: str) -> str:
+        place, error = found["places"][name][spp][what], found["errors"][name][spp][what]
+        if place is None:
+            return "outside"
+        return f"{place:.3f}" + ("" if error is None else f" ± {error:.3f}")
+
+    rows = [
+        [name, spp, told(name, spp, "least"), told(name, spp, "stop")]
+        for name, entry in found["places"].items()
+        for spp in entry
+    ]
+    s, factors = found["settings"], found["factors"]
+    head = ["loss", "spp", "mean loss least at", "mean derivative 0 at"]
+    return (
+        f"`three-bodies`, {s['resolution']}², {s['runs']} renders at {len(factors)} factors from {factors[0]:g} to {factors[-1]:g} of "
+        f"the fog's true extinction, 1.\n\n{table(head, rows)}"
+    )
 
 
 def memory(found: dict[str, Any]) -> str:
