@@ -34,15 +34,20 @@ from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
-RATES = (0.001, 0.003)
+RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}
 EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 
 
 def entrants(budget: str) -> list[Entrant]:
     """Who races: the picture's samples differ, the derivative's do not."""
     adam, cv = at(ur.optimizers.Adam), ur.images.RecursiveControlVariate
-    plain = [Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES) for n in PLAIN[budget]]
-    return plain + [Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES) for n in WITH]
+    plain = [
+        Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES[budget])
+        for n in PLAIN[budget]
+    ]
+    return plain + [
+        Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget]) for n in WITH
+    ]
 
 
 def measure(problem: ur.Problem) -> Callable[[Tree], dict[str, float]]:

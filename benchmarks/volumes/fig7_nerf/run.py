@@ -3,9 +3,9 @@
     python benchmarks/volumes/fig7_nerf/run.py [--seconds 12] [--seeds 2] [--grid 64] [--resolution 64] [--schedule falling] [--only meta]
 
 Adam on plain gradients at 2, 4 and 8 samples per pixel, against meta-estimation with MetaAdam in the paper's form (1 difference,
-2 proportional samples), in the coupled one, and in that on a control variate's images. Each is tuned on a seed of its own for the whole
-budget: the emission's learning rate, extinction's being 20 times that; constant, or falling along half a cosine over the steps that
-fit into the budget.
+2 proportional samples), in the coupled one, and in that on a control variate's images; two of them with more samples as well. Each is
+tuned on a seed of its own for the whole budget: the emission's learning rate, extinction's being 20 times that; constant, or falling
+along half a cosine over the steps that fit into the budget.
 
 The field has no truth, so errors are of pictures: root mean square over the 8 views that the descent sees, and over 4 between them that it
 does not, relative to where it began. They are free of rendering noise: products of two independent renders' differences. Tuned is by
@@ -39,6 +39,7 @@ from unrender.trees import Tree
 HERE = Path(__file__).resolve().parent
 SPP = (2, 4, 8)
 VIEWS = 12
+GRID = 64
 UNSEEN = (1, 4, 7, 10)
 RATES = {
     ("Adam", "constant"): (0.01, 0.02, 0.04),
@@ -48,6 +49,7 @@ RATES = {
 }
 SCHEDULES = ("constant", "falling")
 FLOOR = 0.05
+GREENS = ("#8fd3aa", "#1a8f4c", "#7fb2dd", "#5b7f3a", "#1f6fb4")
 
 
 def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
@@ -59,6 +61,8 @@ def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
         "meta": ur.MetaEstimator(),
         "coupled, 3 spp": ur.MetaEstimator(coupled=True, spp=3),
         "coupled on rcv, 3 spp": ur.MetaEstimator(coupled=True, spp=3, image=control),
+        "meta, 8 and 4 spp": ur.MetaEstimator(proportional_spp=8, difference_spp=4),
+        "coupled on rcv, 8 spp": ur.MetaEstimator(coupled=True, spp=8, image=control),
     }
     found = [Entrant(f"Adam, {n} spp", "Adam", ur.PathGradient(spp=n), adam, RATES["Adam", kind]) for n in SPP]
     return found + [Entrant(name, "meta", estimator, meta, RATES["meta", kind]) for name, estimator in others.items()]
@@ -102,14 +106,14 @@ def run(problem: ur.Problem, pictures: Pictures, name: str, kind: str, seconds: 
     return compete(problem, entrant(schedule), pictures, "seen", seeds, seconds=seconds)
 
 
-def plot(results: dict[str, Any]) -> None:
+def plot(folder: Path, results: dict[str, Any]) -> None:
     """Errors over time: a row per schedule; seen and unseen views."""
     kinds = [kind for kind in SCHEDULES if kind in results["schedules"]]
     figure, axes = plt.subplots(
         len(kinds), 2, figsize=(11, 4.2 * len(kinds)), squeeze=False, sharey=True, layout="constrained"
     )
     names = [entrant.name for entrant in entrants(SCHEDULES[0], Constant())]
-    shades = dict(zip(names, [*colours(len(SPP)), "#8fd3aa", "#1a8f4c", "#1f6fb4"], strict=True))
+    shades = dict(zip(names, [*colours(len(SPP)), *GREENS], strict=True))
     for row, kind in zip(axes, kinds, strict=True):
         found = results["schedules"][kind]
         for axis, views in zip(row, ("seen", "unseen"), strict=True):
@@ -123,8 +127,8 @@ def plot(results: dict[str, Any]) -> None:
                 yscale="log",
             )
             axis.legend(fontsize=8)
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
+    figure.savefig(folder / "figure.png", dpi=110)
+    print(f"wrote {folder / 'figure.png'}")
 
 
 def main() -> None:
@@ -132,17 +136,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--resolution", type=int, default=64)
-    parser.add_argument("--grid", type=int, default=64)
+    parser.add_argument("--grid", type=int, default=GRID, help="others than 64 have a folder of their own")
     parser.add_argument("--schedule", choices=SCHEDULES, action="append", help="these alone; others' figures stay")
     parser.add_argument("--only", action="append", help="these entrants alone; others' figures stay")
     asked = parser.parse_args()
+    folder = HERE if asked.grid == GRID else HERE / f"grid{asked.grid}"
     ur.use()
     options = {"resolution": asked.resolution, "grid_resolution": asked.grid, "views": VIEWS, "reference_spp": 1024}
     made = ur.gallery.problem("nerf-volume", **options)
     views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
     problem = ur.Problem(made.renderer, made.parameters, views, made.loss, made.max_depth, name="nerf-volume")
     pictures = Pictures(made, options)
-    found: dict[str, Any] = read(HERE) if (HERE / "results.json").is_file() else {}
+    found: dict[str, Any] = read(folder) if (folder / "results.json").is_file() else {}
     settings = {name: getattr(asked, name) for name in ("seconds", "seeds", "resolution", "grid")}
     for kind in asked.schedule or SCHEDULES:
         if found.setdefault("settings", {}).get(kind, settings) != settings:
@@ -157,8 +162,8 @@ def main() -> None:
             entry = run(problem, pictures, name, kind, asked.seconds, asked.seeds)
             found.setdefault("schedules", {}).setdefault(kind, {})[name] = entry
             record = {key: value for key, value in found.items() if key not in ("command", "hardware", "versions")}
-            write(HERE, record)
-    plot(read(HERE))
+            write(folder, record)
+    plot(folder, read(folder))
 
 
 if __name__ == "__main__":
