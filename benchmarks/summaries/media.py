@@ -65,14 +65,15 @@ counted in voxels without smoke, where no picture tells it and every descent tak
 of the initial one wherever the smoke is found). So errors here are of extinction and of extinction times albedo."""
 
 NERF = """\
-Meta-estimation in the paper's form loses to Adam at 2, 4 and 8 spp at equal time. Its steps are fewer: beside the paths, a step pays for
-gradients, differences, mean squares and variances of a million unknowns. With a grid of 64³, films of 64² and 8 views, Adam's steps at 2, 4
-and 8 spp took 106, 151 and 260 ms on a quiet machine, those of the paper's form 303 and of the coupled one at 3 spp 229; with a grid of 16³
-86, 146, 199, 193 and 144. So more samples cost little beside it, and every method gains by them, meta-estimation too. Step by step the order
-is another: on a control variate's images at 8 spp, 40 steps come below 93 of Adam's at 4 spp, and near 60 of Adam's at 8. Pictures between
-the views seen gain little in any descent, most at low rates and in the forms with a memory, and are not what was tuned. None but Adam at 2 spp
-made more than 100 steps. Constant rates over 12 s, tried for three of the methods, gave the same order (Adam at 2 spp 0.34, coupled 0.37, meta
-0.43), with two seconds lost to kernels that were recorded anew within the run's clock."""
+Meta-estimation in the paper's form loses to Adam at 2, 4 and 8 spp at equal time. The best of its forms, the coupled one on a control
+variate's images at 8 spp, beats Adam at 2 and 4 spp and loses to 8. Its steps are dear: beside the paths, a step pays for gradients,
+differences, mean squares and variances of a million unknowns. With a grid of 64³, films of 64² and 8 views, steps of Adam at 2, 4 and 8
+spp took 106, 151 and 260 ms in a trial, those of the paper's form 303, of the coupled one at 3 spp 229; with a grid of 16³ 86, 146,
+199, 193 and 144. So samples cost little beside it, and every method gains by more of them. Step by step the order is another: on a
+control variate's images at 8 spp, 40 steps come below 93 of Adam's at 4 spp, and near 60 of Adam's at 8. Views between those seen gain
+little in any descent, most at low rates and in the forms with a memory; they are not what was tuned. None but Adam at 2 spp made more
+than 100 steps. Constant rates over 12 s, tried for three of the methods, gave the same order (Adam at 2 spp 0.34, coupled 0.37, the
+paper's form 0.43), but two seconds of the latter two went to kernels that were recorded anew within the run's clock."""
 
 
 def smoke(found: dict[str, Any]) -> str:
