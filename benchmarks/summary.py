@@ -567,7 +567,6 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
         media.nerf,
         media.NERF,
     ),
-    ("Participating media: the same with grids of 32³", "volumes/fig7_nerf/grid32", media.nerf, ""),
     ("Participating media: memory of grids", "volumes/memory", media.memory, ""),
     ("Coarse to fine", "coarse_to_fine", life.coarse_to_fine, life.COARSE),
     ("What checkpoints cost", "checkpoints", life.checkpoints, life.CHECKPOINTS),

@@ -59,7 +59,7 @@ def drift(found: dict[str, Any]) -> str:
 SMOKE = """\
 L1 sees the noise of a picture: at 1 spp plain gradients hardly move, and at a higher rate (0.003) the error rises above the initial
 one. With a control variate a picture at 1 spp does what one at 21 does without, and one at 2 spp what one at 32 does: more than the
-paper's 4 to 8. These are 300 steps on small films, seven tenths of the way still to go. At equal time the control variate is ahead too.
+paper's 4 to 8. These are 300 steps on small films, which leave 0.7 of the error. At equal time the control variate is ahead too.
 Rates: 0.001, 0.0018 and 0.003 from 4 spp on at equal steps, elsewhere a factor of 3 apart. Two things kept an earlier race from showing
 anything: the tuned rate was not extinction's, which the problem gives a rate of its own (now both move together), and albedo counted in
 voxels without smoke, where no picture tells it: its error over all voxels grows to 1.2 to 1.5 of the initial one wherever the smoke is
