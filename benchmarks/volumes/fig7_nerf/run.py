@@ -139,8 +139,12 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=GRID, help="others than 64 have a folder of their own")
     parser.add_argument("--schedule", choices=SCHEDULES, action="append", help="these alone; others' figures stay")
     parser.add_argument("--only", action="append", help="these entrants alone; others' figures stay")
+    parser.add_argument("--plot-only", action="store_true")
     asked = parser.parse_args()
     folder = HERE if asked.grid == GRID else HERE / f"grid{asked.grid}"
+    if asked.plot_only:
+        plot(folder, read(folder))
+        return
     ur.use()
     options = {"resolution": asked.resolution, "grid_resolution": asked.grid, "views": VIEWS, "reference_spp": 1024}
     made = ur.gallery.problem("nerf-volume", **options)
