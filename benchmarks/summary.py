@@ -551,6 +551,13 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
     ("Drawn pixels: what they cost", "adaptive/cost", pixels.cost, ""),
     ("Participating media: what they cost", "volumes/cost", media.cost, media.COST),
     ("Participating media: gradients", "volumes/gradients", media.gradients, media.GRADIENTS),
+    ("Participating media: weights along a descent (Fig. 2)", "volumes/fig2_weights", media.weights, media.WEIGHTS),
+    (
+        "Participating media: a loss along one parameter (Fig. 6)",
+        "volumes/fig6_landscape",
+        media.landscape,
+        media.LANDSCAPE,
+    ),
     ("Participating media: where noise pushes a loss (Figs 5 and 6)", "volumes/fig5_drift", media.drift, media.DRIFT),
     ("Participating media: what a control variate saves (Fig. 11)", "volumes/fig11_smoke", media.smoke, media.SMOKE),
     ("Participating media: what sparse ones cost", "volumes/cost/sparse", media.cost, ""),

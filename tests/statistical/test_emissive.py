@@ -50,6 +50,50 @@ def test_a_constant_glow_is_what_its_closed_form_says(depth: int) -> None:
     assert (error < 0.005).all()
 
 
+def slabs(voxels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Extinction and emission in slabs along y, empty to dense, other ones where x < 0 than where x > 0."""
+    rng = np.random.default_rng(7)
+    extinction, emission = rng.choice([0, 0.02, 1, 6], (2, voxels)), rng.uniform(0, 2, (2, voxels, 3))
+    half = np.where(np.arange(voxels) < voxels // 2, 0, 1)
+    shape = (voxels, voxels, voxels)
+    by_half = [
+        np.broadcast_to(np.moveaxis(x[half], 0, 1), (*shape, x.shape[2])) for x in (extinction[..., None], emission)
+    ]
+    return by_half[0], by_half[1]
+
+
+def seen_through(extinction: np.ndarray, emission: np.ndarray) -> np.ndarray:
+    """The mean over x of what such slabs show from y = -1, before the sky: colours."""
+    voxels = len(extinction)
+    passed, found = np.ones((voxels, 1)), np.zeros((voxels, 3))
+    for y in range(voxels):
+        through = np.exp(-extinction[0, y] * 2 / voxels)
+        found += passed * (1 - through) * emission[0, y]
+        passed = passed * through
+    return (found + passed * SKY).mean(axis=0)
+
+
+@pytest.mark.parametrize("voxels", [8, 20])
+def test_slabs_that_glow_are_what_their_closed_form_says(voxels: int) -> None:
+    """With one majorant and with a coarse grid of them; alone, and both images of a pair."""
+    extinction, emission = slabs(voxels)
+    renderer = MitsubaRenderer(before_the_sky(glow(extinction, emission, "nearest")), 2)
+    keys = ["body.interior_medium.sigma_t.data", "body.interior_medium.emission.data"]
+    renderer.select(keys, "path")
+    assert bool(renderer.pair.majorants(previous=False, both=True)) == (voxels == 20)
+    current = renderer.values(keys)
+    previous = {keys[0]: current[keys[0]] * 0.7, keys[1]: current[keys[1]]}
+    alone = renderer.image(current, Shot(0, 32 * 64, 1, 32))
+    pair = renderer.image_pair(current, previous, Shot(0, 32 * 64, 2, 32), "path")
+    for rendered, factor in ((alone.images, 1.0), (pair.images, 1.0), (pair.previous, 0.7)):
+        images = np.array(rendered).astype(np.float64).mean(axis=(1, 2))
+        error = images.std(axis=0, ddof=1) / np.sqrt(len(images))
+        expected = seen_through(extinction * factor, emission)
+        assert (np.abs(images.mean(axis=0) - expected) < 4 * error).all(), (images.mean(axis=0), expected, error)
+        wrong = seen_through(extinction * factor * 1.05, emission)
+        assert (np.abs(images.mean(axis=0) - wrong) > 4 * error).any(), "5 % more extinction goes unseen"
+
+
 def test_gradients_of_glowing_voxels_agree_with_finite_differences() -> None:
     """Emission where it is zero, and extinction where that is."""
     light = np.where(DARK, 0, np.random.default_rng(1).uniform(0.3, 2, (*KIND.shape[:3], 3)))

@@ -27,8 +27,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from along import Moments, follow, gallery, read_maps, write_maps
+from along import Moments, gallery, read_maps, write_maps
 from common import read, write
+from rcv.fig3_weights.track import squares, track
 
 import unrender as ur
 from unrender import arrays, statistics
@@ -92,10 +93,7 @@ def one_run(
             used.append(simulated.advance(F))
             kept.append(simulated.image)
         images[rule], weights[rule] = np.stack(kept), np.stack(used)
-    found = list(follow(problem, ur.images.RecursiveControlVariate(), [start] * steps, spp, seed))
-    images["relative"] = np.stack([arrays.numpy(e.mean()) for e in found]).astype(np.float64)
-    used = [arrays.numpy(e.info["control_weight"]) for e in found[1:]]
-    weights["relative"] = np.stack([np.zeros_like(used[0]), *used])
+    images["relative"], weights["relative"] = track(problem, [start] * steps, spp, seed)
     return renders, images, weights
 
 
@@ -121,13 +119,13 @@ def measure(problem: ur.Problem, steps: int, spp: int, runs: int) -> tuple[dict[
     rules = {}
     for rule in RULES:
         stack = np.stack(images[rule]).astype(np.float64)  # (runs, steps, H, W, 3)
-        squares = np.square(stack - stack.mean(axis=0)).sum(axis=(2, 3, 4)) * runs / (runs - 1) / unit
+        variance = squares(stack) / unit
         extra = (stack[:, -1] - np.stack(images["analytic"])[:, -1]).mean(axis=(1, 2, 3)) / brightness
         rules[rule] = {
             "weight": weights[rule].mean.tolist(),
             "weight_10_90": np.mean(spread[rule], axis=0).tolist(),
-            "variance": squares.mean(axis=0).tolist(),
-            "variance_error": (squares.std(axis=0, ddof=1) / np.sqrt(runs)).tolist(),
+            "variance": variance.mean(axis=0).tolist(),
+            "variance_error": (variance.std(axis=0, ddof=1) / np.sqrt(runs)).tolist(),
             "bias": float(extra.mean()),
             "bias_error": float(extra.std(ddof=1) / np.sqrt(runs)),
         }

@@ -23,25 +23,20 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.lines import Line2D
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from along import Moments, converged, descent, follow, gallery, paired_bias, read_maps, write_maps
 from common import read, write
+from rcv.fig6_7_loss_bias.landscape import LOSSES, check, places, plot_landscape, sample, table
 
 import unrender as ur
 from unrender import arrays
-from unrender.keys import Key
-from unrender.losses import Loss
-from unrender.rendering.port import Shot
 from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 KEY = "back.bsdf.reflectance.data"
 TRUE_SCALE = 0.7
 """The true wall is this share of the photograph, so that factors up to 1.4 keep its albedo below 1."""
-SPP = (1, 4, 16, 64)
-LOSSES: dict[str, Loss] = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 CHECK_FACTOR, CHECK_SPP = 1.2, 4
 
 
@@ -50,77 +45,18 @@ def at(problem: ur.Problem, factor: float) -> Tree:
     return {KEY: problem.renderer.array(factor * TRUE_SCALE * problem.truth[KEY])}
 
 
-def slopes(problem: ur.Problem, factor: float, spp: int, change: float = 0.02) -> np.ndarray:
-    """dI/dfactor, (H, W, 3), on paths that both sides share."""
-    higher, lower, found = at(problem, factor + change), at(problem, factor - change), Moments()
-    problem.renderer.select([KEY], "path")
-    for number in range(max(1, spp // 64)):
-        shot = Shot(problem.views[0].sensor, 64, Key(31_337, number).uint32())
-        pair = problem.renderer.image_pair(higher, lower, shot, "path")
-        assert pair.previous is not None
-        found.add((arrays.numpy(pair.images[0]) - arrays.numpy(pair.previous[0])) / (2 * change))
-    return found.mean
-
-
-def landscape(problem: ur.Problem, factors: np.ndarray, runs: int, reference_spp: int) -> dict[str, Any]:
+def by_factor(problem: ur.Problem, factors: np.ndarray, runs: int, reference_spp: int) -> dict[str, Any]:
     """Loss and derivative at every factor, sample count and loss, with standard errors over runs."""
-    reference = converged(problem, at(problem, 1.0), reference_spp).mean
-    table: dict[str, Any] = {name: {str(spp): [] for spp in SPP} for name in LOSSES}
-    for index, factor in enumerate(factors):
-        parameters, slope = at(problem, float(factor)), slopes(problem, float(factor), reference_spp // 4)
-        problem.renderer.select([KEY], None)
-        for spp in SPP:
-            seen: dict[str, list[tuple[float, float]]] = {name: [] for name in LOSSES}
-            for run in range(runs):
-                shot = Shot(problem.views[0].sensor, spp, Key(run, index, spp).uint32())
-                image = arrays.numpy(problem.renderer.image(parameters, shot).images[0]).astype(np.float64)
-                for name, loss in LOSSES.items():
-                    value, derivative = loss.value(image, reference), loss.derivative(image, reference) * slope
-                    seen[name].append((float(value.mean()), float(derivative.mean())))
-            for name, values in seen.items():
-                mean, error = np.mean(values, axis=0), np.std(values, axis=0, ddof=1) / np.sqrt(runs)
-                table[name][str(spp)].append([mean[0], error[0], mean[1], error[1]])
-        print(f"factor {factor:.2f}", flush=True)
-    places = {
-        name: {
-            spp: {"least": least(factors, np.array(rows)[:, 0]), "stop": stop(factors, np.array(rows)[:, 2])}
-            for spp, rows in entry.items()
-        }
-        for name, entry in table.items()
-    }
-    return {"factors": factors.tolist(), "table": table, "places": places, "check": check(problem, runs, reference)}
 
+    def state(factor: float) -> Tree:
+        return at(problem, factor)
 
-def least(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Where a curve is least, by a parabola through its lowest point's neighbours; None at an end."""
-    n = int(np.argmin(y))
-    if n in (0, len(x) - 1):
-        return None
-    a, b, _ = np.polyfit(x[n - 1 : n + 2], y[n - 1 : n + 2], 2)
-    return float(-b / (2 * a))
-
-
-def stop(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Where a derivative crosses from below 0 to above, and a descent stops; None if it does not."""
-    for n in range(len(x) - 1):
-        if y[n] < 0 <= y[n + 1]:
-            return float(x[n] - y[n] * (x[n + 1] - x[n]) / (y[n + 1] - y[n]))
-    return None
-
-
-def check(problem: ur.Problem, runs: int, reference: np.ndarray) -> dict[str, list[float]]:
-    """The same derivative by the library's own estimator at one place: mean and standard error, per loss."""
-    found: dict[str, list[float]] = {}
-    for name, loss in LOSSES.items():
-        posed = ur.Problem(problem.renderer, problem.parameters, [ur.View(reference.astype(np.float32))], loss=loss)
-        estimator = ur.PathGradient(spp=CHECK_SPP, adjoint_spp=CHECK_SPP)
-        parameters = at(problem, CHECK_FACTOR)
-        state, values = estimator.init(posed, parameters), []
-        for run in range(4 * runs):
-            estimate, _ = estimator.estimate(posed, parameters, state, Key(run, 0, 99))
-            values.append(float(np.sum(arrays.numpy(estimate.gradient[KEY]) * TRUE_SCALE * problem.truth[KEY])))
-        found[name] = [float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))]
-    return found
+    reference = converged(problem, state(1.0), reference_spp).mean
+    values = sample(problem, state, factors.tolist(), runs, reference, reference_spp // 4)
+    along = {KEY: TRUE_SCALE * problem.truth[KEY]}
+    checked = check(problem, state(CHECK_FACTOR), along, reference, CHECK_SPP, 4 * runs)
+    found = {"factors": factors.tolist(), "table": table(values), "places": places(factors.tolist(), values)}
+    return {**found, "check": checked}
 
 
 def derivatives(
@@ -184,33 +120,6 @@ def report(results: dict[str, Any]) -> None:
     print(f"image variance, plain / control variate: {fig7['image_variance_ratio']:.1f}")
 
 
-def plot_landscape(axes: Any, fig6: dict[str, Any]) -> None:
-    """Two rows (losses) of loss and derivative."""
-    factors = np.array(fig6["factors"])
-    colours = dict(zip(map(str, SPP), ("#c0392b", "#d1782a", "#4a9c6d", "#1f6fb4"), strict=True))
-    for row, name in zip(axes, LOSSES, strict=True):
-        for spp, colour in colours.items():
-            rows = np.array(fig6["table"][name][spp])
-            place = fig6["places"][name][spp]
-            for axis, column, where in ((row[0], 0, place["least"]), (row[1], 2, place["stop"])):
-                axis.errorbar(factors, rows[:, column], rows[:, column + 1], color=colour, label=f"{spp} spp", lw=1.4)
-                if where is not None:
-                    y = 0.0 if column else np.interp(where, factors, rows[:, column])
-                    axis.plot([where], [y], "x", color=colour, ms=9, mew=2.5, zorder=5)
-        row[1].axhline(0.0, color="black", lw=0.7)
-        for axis in row:
-            axis.axvline(1.0, color="black", lw=0.7, ls=":")
-            axis.set_xlabel("factor on the wall's albedo (truth 1)")
-        row[0].set(title=f"{name}: mean loss (× least)", ylabel="loss", yscale="log")
-        row[1].set(title=f"{name}: mean derivative (× where a descent stops)", ylabel="d loss / d factor")
-        row[0].margins(y=0.2)
-        row[0].legend(fontsize=8, ncols=4, loc="upper left")
-        missing = [spp for spp in colours if fig6["places"][name][spp]["stop"] is None]
-        if missing:
-            handle = Line2D([], [], color="none", label=f"no stop in this range: {', '.join(missing)} spp")
-            row[1].legend(handles=[handle], fontsize=8, loc="upper left", handlelength=0)
-
-
 def plot_derivatives(axes: Any, figure: Any, results: dict[str, Any]) -> None:
     """Two rows (losses) of derivative images."""
     maps = read_maps(HERE)
@@ -239,7 +148,7 @@ def plot(results: dict[str, Any]) -> None:
     whole = plt.figure(figsize=(12.5, 13), layout="constrained")
     halves: Any = whole.subfigures(2, 1, height_ratios=[1.3, 1])
     above, below = halves
-    plot_landscape(above.subplots(2, 2), results["fig6"])
+    plot_landscape(above.subplots(2, 2), results["fig6"], "the wall's albedo")
     above.suptitle(
         f"Fig. 6: indirect-room, {results['resolution']}², mean of {results['runs']} renders (± standard error)"
     )
@@ -265,10 +174,10 @@ def main() -> None:
     if not asked.plot_only:
         ur.use()
         problem = gallery("indirect-room", asked.resolution, asked.resolution, loss="L1")
-        fig6 = landscape(problem, np.linspace(0.6, 1.4, asked.factors), asked.runs, asked.reference_spp)
+        landscape = by_factor(problem, np.linspace(0.6, 1.4, asked.factors), asked.runs, asked.reference_spp)
         fig7, maps = derivatives(problem, asked.step, asked.spp, asked.runs, asked.reference_spp)
         sizes = {k: getattr(asked, k) for k in ("resolution", "runs", "spp", "step", "reference_spp")}
-        results = {**sizes, "fig6": fig6, "fig7": fig7}
+        results = {**sizes, "fig6": landscape, "fig7": fig7}
         report(results)
         write(HERE, results)
         write_maps(HERE, maps)

@@ -1,55 +1,114 @@
 """How many more samples the picture needs without its control variate (Fig. 11 of the recursive control variates): `smoke`, L1.
 
-    python benchmarks/volumes/fig11_smoke/run.py [--budget steps] [--steps 150] [--seconds 12] [--seeds 2] [--resolution 32] [--grid 16]
+    python benchmarks/volumes/fig11_smoke/run.py [--budget steps] [--steps 300] [--seconds 10] [--seeds 2] [--resolution 24] [--grid 16]
 
-Differential ratio tracking with 1 adjoint path per pixel throughout; the picture with 1, 4, 8 and 16 paths per pixel without a control
-variate, and 1 with one. Adam, its learning rate tuned per method on a seed of its own for the whole budget. Error is each
-grid's RMSE relative to where it began, averaged over the two grids, at equal time and at equal steps.
+Differential ratio tracking with 1 adjoint path per pixel throughout; the picture with 1 to 32 paths per pixel without a control
+variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget: the albedo's, extinction's
+being 10 times that. At equal steps, and some of them at equal time.
+
+Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient (extinction times
+albedo), averaged: the albedo of empty voxels shows in no picture. "needs" says how many samples a plain picture needs for the error that
+a control variate leaves: between the two neighbours in spp, along a line in logarithms.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
-from races import Entrant, colours, draw, race
+from judged import at, compete
+from races import Entrant, colours, draw
 
 import unrender as ur
+from unrender import arrays
+from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
-PLAIN, WITH = (1, 4, 8, 16), (1,)
-RATES = (0.01, 0.03)
-BUDGETS = ("time", "steps")
+PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
+RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}
+EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 
 
-def entrants() -> list[Entrant]:
+def entrants(budget: str) -> list[Entrant]:
     """Who races: the picture's samples differ, the derivative's do not."""
-    adam, cv = ur.optimizers.Adam, ur.images.RecursiveControlVariate
-    plain = [Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES) for n in PLAIN]
-    return plain + [Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES) for n in WITH]
+    adam, cv = at(ur.optimizers.Adam), ur.images.RecursiveControlVariate
+    plain = [
+        Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES[budget])
+        for n in PLAIN[budget]
+    ]
+    return plain + [
+        Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget]) for n in WITH
+    ]
+
+
+def measure(problem: ur.Problem) -> Callable[[Tree], dict[str, float]]:
+    """ "both", and for the record extinction, scattering, and albedo over all voxels."""
+
+    def fields(parameters: Any) -> dict[str, np.ndarray]:
+        extinction, albedo = (np.asarray(arrays.numpy(parameters[key]), np.float64) for key in (EXTINCTION, ALBEDO))
+        return {"extinction": extinction, "scattering": extinction * albedo, "albedo": albedo}
+
+    truth = fields({key: problem.renderer.array(value) for key, value in problem.truth.items()})
+
+    def errors(parameters: Tree) -> dict[str, float]:
+        return {name: float(np.sqrt(np.mean((x - truth[name]) ** 2))) for name, x in fields(parameters).items()}
+
+    start = errors(problem.initial())
+
+    def relative(parameters: Tree) -> dict[str, float]:
+        found = {name: error / start[name] for name, error in errors(parameters).items()}
+        return {"both": (found["extinction"] + found["scattering"]) / 2, **found}
+
+    return relative
+
+
+def needs(found: dict[str, Any], name: str) -> dict[str, Any]:
+    """Plain samples for the final error of "rcv, n": {"spp": ..., "times": spp / n}; "more_than" where no plain one reaches it."""
+    spp = sorted(int(other.split(", ")[1]) for other in found if other.startswith("plain"))
+    errors = [found[f"plain, {n}"]["final"]["both"][0] for n in spp]
+    goal, own = found[name]["final"]["both"][0], int(name.split(", ")[1])
+    first = next((i for i, error in enumerate(errors) if error <= goal), None)
+    if first is None:
+        return {"more_than": spp[-1], "times": spp[-1] / own}
+    if first == 0:
+        return {"spp": spp[0], "times": spp[0] / own}
+    low, high = np.log(errors[first - 1]), np.log(errors[first])
+    share = (low - np.log(goal)) / (low - high)
+    between = float(np.exp(np.log(spp[first - 1]) + share * np.log(spp[first] / spp[first - 1])))
+    return {"spp": between, "least": spp[first], "times": between / own}
 
 
 def plot(results: dict[str, Any]) -> None:
-    """Error over time and over steps."""
-    budgets = [budget for budget in BUDGETS if budget in results]
-    figure, axes = plt.subplots(1, len(budgets), figsize=(6 * len(budgets), 4.5), squeeze=False, layout="constrained")
-    shades = dict(zip((f"plain, {n}" for n in PLAIN), colours(len(PLAIN)), strict=True))
-    for axis, budget in zip(axes[0], budgets, strict=True):
+    """Final errors by samples, and error along the descents."""
+    budgets = [budget for budget in PLAIN if budget in results]
+    figure, axes = plt.subplots(1, 1 + len(budgets), figsize=(5 * (1 + len(budgets)), 4.3), layout="constrained")
+    found = results[budgets[0]]
+    plain = [name for name in found if name.startswith("plain")]
+    spp = [int(name.split(", ")[1]) for name in plain]
+    middle, low, high = np.array([found[name]["final"]["both"] for name in plain]).T
+    axes[0].errorbar(spp, middle, [middle - low, high - middle], marker="o", color="#d1782a", label="plain")
+    blues = {"rcv, 1": "#1f6fb4", "rcv, 2": "#7fb2dd"}
+    for name, blue in blues.items():
+        axes[0].axhline(found[name]["final"]["both"][0], color=blue, label=name)
+    axes[0].set(title=f"equal {budgets[0]}: error at the end", xlabel="paths per pixel of the picture", xscale="log")
+    axes[0].set_xticks(spp, [str(n) for n in spp])
+    axes[0].legend(fontsize=8)
+    shades = dict(zip((f"plain, {n}" for n in PLAIN["steps"]), colours(len(PLAIN["steps"])), strict=True)) | blues
+    for axis, budget in zip(axes[1:], budgets, strict=True):
         for name, entry in results[budget].items():
-            draw(
-                axis,
-                entry,
-                0,
-                shades.get(name, "#1f6fb4" if name == "rcv, 1" else "#7fb2dd"),
-                f"{name}: {entry['final'][0]:.3f}",
-            )
-        axis.set(title=f"equal {budget}", xlabel="seconds", ylabel="parameter error / initial", yscale="log")
+            if name in shades:
+                curves = {"runs": entry["runs"]["both"]}
+                draw(axis, curves, 0, shades[name], f"{name}: {entry['final']['both'][0]:.3f}")
+        axis.set(title=f"equal {budget}", xlabel="seconds", ylabel="error / initial")
         axis.legend(fontsize=7)
     figure.savefig(HERE / "figure.png", dpi=110)
     print(f"wrote {HERE / 'figure.png'}")
@@ -57,24 +116,35 @@ def plot(results: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=12.0)
-    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument(
-        "--budget", choices=list(BUDGETS), action="append", help="run this again, keep the other's figures"
-    )
-    parser.add_argument("--resolution", type=int, default=32)
+    parser.add_argument("--budget", choices=list(PLAIN), action="append", help="this alone; the other's figures stay")
+    parser.add_argument("--only", action="append", help="these entrants alone; others' figures stay")
+    parser.add_argument("--resolution", type=int, default=24)
     parser.add_argument("--grid", type=int, default=16)
     asked = parser.parse_args()
     ur.use()
     problem = ur.gallery.problem("smoke", resolution=asked.resolution, grid_resolution=asked.grid, reference_spp=4096)
     found: dict[str, Any] = read(HERE) if (HERE / "results.json").is_file() else {}
-    found["settings"] = vars(asked)
-    for budget in asked.budget or BUDGETS:
+    settings = {name: getattr(asked, name) for name in ("seconds", "steps", "seeds", "resolution", "grid")}
+    if found.get("settings") != settings:
+        found = {"settings": settings}
+    for budget in asked.budget or PLAIN:
         limit = {"seconds": asked.seconds} if budget == "time" else {"steps": asked.steps}
-        found[budget] = race(problem, entrants(), asked.seeds, **limit)
-    write(HERE, found)
-    plot(read(HERE))
+        for entrant in entrants(budget):
+            if entrant.name in (asked.only or [entrant.name]):
+                entry = compete(problem, entrant, measure(problem), "both", asked.seeds, **limit)
+                found.setdefault(budget, {})[entrant.name] = entry
+        names = [entrant.name for entrant in entrants(budget)]
+        if budget == "steps" and all(name in found[budget] for name in names):
+            found["needs"] = {f"rcv, {n}": needs(found[budget], f"rcv, {n}") for n in WITH}
+        found[budget] = {name: found[budget][name] for name in names if name in found[budget]}
+    write(HERE, {key: value for key, value in found.items() if key not in ("command", "hardware", "versions")})
+    results = read(HERE)
+    if "needs" in results:
+        print(results["needs"])
+        plot(results)
 
 
 if __name__ == "__main__":
