@@ -55,19 +55,15 @@ def descend(
     ]
 
 
-def tune(
-    problem: ur.Problem, entrant: Entrant, tuning_seeds: int, **budget: Any
-) -> tuple[float, list[dict[str, float]]]:
-    """The rate whose median final error is least, and all that were tried. A best rate at an end of the grid extends it, thrice at most."""
+def search(rates: tuple[float, ...], error: Callable[[float], float]) -> tuple[float, list[dict[str, float]]]:
+    """The rate of the least error, and all that were tried. A best rate at an end of the grid extends it, thrice at most."""
     tried: dict[float, float] = {}
 
     def attempt(rate: float) -> None:
-        seeds = range(TUNING_SEED, TUNING_SEED + tuning_seeds)
-        error = float(np.median([descend(problem, entrant, rate, seed, **budget)[-1][2] for seed in seeds]))
-        tried[rate] = error if math.isfinite(error) else float("inf")
-        print(f"{problem.name} {entrant.name} rate {rate:g}: {error:.4f}", flush=True)
+        found = error(rate)
+        tried[rate] = found if math.isfinite(found) else math.inf
 
-    for rate in entrant.rates:
+    for rate in rates:
         attempt(rate)
     factor = sorted(tried)[1] / sorted(tried)[0] if len(tried) > 1 else 1.0
     for _ in range(3):
@@ -75,8 +71,21 @@ def tune(
         if factor == 1.0 or best not in (min(tried), max(tried)):
             break
         attempt(best / factor if best == min(tried) else best * factor)
-    best = min(tried, key=tried.__getitem__)
-    return best, [{"rate": rate, "error": error} for rate, error in sorted(tried.items())]
+    return min(tried, key=tried.__getitem__), [{"rate": rate, "error": e} for rate, e in sorted(tried.items())]
+
+
+def tune(
+    problem: ur.Problem, entrant: Entrant, tuning_seeds: int, **budget: Any
+) -> tuple[float, list[dict[str, float]]]:
+    """The rate whose median final error is least, and all that were tried."""
+
+    def error(rate: float) -> float:
+        seeds = range(TUNING_SEED, TUNING_SEED + tuning_seeds)
+        found = float(np.median([descend(problem, entrant, rate, seed, **budget)[-1][2] for seed in seeds]))
+        print(f"{problem.name} {entrant.name} rate {rate:g}: {found:.4f}", flush=True)
+        return found
+
+    return search(entrant.rates, error)
 
 
 def race(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from races import TUNING_SEED, Entrant
+from races import TUNING_SEED, Entrant, search
 
 import unrender as ur
 from unrender.optimizers.base import Optimizer
@@ -70,19 +70,6 @@ def follow(
     return watch
 
 
-def tune(entrant: Entrant, error: Callable[[float], float]) -> tuple[float, list[dict[str, float]]]:
-    """The rate of the least error, and all that were tried; a best rate at an end of the grid extends it, thrice at most."""
-    tried = {rate: error(rate) for rate in entrant.rates}
-    factor = sorted(tried)[1] / sorted(tried)[0]
-    for _ in range(3):
-        best = min(tried, key=tried.__getitem__)
-        if best not in (min(tried), max(tried)):
-            break
-        rate = best / factor if best == min(tried) else best * factor
-        tried[rate] = error(rate)
-    return min(tried, key=tried.__getitem__), [{"rate": rate, "error": e} for rate, e in sorted(tried.items())]
-
-
 def compete(
     problem: ur.Problem, entrant: Entrant, measure: Measure, by: str, seeds: int, **budget: Any
 ) -> dict[str, Any]:
@@ -101,7 +88,7 @@ def compete(
         print(f"{problem.name} {entrant.name} rate {rate:g}: {told}", flush=True)
         return last[by]
 
-    rate, tried = tune(entrant, final)
+    rate, tried = search(entrant.rates, final)
     watched = [follow(problem, entrant, measure, rate, seed, 1 / POINTS, **budget) for seed in range(seeds)]
     runs = {name: [watch.points[name] for watch in watched] for name in watched[0].points}
     ends = {name: [run[-1][2] for run in found] for name, found in runs.items()}
