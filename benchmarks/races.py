@@ -108,6 +108,19 @@ def race(
     return found
 
 
+def over(
+    runs: dict[str, list[list[tuple[float, float, float]]]], other: str, column: int, checkpoints: int = 10
+) -> dict[str, list[float]]:
+    """Each method's error over `other`'s, medians over runs, at each tenth of the seconds (column 0) or samples (1) that all reached."""
+    end = min(run[-1][column] for found in runs.values() for run in found)
+    where = end * np.arange(1, checkpoints + 1) / checkpoints
+
+    def middle(found: list[list[tuple[float, float, float]]]) -> np.ndarray:
+        return np.median([np.interp(where, *np.array(run)[:, [column, 2]].T) for run in found], axis=0)
+
+    return {name: (middle(found) / middle(runs[other])).tolist() for name, found in runs.items()}
+
+
 def reached(runs: list[list[tuple[float, float, float]]], error: float, column: int) -> float | None:
     """The median over runs of the seconds (column 0) or samples (1) at which the error is first at most `error`; None
     where half of the runs never get there."""

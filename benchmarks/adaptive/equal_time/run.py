@@ -1,5 +1,4 @@
-"""Drawn pixels at equal time (Figs 4, 5 and 8 of the paper, and its smoke): `sun-glossy` with two losses, `plain-and-textured`,
-`two-planets`, `smoke`.
+"""Drawn pixels at equal time (Figs 4, 5 and 8 of the paper): `sun-glossy` with two losses, `plain-and-textured`, `two-planets`.
 
     python benchmarks/adaptive/equal_time/run.py [--problem two-planets] [--seconds 10] [--seeds 5] [--resolution 192]
 
@@ -18,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
-from races import Entrant, draw, race
+from races import Entrant, draw, over, race
 from schemes import COLOURS, pixels
 
 import unrender as ur
@@ -36,12 +34,10 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "plain-and-textured": ("plain-and-textured", FINE, 2048),
     "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 2048),
     "two-planets, memories": ("two-planets", {}, 2048),
-    "smoke": ("smoke", {"resolution": 64, "grid_resolution": 32, "loss": "L2"}, 2048),
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
 META_RATES = (0.001, 0.003)
-CHECKPOINTS = 10
 CV = ur.images.RecursiveControlVariate
 
 
@@ -73,17 +69,6 @@ def entrants(task: str, count: int) -> list[Entrant]:
             Entrant("all, coupled", "all, coupled", ur.MetaEstimator(coupled=True, spp=2), meta, META_RATES),
         ]
     return found
-
-
-def checkpoints(methods: dict[str, Any], column: int) -> dict[str, list[float]]:
-    """Per method its error over uniform's at each tenth of the seconds (column 0) or samples (1) that all reached, medians over runs."""
-    end = min(run[-1][column] for entry in methods.values() for run in entry["runs"])
-    where = end * np.arange(1, CHECKPOINTS + 1) / CHECKPOINTS
-
-    def middle(entry: dict[str, Any]) -> np.ndarray:
-        return np.median([np.interp(where, *np.array(run)[:, [column, 2]].T) for run in entry["runs"]], axis=0)
-
-    return {name: (middle(entry) / middle(methods["uniform"])).tolist() for name, entry in methods.items()}
 
 
 def plot(results: dict[str, Any]) -> None:
@@ -120,7 +105,8 @@ def main() -> None:
             chosen = [e for e in entrants(task, count) if not asked.only or e.name in asked.only]
             kept = entries.get(task, {}).get("methods", {}) if asked.only else {}
             methods = {**kept, **race(problem, chosen, asked.seeds, seconds=asked.seconds)}
-            ratios = {by: checkpoints(methods, column) for by, column in (("time", 0), ("samples", 1))}
+            runs = {method: entry["runs"] for method, entry in methods.items()}
+            ratios = {by: over(runs, "uniform", column) for by, column in (("time", 0), ("samples", 1))}
             for by, found in ratios.items():
                 for method, ratio in found.items():
                     print(task, by, method, [round(r, 3) for r in ratio], flush=True)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +26,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
 from judged import at, compete
 from races import Entrant, colours, draw
+from smoke_error import measure
 
 import unrender as ur
-from unrender import arrays
-from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
 RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}
-EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 
 
 def entrants(budget: str) -> list[Entrant]:
@@ -48,27 +45,6 @@ def entrants(budget: str) -> list[Entrant]:
     return plain + [
         Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget]) for n in WITH
     ]
-
-
-def measure(problem: ur.Problem) -> Callable[[Tree], dict[str, float]]:
-    """ "both", and for the record extinction, scattering, and albedo over all voxels."""
-
-    def fields(parameters: Any) -> dict[str, np.ndarray]:
-        extinction, albedo = (np.asarray(arrays.numpy(parameters[key]), np.float64) for key in (EXTINCTION, ALBEDO))
-        return {"extinction": extinction, "scattering": extinction * albedo, "albedo": albedo}
-
-    truth = fields({key: problem.renderer.array(value) for key, value in problem.truth.items()})
-
-    def errors(parameters: Tree) -> dict[str, float]:
-        return {name: float(np.sqrt(np.mean((x - truth[name]) ** 2))) for name, x in fields(parameters).items()}
-
-    start = errors(problem.initial())
-
-    def relative(parameters: Tree) -> dict[str, float]:
-        found = {name: error / start[name] for name, error in errors(parameters).items()}
-        return {"both": (found["extinction"] + found["scattering"]) / 2, **found}
-
-    return relative
 
 
 def needs(found: dict[str, Any], name: str) -> dict[str, Any]:
