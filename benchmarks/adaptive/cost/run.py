@@ -113,7 +113,7 @@ def main() -> None:
         problem = ur.gallery.problem(name)
         runs = {
             "refreshed": Steps(problem, ur.pixels.Adaptive(asked.count)),
-            "kept": Steps(problem, ur.pixels.Adaptive(asked.count, refresh=10**9, samples=asked.count // 2)),
+            "kept": Steps(problem, ur.pixels.Adaptive(asked.count, refresh=10**9, samples=asked.count // 3)),
             "uniform": Steps(problem, ur.pixels.Uniform(asked.count)),
         }
         found = in_turns(runs, asked.rounds)

@@ -35,7 +35,7 @@ class Adaptive:
         levels: D, >= 0.
         refresh: steps between estimates, >= 1.
         samples: paths of an estimate, >= 1, which also says how fine the cells are: one path in each, or several where cells are
-            pixels. None for half of `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths
+            pixels. None for a third of `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths
             of what the steps cost.
         uniform: share of the draws that every pixel has equally, in (0, 1].
         stratified: spread the draws evenly over the probabilities (`cells.Table.draw`); otherwise they are independent, as in the paper.

@@ -136,11 +136,11 @@ class Refreshing:
         return cut(problem, max(self._budget(), len(problem.views)))
 
     def _budget(self) -> int:
-        """Paths of a refresh: by default half as many as a step's pixels, for each twenty steps that it serves; at least 4096, or for
+        """Paths of a refresh: by default a third of a step's pixels, for each twenty steps that it serves; at least 4096, or for
         small steps twice their pixels."""
         if self.samples is not None:
             return self.samples
-        return max(1, min(max(self.count // 2, _FEWEST_PATHS), 2 * self.count) * self.refresh // 20)
+        return max(1, min(max(self.count // 3, _FEWEST_PATHS), 2 * self.count) * self.refresh // 20)
 
     def _renew(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[RefreshedState, int]:
         cells = self._cells(problem)
