@@ -6,7 +6,8 @@ Uniform mini-batches, those in proportion to the loss derivative, and adaptive o
 the learning rate of each tuned on a seed of its own for the whole budget. Pictures and textures have fewer pixels drawn per texel than
 texels, as in the paper. On `plain-and-textured` also five levels; `two-planets, memories` adds, on small pictures, a control variate and
 coupled meta-estimation, drawn and whole. Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios
-are to uniform mini-batches, at ten checkpoints, medians over seeds, at equal time and at equal samples.
+are to uniform mini-batches, at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may
+change between runs, the time of a path is measured in turns, after the race (`--costs-only`: that alone, of the races on file).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -71,6 +73,26 @@ def entrants(task: str, count: int) -> list[Entrant]:
     return found
 
 
+def costs(
+    problem: ur.Problem, chosen: list[Entrant], rate: float, rounds: int = 5, steps: int = 60
+) -> dict[str, float]:
+    """Seconds per path of short descents, in turns: medians."""
+    found: dict[str, list[float]] = {entrant.name: [] for entrant in chosen}
+    for turn in range(rounds):
+        for entrant in chosen:
+            history = ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), steps=steps, seed=turn).history
+            first, last = history[steps // 3], history[-1]
+            found[entrant.name].append((last["seconds"] - first["seconds"]) / (last["samples"] - first["samples"]))
+    return {name: float(np.median(times)) for name, times in found.items()}
+
+
+def compare(methods: dict[str, Any], seconds: dict[str, float]) -> dict[str, dict[str, list[float]]]:
+    """Errors over uniform's, by time and by samples."""
+    runs = {name: entry["runs"] for name, entry in methods.items()}
+    timed = {name: [[(s * seconds[name], s, e) for _, s, e in run] for run in found] for name, found in runs.items()}
+    return {"time": over(timed, "uniform", 0), "samples": over(runs, "uniform", 1)}
+
+
 def plot(results: dict[str, Any]) -> None:
     """Error over time, one axis per task."""
     entries = results["entries"]
@@ -92,30 +114,34 @@ def main() -> None:
     parser.add_argument("--resolution", type=int, help="film size, for GPUs")
     parser.add_argument("--count", type=int, help="pixels a step")
     parser.add_argument("--only", action="append", metavar="NAME", help="run these again, keep the others' figures")
+    parser.add_argument("--costs-only", action="store_true")
     parser.add_argument("--plot-only", action="store_true")
     asked = parser.parse_args()
     if not asked.plot_only:
         ur.use()
         entries: dict[str, Any] = read(HERE)["entries"] if (HERE / "results.json").is_file() else {}
-        for task in asked.problem or TASKS:
+        for task in asked.problem or (entries if asked.costs_only else TASKS):
             name, options, count = TASKS[task]
             options = {**options, **({"resolution": asked.resolution} if asked.resolution else {})}
             problem = ur.gallery.problem(name, **options)
             count = asked.count or count
-            chosen = [e for e in entrants(task, count) if not asked.only or e.name in asked.only]
-            kept = entries.get(task, {}).get("methods", {}) if asked.only else {}
-            methods = {**kept, **race(problem, chosen, asked.seeds, seconds=asked.seconds)}
-            runs = {method: entry["runs"] for method, entry in methods.items()}
-            ratios = {by: over(runs, "uniform", column) for by, column in (("time", 0), ("samples", 1))}
+            everyone = entrants(task, count)
+            chosen = [e for e in everyone if not asked.only or e.name in asked.only]
+            kept = entries.get(task, {}).get("methods", {}) if asked.only or asked.costs_only else {}
+            methods = {
+                **kept,
+                **({} if asked.costs_only else race(problem, chosen, asked.seeds, seconds=asked.seconds)),
+            }
+            seconds = costs(problem, [e for e in everyone if e.name in methods], RATES[0])
+            ratios = compare(methods, seconds)
             for by, found in ratios.items():
                 for method, ratio in found.items():
                     print(task, by, method, [round(r, 3) for r in ratio], flush=True)
+            budget = {"options": options, "count": count, "seconds": asked.seconds, "seeds": asked.seeds}
             entries[task] = {
-                "options": options,
-                "count": count,
-                "seconds": asked.seconds,
-                "seeds": asked.seeds,
+                **(entries[task] if asked.costs_only else budget),
                 "methods": methods,
+                "seconds_per_path": seconds,
                 "over uniform": ratios,
             }
             write(HERE, {"entries": entries})
