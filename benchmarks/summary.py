@@ -567,6 +567,7 @@ SECTIONS: list[tuple[str, str, Any, str]] = [
         media.nerf,
         media.NERF,
     ),
+    ("Participating media: drawn pixels", "volumes/adaptive_smoke", media.drawn, media.DRAWN),
     ("Participating media: memory of grids", "volumes/memory", media.memory, ""),
     ("Coarse to fine", "coarse_to_fine", life.coarse_to_fine, life.COARSE),
     ("What checkpoints cost", "checkpoints", life.checkpoints, life.CHECKPOINTS),

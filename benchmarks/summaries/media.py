@@ -136,6 +136,36 @@ As in the paper: noise moves the minimum of both losses towards thinner fog, but
 finds; L2's is at the truth within two standard errors."""
 
 
+DRAWN = """\
+Of smoke, drawn pixels of any scheme find little within this budget: each voxel is met by a few paths a step, and all pixels that show
+smoke are about as noisy and as telling as the next. Adaptive ones are no better than uniform ones here, and their steps dearer; those in
+proportion to the loss derivative gain a little."""
+
+
+def drawn(found: dict[str, Any]) -> str:
+    """Final errors, and ratios to uniform draws."""
+    rows = [
+        [
+            name,
+            f"{e['rate']:g}",
+            "{:.3f} ({:.3f} to {:.3f})".format(*e["final"]["both"]),
+            *(" ".join(f"{x:.3f}" for x in ratios[name][1::3]) for ratios in found["over uniform"].values()),
+        ]
+        for name, e in found["methods"].items()
+    ]
+    s = found["settings"]
+    head = [
+        "pixels",
+        "learning rate",
+        "final error",
+        *(f"over uniform, at .2 .5 .8 of the {by}" for by in found["over uniform"]),
+    ]
+    return (
+        f"`smoke`, {s['resolution']}², grids of {s['grid']}³, {s['count']} pixels a step, L2, {s['seconds']:g} s, {s['seeds']} seeds.\n\n"
+        f"{table(head, rows)}"
+    )
+
+
 def weights(found: dict[str, Any]) -> str:
     """Along one descent."""
     steps = [n for n in (1, 5, 20, 50, 100, 200, 500) if n < len(found["weight"])] + [len(found["weight"]) - 1]
