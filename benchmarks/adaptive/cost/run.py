@@ -2,9 +2,9 @@
 
     python benchmarks/adaptive/cost/run.py [--count 16384] [--largest 4096]
 
-Share: wall time of `Adaptive` with its probabilities refreshed every 20 steps over that with the same ones kept, steps in turns. Sizes: one view of
-`plain-and-textured` from 256² to 4096² pixels, refreshes included, against black references (their values do not change the work).
-Memory: 16 views of 4 megapixels of `two-planets`, in a process of its own, its greatest resident size.
+Share: wall time of `Adaptive` with its probabilities refreshed every 20 steps over that with the same ones kept, steps in turns. Sizes:
+one view of `plain-and-textured` from 256² to 4096² pixels, refreshes included, against black references (their values do not change the
+work). Memory: 16 views of 4 megapixels of `two-planets`, in a process of its own, its greatest resident size.
 """
 
 from __future__ import annotations
