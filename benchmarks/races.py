@@ -108,17 +108,25 @@ def race(
     return found
 
 
-def over(
-    runs: dict[str, list[list[tuple[float, float, float]]]], other: str, column: int, checkpoints: int = 10
-) -> dict[str, list[float]]:
-    """Each method's error over `other`'s, medians over runs, at each tenth of the seconds (column 0) or samples (1) that all reached."""
+Runs = dict[str, list[list[tuple[float, float, float]]]]
+"""Of each method, per seed: (seconds, samples, error) along the run."""
+
+
+def tenths(runs: Runs, column: int) -> dict[str, list[float]]:
+    """Each method's error, median over seeds, at each tenth of the seconds (column 0) or samples (1) that all reached."""
     end = min(run[-1][column] for found in runs.values() for run in found)
-    where = end * np.arange(1, checkpoints + 1) / checkpoints
+    where = end * np.arange(1, 11) / 10
 
     def middle(found: list[list[tuple[float, float, float]]]) -> np.ndarray:
         return np.median([np.interp(where, *np.array(run)[:, [column, 2]].T) for run in found], axis=0)
 
-    return {name: (middle(found) / middle(runs[other])).tolist() for name, found in runs.items()}
+    return {name: middle(found).tolist() for name, found in runs.items()}
+
+
+def over(runs: Runs, other: str, column: int) -> dict[str, list[float]]:
+    """`tenths` over those of one of the methods."""
+    found = tenths(runs, column)
+    return {name: [a / b for a, b in zip(errors, found[other], strict=True)] for name, errors in found.items()}
 
 
 def reached(runs: list[list[tuple[float, float, float]]], error: float, column: int) -> float | None:

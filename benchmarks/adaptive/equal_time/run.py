@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
-from races import Entrant, draw, over, race
+from races import Entrant, Runs, draw, over, race, tenths
 from schemes import COLOURS, pixels
 
 import unrender as ur
@@ -86,11 +86,19 @@ def costs(
     return {name: float(np.median(times)) for name, times in found.items()}
 
 
-def compare(methods: dict[str, Any], seconds: dict[str, float]) -> dict[str, dict[str, list[float]]]:
-    """Errors over uniform's, by time and by samples."""
-    runs = {name: entry["runs"] for name, entry in methods.items()}
-    timed = {name: [[(s * seconds[name], s, e) for _, s, e in run] for run in found] for name, found in runs.items()}
-    return {"time": over(timed, "uniform", 0), "samples": over(runs, "uniform", 1)}
+def timed(methods: dict[str, Any], seconds: dict[str, float]) -> Runs:
+    """The runs, with their seconds as so many paths take."""
+    return {
+        name: [[(samples * seconds[name], samples, error) for _, samples, error in run] for run in entry["runs"]]
+        for name, entry in methods.items()
+    }
+
+
+def compare(methods: dict[str, Any], seconds: dict[str, float]) -> dict[str, Any]:
+    """Errors at equal time, and over uniform's by time and by samples."""
+    runs = timed(methods, seconds)
+    ratios = {by: over(runs, "uniform", column) for by, column in (("time", 0), ("samples", 1))}
+    return {"errors": tenths(runs, 0), "over uniform": ratios}
 
 
 def plot(results: dict[str, Any]) -> None:
@@ -98,8 +106,8 @@ def plot(results: dict[str, Any]) -> None:
     entries = results["entries"]
     figure, axes = plt.subplots(1, len(entries), figsize=(5 * len(entries), 4), squeeze=False, layout="constrained")
     for axis, (name, entry) in zip(axes[0], entries.items(), strict=True):
-        for method, found in entry["methods"].items():
-            draw(axis, found, 0, COLOURS[method], f"{method}: {found['final'][0]:.3f}")
+        for method, runs in timed(entry["methods"], entry["seconds_per_path"]).items():
+            draw(axis, {"runs": runs}, 0, COLOURS[method], f"{method}: {entry['errors'][method][-1]:.3f}")
         axis.set(title=name, xlabel="seconds", ylabel="parameter error / initial", yscale="log")
         axis.legend(fontsize=7)
     figure.savefig(HERE / "figure.png", dpi=110)
@@ -133,8 +141,8 @@ def main() -> None:
                 **({} if asked.costs_only else race(problem, chosen, asked.seeds, seconds=asked.seconds)),
             }
             seconds = costs(problem, [e for e in everyone if e.name in methods], RATES[0])
-            ratios = compare(methods, seconds)
-            for by, found in ratios.items():
+            compared = compare(methods, seconds)
+            for by, found in compared["over uniform"].items():
                 for method, ratio in found.items():
                     print(task, by, method, [round(r, 3) for r in ratio], flush=True)
             budget = {"options": options, "count": count, "seconds": asked.seconds, "seeds": asked.seeds}
@@ -142,7 +150,7 @@ def main() -> None:
                 **(entries[task] if asked.costs_only else budget),
                 "methods": methods,
                 "seconds_per_path": seconds,
-                "over uniform": ratios,
+                **compared,
             }
             write(HERE, {"entries": entries})
     plot(read(HERE))
