@@ -315,6 +315,31 @@ def test_probabilities_that_cannot_be_estimated_are_equal() -> None:
     np.testing.assert_allclose(pick.probability[0], 1.0)
 
 
+def test_a_refresh_that_saw_nothing_finite_is_forgotten() -> None:
+    asked = problem(noise=0.9)
+    scheme = ur.pixels.Adaptive(16, refresh=1, samples=64, denoiser="none")
+    at = {k: np.asarray(v, np.float64) for k, v in asked.initial().items()}
+    broken = {k: v * np.nan for k, v in at.items()}
+    _, state = scheme.draw(asked, broken, scheme.init(asked, at), Key(0))
+    state = scheme.observe(asked, state, broken)
+    pick, state = scheme.draw(asked, at, state, Key(1))
+    assert np.isfinite(pick.probability[0]).all()
+    assert np.ptp(pick.probability[0]) > 0.1
+
+
+def test_refreshes_count_alike_whatever_the_size_of_what_they_saw() -> None:
+    """The second refresh sees variances in units of gradients a thousand times smaller: the same shapes, and as much weight."""
+    asked = problem(noise=0.9)
+    scheme = ur.pixels.Adaptive(16, refresh=1, samples=64, denoiser="none")
+    at = asked.initial()
+    found = []
+    for energy in (1.0, 1e-6):
+        _, state = scheme.draw(asked, at, scheme.init(asked, at), Key(0))
+        state = dataclasses.replace(state, energy={k: np.full(np.shape(v), energy) for k, v in at.items()})
+        found.append(scheme.draw(asked, at, state, Key(1))[0].probability[0])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
+
+
 def test_tangents_go_through_preconditioners() -> None:
     """In the coordinates of the descent, x = S u, the sum is over u."""
     asked = problem()

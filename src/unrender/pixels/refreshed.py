@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from unrender import checks, denoising, trees
+from unrender import arrays, checks, denoising, trees
 from unrender.errors import InputError
 from unrender.keys import Key
 from unrender.pixels import moments
@@ -46,7 +46,7 @@ class RefreshedState:
 
     Attributes:
         age: draws since the maps were made.
-        maps: what the probabilities are made of; empty before the first draw.
+        maps: what the probabilities are made of, each with mean 1; empty before the first draw.
         spots: a table of all cells, equally likely per pixel.
         table: of the draws; `spots` before the first.
         shares: how likely a pixel of each cell is, relative to equal probabilities, (cells,).
@@ -122,10 +122,10 @@ class Refreshing:
         return Pick(draw, traced, dict(enumerate(maps))), replace(state, age=state.age + 1)
 
     def observe(self, problem: Problem, state: RefreshedState, gradient: Tree) -> RefreshedState:
-        """Take a gradient's squares in, every few steps, since preconditioning costs something."""
+        """Take a gradient's squares in, every few steps, since preconditioning costs something; those that are not finite as zeros."""
         if state.age % _OBSERVED:
             return state
-        squares = trees.map(lambda g: g * g, problem.precondition(gradient))
+        squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), problem.precondition(gradient))
         if not state.energy or trees.shapes(state.energy) != trees.shapes(squares):
             return replace(state, energy=squares)
         return replace(
@@ -150,7 +150,7 @@ class Refreshing:
         ]
         scales = moments.scales(parameters, state.energy) if self.moments else {}
         seen = moments.look(problem, parameters, cells, state.spots, spp, key, references, scales)
-        maps = self.make(seen)
+        maps = tuple(_shape(values) for values in self.make(seen))
         if state.maps:
             kept = min(_MEMORY, state.refreshes / (state.refreshes + 1))
             maps = tuple(kept * old + (1 - kept) * new for old, new in zip(state.maps, maps, strict=True))
@@ -163,15 +163,13 @@ class Refreshing:
         """How likely a pixel of each cell is, relative to equal probabilities."""
         density = self.density(cells, maps, lambda values: self._clean(cells, values))
         total = float((density * cells.sizes).sum())
-        if not total > 0 or not np.isfinite(
-            total
-        ):  # nothing seen, or something that is not finite: as good as not knowing
+        if not total > 0:  # nothing seen is as good as not knowing
             return np.ones(len(density))
         return (1 - self.uniform) * density * (cells.sizes.sum() / total) + self.uniform
 
     def _clean(self, cells: Cells, values: np.ndarray) -> np.ndarray:
         by = self.denoiser
-        if by == "none" or not np.isfinite(values).all():
+        if by == "none":
             return values
         if by == "auto" and denoising.variant.current() != denoising.variant.CUDA:
             by = "oidn" if importlib.util.find_spec("pyoidn") else "variation"
@@ -185,6 +183,13 @@ class Refreshing:
             for index, part in zip(alike, cleaned, strict=True):
                 found[index] = part
         return cells.join(found).astype(np.float64)
+
+
+def _shape(values: np.ndarray) -> np.ndarray:
+    """A map over its mean, so that refreshes count alike in the memory whatever the loss has fallen to in between, or the units that
+    variances are in; what is not finite is taken for nothing seen."""
+    seen = np.where(np.isfinite(values), values, 0.0)
+    return seen / (seen.mean() or 1.0)
 
 
 def _together(maps: np.ndarray, clean: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
