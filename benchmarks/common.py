@@ -27,9 +27,11 @@ matplotlib.use("Agg")
 
 
 def write(folder: Path, figures: dict[str, Any]) -> None:
-    """Write results.json beside the script, with hardware, versions and the command that made it."""
+    """Write results.json beside the script, with hardware, versions and the command that made it; those of figures that were read back
+    and added to give way."""
     folder.mkdir(parents=True, exist_ok=True)
-    record = {"command": " ".join(["python", *sys.argv]), "hardware": hardware(), "versions": versions(), **figures}
+    made = {"command": " ".join(["python", *sys.argv]), "hardware": hardware(), "versions": versions()}
+    record = made | figures | made
     (folder / "results.json").write_text(json.dumps(record, indent=1) + "\n")
     print(f"wrote {folder / 'results.json'}")
 

@@ -123,10 +123,13 @@ def tenths(runs: Runs, column: int) -> dict[str, list[float]]:
     return {name: middle(found).tolist() for name, found in runs.items()}
 
 
-def over(runs: Runs, other: str, column: int) -> dict[str, list[float]]:
-    """`tenths` over those of one of the methods."""
-    found = tenths(runs, column)
-    return {name: [a / b for a, b in zip(errors, found[other], strict=True)] for name, errors in found.items()}
+def over(runs: Runs, other: str) -> dict[str, dict[str, list[float]]]:
+    """`tenths` over those of one of the methods, by time and by samples."""
+    by = {"time": tenths(runs, 0), "samples": tenths(runs, 1)}
+    return {
+        axis: {name: [a / b for a, b in zip(errors, found[other], strict=True)] for name, errors in found.items()}
+        for axis, found in by.items()
+    }
 
 
 def reached(runs: list[list[tuple[float, float, float]]], error: float, column: int) -> float | None:

@@ -135,7 +135,6 @@ LANDSCAPE = """\
 As in the paper: noise moves the minimum of both losses towards thinner fog, but the zero of the derivative of L1 alone, which a descent
 finds; L2's is at the truth within two standard errors."""
 
-
 DRAWN = """\
 Of smoke, drawn pixels of any scheme find little within this budget: each voxel is met by a few paths a step, and all pixels that show
 smoke are about as noisy and as telling as the next. Adaptive ones are no better than uniform ones here, and their steps dearer; those in

@@ -114,7 +114,8 @@ def main() -> None:
         refreshed = Steps(problem, ur.pixels.Adaptive(asked.count))
         for _ in range(4):
             refreshed.round(keep=False)
-        kept = Steps(problem, ur.pixels.Adaptive(asked.count, refresh=10**9, samples=asked.count // 3))
+        cells = len(refreshed.state.pixels.shares)
+        kept = Steps(problem, ur.pixels.Adaptive(asked.count, refresh=10**9, samples=cells))
         kept.state = refreshed.state  # the same pixels, which may be dearer than those of a first estimate
         runs = {"refreshed": refreshed, "kept": kept, "uniform": Steps(problem, ur.pixels.Uniform(asked.count))}
         found = in_turns(runs, asked.rounds)

@@ -97,8 +97,7 @@ def timed(methods: dict[str, Any], seconds: dict[str, float]) -> Runs:
 def compare(methods: dict[str, Any], seconds: dict[str, float]) -> dict[str, Any]:
     """Errors at equal time, and over uniform's by time and by samples."""
     runs = timed(methods, seconds)
-    ratios = {by: over(runs, "uniform", column) for by, column in (("time", 0), ("samples", 1))}
-    return {"errors": tenths(runs, 0), "over uniform": ratios}
+    return {"errors": tenths(runs, 0), "over uniform": over(runs, "uniform")}
 
 
 def plot(results: dict[str, Any]) -> None:

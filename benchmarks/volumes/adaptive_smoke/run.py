@@ -60,7 +60,7 @@ def main() -> None:
         entrant = Entrant(scheme, scheme, estimator, adam, RATES)
         methods[scheme] = compete(problem, entrant, measure(problem), "both", asked.seeds, seconds=asked.seconds)
     runs = {name: entry["runs"]["both"] for name, entry in methods.items()}
-    ratios = {by: over(runs, "uniform", column) for by, column in (("time", 0), ("samples", 1))}
+    ratios = over(runs, "uniform")
     for by, found in ratios.items():
         for name, ratio in found.items():
             print(by, name, [round(r, 3) for r in ratio])

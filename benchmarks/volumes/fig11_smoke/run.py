@@ -116,7 +116,7 @@ def main() -> None:
         if budget == "steps" and all(name in found[budget] for name in names):
             found["needs"] = {f"rcv, {n}": needs(found[budget], f"rcv, {n}") for n in WITH}
         found[budget] = {name: found[budget][name] for name in names if name in found[budget]}
-    write(HERE, {key: value for key, value in found.items() if key not in ("command", "hardware", "versions")})
+    write(HERE, found)
     results = read(HERE)
     if "needs" in results:
         print(results["needs"])

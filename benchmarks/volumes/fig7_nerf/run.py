@@ -165,8 +165,7 @@ def main() -> None:
         for name in names:
             entry = run(problem, pictures, name, kind, asked.seconds, asked.seeds)
             found.setdefault("schedules", {}).setdefault(kind, {})[name] = entry
-            record = {key: value for key, value in found.items() if key not in ("command", "hardware", "versions")}
-            write(folder, record)
+            write(folder, found)
     plot(folder, read(folder))
 
 
