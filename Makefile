@@ -47,7 +47,7 @@ clean:
 	find src tests benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Made anew whenever the dependencies change. pyright fetches its own program when it is first called: let that be now.
-.venv/ready: pyproject.toml scripts/prerequisites.py src/unrender/llvm.py src/unrender/packages.py
+.venv/ready: pyproject.toml scripts/prerequisites.py src/unrender/backend/llvm.py src/unrender/backend/install_hints.py
 	@test -n "$(PYTHON)" || { echo "no Python from 3.10 to 3.14 found: install one, or run: make PYTHON=/path/to/python3" >&2; exit 3; }
 	@$(PYTHON) -I scripts/prerequisites.py
 	$(PYTHON) -m venv .venv

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender import arrays
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, ImageEstimator
-from unrender.keys import Key
-from unrender.problem.frames import WholeView
-from unrender.rendering.port import Shot
-from unrender.trees import Tree
+from unrender.problem.batches import WholeView
+from unrender.rendering.renderer import SampleRequest
 
 CHUNK = 64
 """Samples per pixel of one render of `converged`."""
@@ -101,8 +101,8 @@ def converged(problem: ur.Problem, parameters: Tree, spp: int, seed: int = 987_6
     problem.renderer.select(list(parameters), None)
     found = Moments()
     for number in range(max(2, -(-spp // CHUNK))):
-        shot = Shot(problem.views[0].sensor, min(CHUNK, spp), Key(seed, number).uint32())
-        found.add(arrays.numpy(problem.renderer.image(parameters, shot).images[0]))
+        request = SampleRequest(problem.views[0].sensor, min(CHUNK, spp), Key(seed, number).uint32())
+        found.add(arrays.numpy(problem.renderer.image(parameters, request).images[0]))
     return found
 
 

@@ -19,9 +19,9 @@ import numpy as np
 
 import unrender as ur
 from unrender.problem.bounds import project
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.scene_pair import from_tensor
-from unrender.training.result import hardware, versions
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.scene_pair import from_tensor
+from unrender.runs.result import hardware, versions
 
 matplotlib.use("Agg")
 

@@ -12,7 +12,7 @@ import numpy as np
 from common import total_error
 
 import unrender as ur
-from unrender.gradients.estimate import Estimator
+from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
 
 TUNING_SEED = 1000

@@ -14,12 +14,12 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-PACKAGE = Path(__file__).resolve().parents[1] / "src" / "unrender"
+BACKEND = Path(__file__).resolve().parents[1] / "src" / "unrender" / "backend"
 
 
 def load(name: str) -> ModuleType:
     """A module of `unrender` by its file: the package itself cannot be imported yet."""
-    spec = importlib.util.spec_from_file_location(f"unrender_{name}", PACKAGE / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(f"unrender_{name}", BACKEND / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -28,11 +28,11 @@ def load(name: str) -> ModuleType:
     return module
 
 
-llvm, packages = load("llvm"), load("packages")
+llvm, install_hints = load("llvm"), load("install_hints")
 
 
 def missing() -> list[str]:
-    """What has to be installed, in the terms of `packages.NEEDS`."""
+    """What has to be installed, in the terms of `install_hints.NEEDS`."""
     needs = [] if importlib.util.find_spec("ensurepip") else ["venv"]
     needs += llvm.missing_companions()
     given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
@@ -43,7 +43,7 @@ def missing() -> list[str]:
 
 def administrator() -> "list[str] | None":
     """What to put before a command that installs: nothing for root, sudo if it asks no password; None where neither."""
-    if packages.is_root():
+    if install_hints.is_root():
         return []
     sudo = shutil.which("sudo")
     if sudo and subprocess.run([sudo, "-n", "true"], capture_output=True, check=False).returncode == 0:
@@ -59,9 +59,9 @@ def install(needs: "list[str]") -> None:
     quiet = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-qq"]
     print("reading the package lists: apt-get update", flush=True)
     subprocess.run([*quiet, "update"], check=False)
-    names = packages.apt_packages(needs)
+    names = install_hints.apt_packages(needs)
     if names is None:
-        names = packages.apt_packages([need for need in needs if need != "llvm"])
+        names = install_hints.apt_packages([need for need in needs if need != "llvm"])
     if names:
         print(f"installing {' '.join(names)}", flush=True)
         options = ["-y", "--no-install-recommends", "-o", "Dpkg::Use-Pty=0"]
@@ -79,12 +79,12 @@ def main() -> int:
         install(needs)
         needs = missing()
     if needs == ["llvm"] and Path("/proc/driver/nvidia/version").exists():
-        print(f"no LLVM {llvm.OLDEST} or newer, so only the GPU will do; for the CPU: {packages.command(needs)}")
+        print(f"no LLVM {llvm.OLDEST} or newer, so only the GPU will do; for the CPU: {install_hints.command(needs)}")
         return 0
     if needs:
         names = {"venv": "Python's venv", "llvm": f"LLVM {llvm.OLDEST} or newer"}
         what = ", ".join(names.get(need, need) for need in needs)
-        print(f"missing: {what}; run: {packages.command(needs)}", file=sys.stderr)
+        print(f"missing: {what}; run: {install_hints.command(needs)}", file=sys.stderr)
         return 3
     return 0
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from unrender import variant
-from unrender.errors import VariantError
+from unrender.backend import variant
+from unrender.core.errors import VariantError
 
 variant.prepare()  # before any test module imports Dr.Jit
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
-from unrender.gradients.path import PathGradient
-from unrender.keys import Key
+from unrender.core.random import Key
+from unrender.estimators.path import PathGradient
 
 
 def gradients(

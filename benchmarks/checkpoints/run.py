@@ -20,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import write
 
 import unrender as ur
-from unrender.methods import method
-from unrender.training import folder
-from unrender.training.folder import Keeper
+from unrender.methods.catalogue import method
+from unrender.runs.folder import writer
+from unrender.runs.folder.writer import RunWriter
 
 HERE = Path(__file__).resolve().parent
 CASES: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {
@@ -42,7 +42,7 @@ CASES: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {
 BOTH = ("quad, smoothed", "indirect-room, rcv")
 
 
-class Timed(Keeper):
+class Timed(RunWriter):
     """A keeper that knows how long it took."""
 
     spent: dict[str, float] = {}  # noqa: RUF012
@@ -88,10 +88,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     asked = parser.parse_args()
     print(ur.use())
-    folder.Keeper = Timed
-    from unrender.training import loop
+    writer.RunWriter = Timed
+    from unrender.runs import loop
 
-    loop.Keeper = Timed
+    loop.RunWriter = Timed
     found: dict[str, Any] = {}
     for name, case in CASES.items():
         ways = {"50": 50, "default": None} if name in BOTH else {"50": 50}

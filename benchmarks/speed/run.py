@@ -27,9 +27,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import median_time, mitsuba_renderer, read, stock_loop, write
 
 import unrender as ur
-from unrender.keys import Key
+from unrender.core.random import Key
 from unrender.problem.bounds import project
-from unrender.rendering.port import Shot
+from unrender.rendering.renderer import SampleRequest
 
 HERE = Path(__file__).resolve().parent
 
@@ -64,10 +64,10 @@ def primal_costs(problem: ur.Problem, spp: int) -> dict[str, Any]:
     dr.eval(before)
     prb = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
     scene = renderer.pair.current
-    plain = median_time(lambda n: dr.eval(renderer.image(now, Shot(0, spp, n, 2)).images))
+    plain = median_time(lambda n: dr.eval(renderer.image(now, SampleRequest(0, spp, n, 2)).images))
 
     def pair(n: int) -> None:
-        found = renderer.image_pair(now, before, Shot(0, spp, n, 2), "path")
+        found = renderer.image_pair(now, before, SampleRequest(0, spp, n, 2), "path")
         dr.eval(found.images, found.previous)
 
     both = median_time(pair)

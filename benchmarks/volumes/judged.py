@@ -15,9 +15,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from races import TUNING_SEED, Entrant, search
 
 import unrender as ur
+from unrender.core.trees import Tree
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.schedules import Constant, Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Constant, Schedule
 
 UNIT = 0.01
 """The optimizers' own rate, which a schedule multiplies: where a problem gives a parameter a rate of its own, that scales it with the

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender import arrays
-from unrender.trees import Tree
+from unrender.core import arrays
+from unrender.core.trees import Tree
 
 EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 

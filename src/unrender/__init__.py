@@ -14,71 +14,85 @@ from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from unrender import variant as _variant
-from unrender.errors import InputError, UnrenderError, VariantError
-from unrender.variant import use
+from unrender.backend import variant as _variant
+from unrender.backend.variant import use
+from unrender.core.errors import InputError, UnrenderError, VariantError
 
 if TYPE_CHECKING:
-    from unrender import gallery, images, losses, optimizers, pixels, preconditioners, report, smoothed, statistics
-    from unrender import grey_box as grey_box
-    from unrender import metrics as metrics
-    from unrender.exporting.folder import export
-    from unrender.gradients.black_box import LossValues
-    from unrender.gradients.estimate import Estimate
-    from unrender.gradients.meta import MetaEstimator
-    from unrender.gradients.path import PathGradient
-    from unrender.gradients.smoothed import SmoothedDerivatives
-    from unrender.keys import Key
+    from unrender import (
+        gallery,
+        images,
+        losses,
+        optimizers,
+        pixels,
+        preconditioners,
+        report,
+        schedules,
+        statistics,
+    )
+    from unrender import (
+        smoothing as smoothed,
+    )
+    from unrender.core.random import Key
+    from unrender.estimators.base import Estimate
+    from unrender.estimators.loss_values import LossValues
+    from unrender.estimators.meta import MetaEstimator
+    from unrender.estimators.path import PathGradient
+    from unrender.estimators.smoothed import SmoothedDerivatives
+    from unrender.evaluation import metrics
+    from unrender.exporting.scene_folder import export
+    from unrender.io.volumes import Grid, read_grid, write_grid
     from unrender.problem.coarse_to_fine import CoarseToFine
-    from unrender.problem.grids import Grid, read_grid, write_grid
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
     from unrender.problem.render import render, render_pair
     from unrender.problem.view import View
-    from unrender.reopen import resume
-    from unrender.training.callbacks import Callback
-    from unrender.training.live import Live
-    from unrender.training.loop import estimate, optimize
-    from unrender.training.result import Result
-    from unrender.training.tensorboard import TensorBoard
+    from unrender.runs.callbacks import Callback
+    from unrender.runs.live import Live
+    from unrender.runs.loop import estimate, optimize
+    from unrender.runs.reopen import resume
+    from unrender.runs.result import Result
+    from unrender.runs.tensorboard import TensorBoard
+    from unrender.smoothing import grey_box as grey_box
 
-_MODULES = (
-    "gallery",
-    "grey_box",
-    "images",
-    "losses",
-    "metrics",
-    "optimizers",
-    "pixels",
-    "preconditioners",
-    "report",
-    "smoothed",
-    "statistics",
-)
+_MODULES = {
+    "gallery": "gallery",
+    "grey_box": "smoothing.grey_box",
+    "images": "images",
+    "losses": "losses",
+    "metrics": "evaluation.metrics",
+    "optimizers": "optimizers",
+    "pixels": "pixels",
+    "preconditioners": "preconditioners",
+    "report": "report",
+    "schedules": "schedules",
+    "smoothed": "smoothing",
+    "statistics": "statistics",
+}
 _HOMES = {
-    "Callback": "training.callbacks",
+    "Callback": "runs.callbacks",
     "CoarseToFine": "problem.coarse_to_fine",
-    "Estimate": "gradients.estimate",
-    "Grid": "problem.grids",
-    "Key": "keys",
-    "Live": "training.live",
-    "LossValues": "gradients.black_box",
-    "MetaEstimator": "gradients.meta",
+    "Estimate": "estimators.base",
+    "Grid": "io.volumes",
+    "Key": "core.random",
+    "Live": "runs.live",
+    "LossValues": "estimators.loss_values",
+    "MetaEstimator": "estimators.meta",
     "Parameter": "problem.parameter",
-    "PathGradient": "gradients.path",
+    "PathGradient": "estimators.path",
     "Problem": "problem.problem",
-    "Result": "training.result",
-    "SmoothedDerivatives": "gradients.smoothed",
-    "TensorBoard": "training.tensorboard",
+    "Result": "runs.result",
+    "SmoothedDerivatives": "estimators.smoothed",
+    "TensorBoard": "runs.tensorboard",
     "View": "problem.view",
-    "estimate": "training.loop",
-    "export": "exporting.folder",
-    "optimize": "training.loop",
-    "read_grid": "problem.grids",
+    "estimate": "runs.loop",
+    "export": "exporting.scene_folder",
+    "optimize": "runs.loop",
+    "read_grid": "io.volumes",
     "render": "problem.render",
     "render_pair": "problem.render",
-    "resume": "reopen",
-    "write_grid": "problem.grids",
+    "resume": "runs.reopen",
+    "write_grid": "io.volumes",
 }
 
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
@@ -119,6 +133,7 @@ __all__ = [
     "render_pair",
     "report",
     "resume",
+    "schedules",
     "smoothed",
     "statistics",
     "use",
@@ -130,7 +145,7 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES or name in _HOMES:
         _variant.prepare()
         if name in _MODULES:
-            return import_module(f"unrender.{name}")
+            return import_module(f"unrender.{_MODULES[name]}")
         value = getattr(import_module(f"unrender.{_HOMES[name]}"), name)
         globals()[name] = value
         return value

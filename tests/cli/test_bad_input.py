@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender import variant
-from unrender.errors import VariantError
+from unrender.backend import variant
+from unrender.core.errors import VariantError
 
 # Arguments, and what the line says. None of them reaches a renderer.
 MISTAKES = [

@@ -8,9 +8,9 @@ import math
 import pytest
 from rich.console import Console
 
-from unrender import variant
+from unrender.backend import variant
 from unrender.cli import doctor
-from unrender.errors import VariantError
+from unrender.core.errors import VariantError
 
 
 @pytest.fixture(autouse=True)

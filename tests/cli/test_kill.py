@@ -16,9 +16,9 @@ import pytest
 from victim import CASES
 
 import unrender as package
-from unrender.report import folder as report_folder
-from unrender.training import checkpoint
-from unrender.training.checkpoint import STATE
+from unrender.runs.folder import checkpoint
+from unrender.runs.folder import reader as report_folder
+from unrender.runs.folder.checkpoint import STATE
 
 SOURCE = str(Path(package.__file__).parents[1])
 ENVIRONMENT = {**os.environ, "PYTHONPATH": SOURCE}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from unrender import gallery
-from unrender.methods import METHODS
+from unrender.methods.catalogue import METHODS
 
 COMMANDS = ("run", "compare", "report", "gallery", "methods", "doctor")
 

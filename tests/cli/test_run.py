@@ -15,7 +15,7 @@ import pytest
 
 import unrender as package
 from unrender.cli import execute
-from unrender.training.pictures import pictures
+from unrender.runs.final_images import pictures
 
 KEY = "wall.bsdf.reflectance.value"
 FILES = ["checkpoints", "history.jsonl", "initial.npz", "method.toml", "parameters.npz", "pictures.npz", "problem.toml"]

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.rendering.numpy.linear import AnalyticRenderer
 
 SHAPE = (4, 4)
 
 
-def problem(loss: object = None, views: int = 1, noise: float = 0.5, carried: bool = True, seed: int = 0) -> ur.Problem:
+def problem(
+    loss: object = None, views: int = 1, noise: float = 0.5, shares_paths: bool = True, seed: int = 0
+) -> ur.Problem:
     """Two parameters, a vector and a matrix, seen in a few pixels through a random positive matrix; the truth is known."""
     rng = np.random.default_rng(seed)
     truth = {"colour": rng.uniform(0.3, 0.9, 3), "map": rng.uniform(0.3, 0.9, (2, 2, 1))}
     matrix = rng.uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 7))
-    renderer = AnalyticRenderer(truth, matrix, 0.1, noise, shape=SHAPE, sensors=views, carried=carried)
+    renderer = AnalyticRenderer(truth, matrix, 0.1, noise, shape=SHAPE, sensors=views, shares_paths=shares_paths)
     reference = renderer.exact(truth)
     return ur.Problem(
         renderer,

@@ -13,11 +13,11 @@ from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
+from unrender.core.random import Key
 from unrender.images.base import ImageEstimate
-from unrender.keys import Key
+from unrender.problem.batches import WholeView
 from unrender.problem.bounds import MARGIN
-from unrender.problem.frames import WholeView
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.rendering.numpy.linear import AnalyticRenderer
 
 Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate
@@ -261,12 +261,12 @@ def test_meta_refuses_what_makes_no_sense() -> None:
     with pytest.raises(ur.InputError, match=r'"variance".*does not provide'):
         ur.optimize(problem(), ur.PathGradient(), ur.optimizers.MetaAdam(), steps=1)
     with pytest.raises(ur.InputError, match='space="primary"'):
-        ur.optimize(problem(carried=False), ur.MetaEstimator(space="path"), ur.optimizers.MetaAdam(), steps=1)
+        ur.optimize(problem(shares_paths=False), ur.MetaEstimator(space="path"), ur.optimizers.MetaAdam(), steps=1)
 
 
 def test_meta_takes_the_space_that_its_parameters_allow() -> None:
-    for carried, space in ((True, "path"), (False, "primary")):
-        found = ur.estimate(problem(carried=carried), ur.MetaEstimator())
+    for shares_paths, space in ((True, "path"), (False, "primary")):
+        found = ur.estimate(problem(shares_paths=shares_paths), ur.MetaEstimator())
         assert found.info["space"] == dict.fromkeys(found.gradient, space)
 
 
@@ -430,7 +430,7 @@ def test_what_does_not_fit_is_refused() -> None:
         with pytest.raises(ur.InputError):
             ur.optimize(problem(), ur.PathGradient(), OPTIMIZERS["SGD"](), **bad)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ur.InputError, match='space="primary"'):
-        ur.optimize(problem(carried=False), ur.PathGradient(CV()), OPTIMIZERS["SGD"](), steps=1)
+        ur.optimize(problem(shares_paths=False), ur.PathGradient(CV()), OPTIMIZERS["SGD"](), steps=1)
     for spp in (0, -4, 1.5, True):
         with pytest.raises(ur.InputError, match="spp"):
             ur.PathGradient(spp=spp)  # pyright: ignore[reportArgumentType]

@@ -12,13 +12,13 @@ from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
-from unrender.keys import Key
-from unrender.pixels import cells as cells_module
-from unrender.pixels import moments, refreshed
-from unrender.pixels.cells import Cells, Grid, Table, cut
-from unrender.problem.frames import Draw, PixelBatch, WholeView
+from unrender.core.random import Key
+from unrender.pixels import guided, pixel_statistics
+from unrender.pixels import tiles as cells_module
+from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
+from unrender.problem.batches import PixelBatch, PixelSample, WholeView
 from unrender.problem.references import References
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.rendering.numpy.linear import AnalyticRenderer
 
 SCHEMES: dict[str, Any] = {
     "uniform": ur.pixels.Uniform,
@@ -27,7 +27,7 @@ SCHEMES: dict[str, Any] = {
 }
 
 
-def two_views(shapes: list[tuple[int, int]], most: int) -> Cells:
+def two_views(shapes: list[tuple[int, int]], most: int) -> Tiles:
     return cells_module._cut(tuple(shapes), most)
 
 
@@ -84,7 +84,7 @@ def test_coarse_means_count_pixels_and_not_cells() -> None:
 # ---------------------------------------------------------------- tables
 
 
-def run_lengths(table: Table) -> np.ndarray:
+def run_lengths(table: InverseCdfTable) -> np.ndarray:
     return np.diff([*np.asarray(table.starts, np.int64), 1 << 32])
 
 
@@ -92,7 +92,7 @@ def test_a_table_never_forgets_a_cell_and_tells_its_exact_probability() -> None:
     found = two_views([(6, 6)], 36)
     probabilities = np.full(36, 1e-14)
     probabilities[20] = 1.0
-    table = Table.of(found, probabilities, array)
+    table = InverseCdfTable.of(found, probabilities, array)
     runs = run_lengths(table)
     assert runs.min() >= 1
     assert runs.sum() == 1 << 32
@@ -104,7 +104,7 @@ def test_draws_follow_the_table(stratified: bool) -> None:
     found = two_views([(5, 7), (3, 4)], 20)
     rng = np.random.default_rng(1)
     probabilities = rng.random(len(found.views)) * found.sizes
-    table = Table.of(found, probabilities, array)
+    table = InverseCdfTable.of(found, probabilities, array)
     counts: Counter[tuple[int, int]] = Counter()
     total = 0
     for seed in range(400):
@@ -129,7 +129,7 @@ def test_weighted_sums_over_draws_are_unbiased_and_stratified_ones_quieter() -> 
     found = two_views([(6, 6)], 36)
     rng = np.random.default_rng(2)
     values, probabilities = rng.random(36), rng.random(36) + 0.1
-    table = Table.of(found, probabilities, array)
+    table = InverseCdfTable.of(found, probabilities, array)
     spread = []
     for stratified in (True, False):
         sums = []
@@ -149,12 +149,12 @@ def test_the_device_draws_as_numpy_does() -> None:
 
     found = two_views([(30, 40), (10, 10)], 200)
     probabilities = np.random.default_rng(3).random(len(found.views)) + 0.1
-    on_host = Table.of(found, probabilities, array)
+    on_host = InverseCdfTable.of(found, probabilities, array)
 
     def on_device(values: np.ndarray) -> Any:
         return mi.TensorXf(mi.Float(np.float32(values).ravel()) + 0, values.shape)
 
-    table = Table.of(found, probabilities, on_device)
+    table = InverseCdfTable.of(found, probabilities, on_device)
     np.testing.assert_array_equal(table.starts.numpy(), on_host.starts)
     np.testing.assert_allclose(table.weights.numpy(), on_host.weights, rtol=1e-6)
     for stratified in (True, False):
@@ -197,7 +197,9 @@ def test_a_batch_of_all_pixels_is_the_whole_problem() -> None:
     assert isinstance(renderer, AnalyticRenderer)
     image = renderer.exact(asked.initial())
     flat = np.concatenate([image.reshape(-1, 3)] * 2)
-    draw = Draw(np.repeat([0, 1], 16).astype(np.uint32), np.tile(np.arange(16), 2).astype(np.uint32), np.ones((32, 1)))
+    draw = PixelSample(
+        np.repeat([0, 1], 16).astype(np.uint32), np.tile(np.arange(16), 2).astype(np.uint32), np.ones((32, 1))
+    )
     batch = PixelBatch(asked, draw)
     views = [WholeView(asked, 0), WholeView(asked, 1)]
     assert batch.loss_value(flat) == pytest.approx(sum(view.loss_value(image) for view in views))
@@ -222,7 +224,7 @@ def exact_density(asked: ur.Problem, spp: int = 1) -> tuple[np.ndarray, np.ndarr
 
 
 def test_adaptive_probabilities_are_those_of_equation_12(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(moments, "ROUNDS", 4000)
+    monkeypatch.setattr(pixel_statistics, "ROUNDS", 4000)
     asked = problem(views=1, noise=0.8)
     scheme = ur.pixels.Adaptive(16, levels=0, samples=16 * 4000, uniform=1e-6, denoiser="none")
     parameters = asked.initial()
@@ -283,7 +285,7 @@ def test_maps_are_cleaned_side_by_side_and_come_back_in_their_places(count: int)
         seen.append(picture.shape)
         return picture
 
-    np.testing.assert_allclose(refreshed._together(maps, clean), maps)
+    np.testing.assert_allclose(guided._together(maps, clean), maps)
     assert len(seen) == 1
 
 
@@ -333,9 +335,11 @@ def test_refreshes_count_alike_whatever_the_size_of_what_they_saw() -> None:
     scheme = ur.pixels.Adaptive(16, refresh=1, samples=64, denoiser="none")
     at = asked.initial()
     found = []
-    for energy in (1.0, 1e-6):
+    for second_moment in (1.0, 1e-6):
         _, state = scheme.draw(asked, at, scheme.init(asked, at), Key(0))
-        state = dataclasses.replace(state, energy={k: np.full(np.shape(v), energy) for k, v in at.items()})
+        state = dataclasses.replace(
+            state, second_moment={k: np.full(np.shape(v), second_moment) for k, v in at.items()}
+        )
         found.append(scheme.draw(asked, at, state, Key(1))[0].probability[0])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
 
@@ -355,25 +359,27 @@ def test_tangents_go_through_preconditioners() -> None:
     looks = []
     for one in (asked, eased):
         whole = cut(one, 16)
-        spots = Table.of(whole, whole.sizes, one.renderer.array)
-        seen = moments.look(one, one.initial(), whole, spots, 4, Key(0), [], moments.scales(one.initial(), {}))
+        uniform_table = InverseCdfTable.of(whole, whole.sizes, one.renderer.array)
+        seen = pixel_statistics.estimate_statistics(
+            one, one.initial(), whole, uniform_table, 4, Key(0), [], pixel_statistics.scales(one.initial(), {})
+        )
         looks.append(seen.moments)
     np.testing.assert_allclose(looks[1], looks[0] * 0.25)
 
 
 def test_relative_variances_are_not_ruled_by_one_bright_element() -> None:
     """Elements of four times the energy weigh half, whatever a single path brought another element; one never met stays finite."""
-    energy = np.concatenate([np.full(500, 1.0), np.full(498, 4.0), [1e9, 0.0]])
-    scales = moments.scales({"a": energy}, {"a": energy})["a"]
+    second_moment = np.concatenate([np.full(500, 1.0), np.full(498, 4.0), [1e9, 0.0]])
+    scales = pixel_statistics.scales({"a": second_moment}, {"a": second_moment})["a"]
     assert scales[0] / scales[500] == pytest.approx(2.0, rel=0.1)
     assert scales[0] / scales[-2] == pytest.approx(np.sqrt(1e9), rel=0.1)
     assert scales[0] < scales[-1] < 5 * scales[0]
 
 
 def test_a_parameter_of_few_elements_counts_as_much_as_one_of_many() -> None:
-    energy = {"colour": np.full(3, 0.2), "texture": np.full((20, 20, 3), 7.0)}
-    scales = moments.scales(energy, energy)
-    shares = {name: float(np.sum(scales[name] ** 2 * energy[name])) for name in energy}
+    second_moment = {"colour": np.full(3, 0.2), "texture": np.full((20, 20, 3), 7.0)}
+    scales = pixel_statistics.scales(second_moment, second_moment)
+    shares = {name: float(np.sum(scales[name] ** 2 * second_moment[name])) for name in second_moment}
     assert shares["colour"] == pytest.approx(shares["texture"], rel=1e-6)
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
 
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 STEP = 4e-3
 
@@ -27,12 +27,12 @@ def total(image: Any, weight: np.ndarray) -> float:
 
 
 def derivative_on_the_same_paths(
-    renderer: MitsubaRenderer, current: dict[str, Any], key: str, shot: Shot, weight: np.ndarray
+    renderer: MitsubaRenderer, current: dict[str, Any], key: str, request: SampleRequest, weight: np.ndarray
 ) -> float:
     """d/ds of sum(weight * image) for the parameter `key` at (1 + s) times its value, at s = 0."""
     values = []
     for side in (1 + STEP, 1 - STEP):
-        pair = renderer.image_pair(current, {**current, key: current[key] * side}, shot, "path")
+        pair = renderer.image_pair(current, {**current, key: current[key] * side}, request, "path")
         assert pair.previous is not None
         values.append(total(pair.previous[0], weight))
     return (values[0] - values[1]) / (2 * STEP)
@@ -44,12 +44,12 @@ def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths(name: str) -> N
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, _ = two_states(renderer, {**changes, **LIGHTS})
     renderer.select(list(current), "path")
-    shot = Shot(0, 64, 7)
+    request = SampleRequest(0, 64, 7)
     weight = np.random.default_rng(2).uniform(0.5, 1.5, (SIZE, SIZE, 3))
-    paths = renderer.image(current, shot).paths
+    paths = renderer.image(current, request).paths
     gradient = renderer.adjoint(current, paths, renderer.array(weight[None]))
     for key in current:
-        expected = derivative_on_the_same_paths(renderer, current, key, shot, weight)
+        expected = derivative_on_the_same_paths(renderer, current, key, request, weight)
         found = float((np.array(gradient[key]).astype(np.float64) * np.array(current[key])).sum())
         assert expected != 0
         assert found == pytest.approx(expected, rel=0.02), key
@@ -62,7 +62,7 @@ def test_halves_are_weighted_each_by_its_own() -> None:
     renderer.select([key], None)
     current = renderer.values([key])
     one, none = np.ones((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))
-    paths = renderer.image(current, Shot(0, 8, 3, 2)).paths
+    paths = renderer.image(current, SampleRequest(0, 8, 3, 2)).paths
     halves = [
         np.array(renderer.adjoint(current, paths, renderer.array(np.stack(w)))[key]) for w in ((one, none), (none, one))
     ]
@@ -78,9 +78,9 @@ def test_repeating_repeats_the_image_to_the_bit_and_the_gradient_to_rounding() -
     renderer.select([key], None)
     current = renderer.values([key])
     weight = renderer.array(np.ones((1, SIZE, SIZE, 3)))
-    shots = [renderer.image(current, Shot(0, 4, 9)) for _ in range(3)]
-    images = [np.array(shot.images[0]) for shot in shots]
-    gradients = [np.array(renderer.adjoint(current, shot.paths, weight)[key]) for shot in shots]
+    requests = [renderer.image(current, SampleRequest(0, 4, 9)) for _ in range(3)]
+    images = [np.array(request.images[0]) for request in requests]
+    gradients = [np.array(renderer.adjoint(current, request.paths, weight)[key]) for request in requests]
     for image, gradient in zip(images[1:], gradients[1:], strict=True):
         assert np.array_equal(images[0], image)
         np.testing.assert_allclose(gradient, gradients[0], rtol=1e-4, atol=1e-5 * np.abs(gradients[0]).max())
@@ -97,7 +97,7 @@ def test_gradients_agree_with_mitsuba_prb() -> None:
     weight = renderer.array(np.full((1, SIZE, SIZE, 3), 1 / SIZE**2))
     ours = np.stack(
         [
-            np.array(renderer.adjoint(current, renderer.image(current, Shot(0, 64, s)).paths, weight)[key])
+            np.array(renderer.adjoint(current, renderer.image(current, SampleRequest(0, 64, s)).paths, weight)[key])
             for s in range(12)
         ]
     )

@@ -13,8 +13,8 @@ import pytest
 from test_adjoint import STEP, total
 from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
 
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 
 def close(a: Any, b: Any, rel: float) -> bool:
@@ -28,19 +28,19 @@ def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shar
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
     renderer.select(list(current), "path")
-    shot = Shot(0, 64, 7)
+    request = SampleRequest(0, 64, 7)
     rng = np.random.default_rng(2)
     weight, weight_previous = rng.uniform(0.5, 1.5, (2, SIZE, SIZE, 3))
-    pair = renderer.image_pair(current, previous, shot, "path")
+    pair = renderer.image_pair(current, previous, request, "path")
     arrays = renderer.array(weight[None]), renderer.array(weight_previous[None])
     gradient, gradient_previous = renderer.adjoint_pair(current, previous, pair.paths, *arrays)
-    alone = renderer.adjoint(current, renderer.image(current, shot).paths, arrays[0])
+    alone = renderer.adjoint(current, renderer.image(current, request).paths, arrays[0])
     for key in current:
         assert close(gradient[key], alone[key], 1e-3), key
         sides = []
         for side in (1 + STEP, 1 - STEP):
             moved = {**previous, key: previous[key] * side}
-            image = renderer.image_pair(current, moved, shot, "path").previous
+            image = renderer.image_pair(current, moved, request, "path").previous
             assert image is not None
             sides.append(total(image[0], weight_previous))
         expected = (sides[0] - sides[1]) / (2 * STEP)
@@ -56,7 +56,7 @@ def test_equal_states_have_equal_gradients() -> None:
     renderer.select(list(current), "path")
     weight = renderer.array(np.random.default_rng(3).uniform(0.5, 1.5, (2, SIZE, SIZE, 3)))
     for space in ("path", "primary"):
-        pair = renderer.image_pair(current, current, Shot(0, 4, 7, groups=2), space)
+        pair = renderer.image_pair(current, current, SampleRequest(0, 4, 7, groups=2), space)
         a, b = renderer.adjoint_pair(current, current, pair.paths, weight, weight)
         assert all(close(a[key], b[key], 1e-4) for key in current), space
 
@@ -69,10 +69,10 @@ def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
     current, previous = two_states(renderer, {**changes, **LIGHTS})
     renderer.select(list(current), "primary")
     weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, SIZE, SIZE, 3)))
-    shot = Shot(0, 8, 5, groups=2)
-    pair = renderer.image_pair(current, previous, shot, "primary")
+    request = SampleRequest(0, 8, 5, groups=2)
+    pair = renderer.image_pair(current, previous, request, "primary")
     _, found = renderer.adjoint_pair(current, previous, pair.paths, weight, weight)
-    alone = renderer.adjoint(previous, renderer.image(previous, shot).paths, weight)
+    alone = renderer.adjoint(previous, renderer.image(previous, request).paths, weight)
     for key in current:
         assert np.abs(np.array(alone[key])).max() > 0
         assert close(found[key], alone[key], 2e-3), key
@@ -91,9 +91,9 @@ def test_in_path_space_the_mean_is_the_previous_scene_s_own() -> None:
 
     shared, own = [], []
     for seed in range(64):
-        pair = renderer.image_pair(current, previous, Shot(0, 16, 2 * seed), "path")
+        pair = renderer.image_pair(current, previous, SampleRequest(0, 16, 2 * seed), "path")
         shared.append(means(renderer.adjoint_pair(current, previous, pair.paths, weight, weight)[1]))
-        paths = renderer.image(previous, Shot(0, 16, 2 * seed + 1)).paths
+        paths = renderer.image(previous, SampleRequest(0, 16, 2 * seed + 1)).paths
         own.append(means(renderer.adjoint(previous, paths, weight)))
     a, b = np.array(shared), np.array(own)
     error = np.sqrt(a.var(0, ddof=1) / len(a) + b.var(0, ddof=1) / len(b))

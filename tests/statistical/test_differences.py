@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import arrays, trees
-from unrender.gradients.gather import gather
-from unrender.images.base import Beside
+from unrender.core import arrays, trees
+from unrender.core.random import Key
+from unrender.estimators.sample_groups import gather
+from unrender.images.base import PairRequest
 from unrender.images.plain import PlainState
-from unrender.keys import Key
 
 STEPS = (0.1, 0.03, 0.01)
 
@@ -27,8 +27,8 @@ def slope(problem: ur.Problem, space: Any, runs: int = 24) -> float:
         previous = {key: x + (truth[key] - x) * arrays.scalar(step, x) for key, x in start.items()}
         rows = []
         for run in range(runs):
-            beside = Beside(previous, space)
-            both = gather(problem, start, ur.images.Plain(), PlainState(), 2, Key(1, run), beside=beside)
+            pair_request = PairRequest(previous, space)
+            both = gather(problem, start, ur.images.Plain(), PlainState(), 2, Key(1, run), pair_request=pair_request)
             assert both.previous is not None
             difference = trees.numpy(trees.subtract(both.gradient, both.previous))
             rows.append(np.concatenate([x.ravel() for x in difference.values()]))

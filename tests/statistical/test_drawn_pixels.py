@@ -14,9 +14,9 @@ from zoo import scene
 from zscores import z_scores
 
 import unrender as ur
-from unrender.keys import Key
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.core.random import Key
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 RUNS, COUNT = 2000, 48
 SCHEMES: dict[str, Any] = {
@@ -97,14 +97,18 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
     rng = np.random.default_rng(1)
     sensors = rng.integers(0, 2, 60)
     pixels = np.array([rng.integers(0, sizes[s][0] * sizes[s][1]) for s in sensors])
-    from unrender import arrays
+    from unrender.core import arrays
 
     like = renderer.array(np.zeros(1))
     chosen = arrays.like_integers(pixels, like), arrays.like_integers(sensors, like)
-    drawn = np.array([np.array(renderer.image(at, Shot(0, 64, seed, 1, *chosen)).images)[0] for seed in range(30)])
+    drawn = np.array(
+        [np.array(renderer.image(at, SampleRequest(0, 64, seed, 1, *chosen)).images)[0] for seed in range(30)]
+    )
     apart = np.zeros_like(drawn)
     for sensor in (0, 1):
-        film = np.array([np.array(renderer.image(at, Shot(sensor, 64, 100 + seed)).images)[0] for seed in range(30)])
+        film = np.array(
+            [np.array(renderer.image(at, SampleRequest(sensor, 64, 100 + seed)).images)[0] for seed in range(30)]
+        )
         here = sensors == sensor
         apart[:, here] = film.reshape(30, -1, 3)[:, pixels[here]]
     z = np.abs(z_scores(drawn, apart))

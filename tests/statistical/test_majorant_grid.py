@@ -15,9 +15,9 @@ from test_volume_gradients import limit, own, scores
 from test_volume_pair import changed, runs, volpath
 from zscores import agree
 
-from unrender.rendering import majorant_grid
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.integrators import majorant_grid
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 RUNS, SPP = 24, 64
 VOXELS = 20
@@ -51,11 +51,11 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
     renderer = MitsubaRenderer(several(), DEPTH)
     assert renderer.pair.majorants(previous=False, both=False)
     expected = volpath(renderer)
-    verdict, figures = agree(runs(renderer.image({}, Shot(0, RUNS * SPP, 1, RUNS)).images), expected)
+    verdict, figures = agree(runs(renderer.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
     assert verdict, figures
     monkeypatch.setattr(majorant_grid, "_MARGIN", 0.5)
     wrong = MitsubaRenderer(several(), DEPTH)
-    verdict, figures = agree(runs(wrong.image({}, Shot(0, RUNS * SPP, 1, RUNS)).images), expected)
+    verdict, figures = agree(runs(wrong.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
     assert not verdict, f"majorants of half the extinction went unseen: {figures}"
 
 
@@ -64,9 +64,9 @@ def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
     keys = media_keys(renderer)
     renderer.select(keys, "path")
     current, previous = changed(renderer, keys)
-    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, Shot(0, RUNS * SPP, seed, RUNS))
+        alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
         verdict, figures = agree(runs(images), runs(alone.images))
         assert verdict, figures
         verdict, figures = agree(1.03 * runs(images), runs(alone.images))
@@ -81,9 +81,11 @@ def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
     half = np.arange(VOXELS) < VOXELS // 2
     states = [{key: renderer.array(full * half[:, None, None, None])}, {key: renderer.array(full)}]
     for current, previous in (states, states[::-1]):
-        pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+        pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
         for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-            verdict, figures = agree(runs(images), runs(renderer.image(state, Shot(0, RUNS * SPP, seed, RUNS)).images))
+            verdict, figures = agree(
+                runs(images), runs(renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS)).images)
+            )
             assert verdict, figures
 
 
@@ -112,7 +114,7 @@ def test_gradients_are_those_of_one_majorant(monkeypatch: pytest.MonkeyPatch) ->
         parts = [values == 0, (values > 0) & (values < 3), values >= 3]
         rows = []
         for seed in range(24):
-            paths = renderer.image_pair(current, previous, Shot(0, 32, seed + fine), "path").paths
+            paths = renderer.image_pair(current, previous, SampleRequest(0, 32, seed + fine), "path").paths
             both = renderer.adjoint_pair(current, previous, paths, renderer.array(weight), renderer.array(weight))
             gradients = [np.array(gradient[keys[0]]).astype(np.float64).sum(axis=-1) for gradient in both]
             rows.append([float(gradient[part].sum()) for gradient in gradients for part in parts])

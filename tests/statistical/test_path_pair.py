@@ -13,8 +13,8 @@ import pytest
 from zoo import DEPTH, LIGHTS, MATERIALS, everything, scene, texture, two_states
 from zscores import agree
 
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 RUNS, SPP = 32, 16
 
@@ -29,10 +29,10 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
     renderer.select(list(current), "path")
-    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, Shot(0, RUNS * SPP, seed, RUNS))
+        alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
         verdict, figures = agree(runs(images), runs(alone.images))
         assert verdict, figures
 
@@ -41,7 +41,7 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
 def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
     renderer = MitsubaRenderer(scene(MATERIALS[name][0]()), DEPTH)
     renderer.select(["floor.bsdf.reflectance.data"], None)
-    ours = renderer.image(renderer.values(["floor.bsdf.reflectance.data"]), Shot(0, RUNS * SPP, 1, RUNS))
+    ours = renderer.image(renderer.values(["floor.bsdf.reflectance.data"]), SampleRequest(0, RUNS * SPP, 1, RUNS))
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
     theirs = [
         np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)
@@ -56,10 +56,10 @@ def test_a_planted_bias_of_one_percent_is_seen() -> None:
     current, previous = two_states(renderer, changes)
     renderer.select(list(current), "path")
     count, spp = 64, 64
-    pair = renderer.image_pair(current, previous, Shot(0, count * spp, 1, count), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, count * spp, 1, count), "path")
     assert pair.previous is not None
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = runs(renderer.image(state, Shot(0, count * spp, seed, count)).images)
+        alone = runs(renderer.image(state, SampleRequest(0, count * spp, seed, count)).images)
         verdict, figures = agree(runs(images), alone)
         assert verdict, figures
         verdict, figures = agree(runs(images) * 1.01, alone)
@@ -79,9 +79,9 @@ def test_mesh_attributes_are_read_from_the_shape_of_their_state() -> None:
     renderer = MitsubaRenderer(description, DEPTH)
     current, previous = two_states(renderer, {"vertex_color": 0.8, **LIGHTS})
     renderer.select(list(current), "path")
-    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
-    alone = renderer.image(previous, Shot(0, RUNS * SPP, 3, RUNS))
+    alone = renderer.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
     verdict, figures = agree(runs(pair.previous), runs(alone.images))
     assert verdict, figures
 
@@ -93,9 +93,9 @@ def test_light_that_is_black_now_but_was_not_before_is_not_lost() -> None:
     renderer.select(keys, "path")
     previous = renderer.values(keys)
     current = {key: value * 0.0 for key, value in previous.items()}
-    pair = renderer.image_pair(current, previous, Shot(0, RUNS * SPP, 1, RUNS), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
     assert all(float(np.abs(image).max()) == 0 for image in runs(pair.images))
-    alone = renderer.image(previous, Shot(0, RUNS * SPP, 3, RUNS))
+    alone = renderer.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
     verdict, figures = agree(runs(pair.previous), runs(alone.images))
     assert verdict, figures

@@ -13,8 +13,8 @@ import pytest
 from zscores import agree
 
 import unrender as ur
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 RUNS, SPP, DEPTH = 24, 32, 5
 TURN = np.array([0.3, 0.5, -0.2])
@@ -57,7 +57,7 @@ def ours(parameters: dict[str, Any], keys: list[str] | None = None) -> np.ndarra
     renderer = MitsubaRenderer(scene, DEPTH)
     renderer.select(keys or list(parameters), None, derivatives=False)
     stacked = {key: np.asarray(value, np.float64)[None] for key, value in parameters.items()}
-    return np.stack([renderer.image_batch(stacked, Shot(0, SPP, run)).numpy()[0] for run in range(RUNS)])
+    return np.stack([renderer.image_batch(stacked, SampleRequest(0, SPP, run)).numpy()[0] for run in range(RUNS)])
 
 
 def test_posed_shapes_look_as_if_they_had_been_moved() -> None:
@@ -94,7 +94,7 @@ def test_a_pose_beside_other_parameters() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
     renderer.select(["ball.translation", key], None, derivatives=False)
     states = {"ball.translation": np.array([[0, 0, 0], [0, -0.5, 0.0]]), key: np.array([0.1, 0.5])}
-    both = [renderer.image_batch(states, Shot(0, SPP, run)).numpy() for run in range(RUNS)]
+    both = [renderer.image_batch(states, SampleRequest(0, SPP, run)).numpy() for run in range(RUNS)]
     for index, (place, alpha) in enumerate((((-0.45, 0.3, 0.2), 0.1), ((-0.45, -0.2, 0.2), 0.5))):
         described = scene(ball=place)
         described["block"]["bsdf"]["alpha_u"] = alpha
@@ -106,14 +106,16 @@ def test_all_states_of_a_batch_share_their_random_numbers() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
     renderer.select(["block.rotation.y"], None, derivatives=False)
     turns = np.array([0.0, 0.7, 0.0, 0.7, 0.0])
-    batch = renderer.image_batch({"block.rotation.y": turns}, Shot(0, 2, 5)).numpy()
+    batch = renderer.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 5)).numpy()
     assert np.array_equal(batch[0], batch[2])
     assert np.array_equal(batch[1], batch[3])
     assert not np.array_equal(batch[0], batch[1])
-    alone = renderer.image_batch({"block.rotation.y": turns[1:2]}, Shot(0, 2, 5)).numpy()
+    alone = renderer.image_batch({"block.rotation.y": turns[1:2]}, SampleRequest(0, 2, 5)).numpy()
     assert np.array_equal(batch[1], alone[0])
-    assert np.array_equal(batch[1], renderer.image({"block.rotation.y": mi.TensorXf(0.7)}, Shot(0, 2, 5)).images[0])
-    assert not np.array_equal(batch, renderer.image_batch({"block.rotation.y": turns}, Shot(0, 2, 6)).numpy())
+    assert np.array_equal(
+        batch[1], renderer.image({"block.rotation.y": mi.TensorXf(0.7)}, SampleRequest(0, 2, 5)).images[0]
+    )
+    assert not np.array_equal(batch, renderer.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 6)).numpy())
 
 
 def test_what_poses_refuse() -> None:

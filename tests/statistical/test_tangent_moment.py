@@ -13,8 +13,8 @@ from scipy import stats
 from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
 
 import unrender as ur
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 STEP = 4e-3
 
@@ -26,14 +26,14 @@ def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, _ = two_states(renderer, {**changes, **LIGHTS})
     renderer.select(list(current), "path")
-    shot = Shot(0, 1, 11)
+    request = SampleRequest(0, 1, 11)
     sides = []
     for scale in (1 + STEP, 1 - STEP):
-        pair = renderer.image_pair(current, {key: x * scale for key, x in current.items()}, shot, "path")
+        pair = renderer.image_pair(current, {key: x * scale for key, x in current.items()}, request, "path")
         assert pair.previous is not None
         sides.append(np.array(pair.previous[0]).astype(np.float64))
     expected = ((sides[0] - sides[1]) / (2 * STEP)) ** 2
-    found = np.array(renderer.tangent_moment(current, renderer.image(current, shot).paths, current))
+    found = np.array(renderer.tangent_moment(current, renderer.image(current, request).paths, current))
     assert found.shape == (SIZE, SIZE, 3)
     assert expected.sum() > 0
     close = np.abs(found - expected) < 0.05 * expected + 1e-3 * expected.mean()
@@ -63,7 +63,7 @@ def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
 def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     """On the same paths: the mean over sign patterns against one pass per parameter, per block of pixels and channel."""
     renderer, values = twelve()
-    paths = renderer.image(values, Shot(0, 16, 3)).paths
+    paths = renderer.image(values, SampleRequest(0, 16, 3)).paths
 
     def blocks(moment: Any) -> np.ndarray:
         return np.array(moment).astype(np.float64).reshape(6, SIZE // 6, 6, SIZE // 6, 3).mean(axis=(1, 3))
@@ -100,7 +100,7 @@ def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str)
     renderer.select(list(values), None)
     rng = np.random.default_rng(0)
     tangents = {key: rng.normal(size=x.shape) * np.array(x) for key, x in values.items()}
-    paths = renderer.image(values, Shot(0, 1, 7)).paths
+    paths = renderer.image(values, SampleRequest(0, 1, 7)).paths
     found = np.array(renderer.tangent_moment(values, paths, {k: renderer.array(x) for k, x in tangents.items()}))
     expected = np.zeros_like(found)
     for place in np.ndindex(found.shape):
@@ -118,12 +118,12 @@ def test_gradients_after_a_tangent_pass_are_what_they_were() -> None:
     other, others = twelve()
 
     def gradients(asked: MitsubaRenderer, at: dict[str, Any]) -> np.ndarray:
-        rendering = asked.image_pair(at, at, Shot(0, 4, 5), "path")
+        rendering = asked.image_pair(at, at, SampleRequest(0, 4, 5), "path")
         found = asked.adjoint_pair(at, at, rendering.paths, rendering.images, rendering.images)
         return np.stack([np.concatenate([np.array(g) for g in tree.values()]) for tree in found])
 
     before = gradients(renderer, values), gradients(other, others)
-    renderer.tangent_moment(values, renderer.image(values, Shot(0, 4, 6)).paths, values)
+    renderer.tangent_moment(values, renderer.image(values, SampleRequest(0, 4, 6)).paths, values)
     after = gradients(renderer, values), gradients(other, others)
     assert np.abs(np.array(before)).min() > 0
     np.testing.assert_allclose(np.array(after), np.array(before), rtol=1e-5)

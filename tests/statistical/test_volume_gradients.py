@@ -18,9 +18,9 @@ import pytest
 from fog import DARK, DEPTH, KIND, LEVELS, SIZE, cloud, fog, media_keys, scene, two_media, voxels
 from scipy import stats
 
-from unrender.rendering import tracking
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.integrators import tracking
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 SPP = 64
 WEIGHT = np.random.default_rng(2).uniform(0.2, 1.8, (1, SIZE, SIZE, 3))
@@ -63,7 +63,7 @@ def derivative(renderer: MitsubaRenderer, current: dict[str, Any], way: Directio
 
     def difference(high: float, low: float, seed: int) -> float:
         above, below = ({**current, way.key: renderer.array(value + s * way.step * way.along)} for s in (high, low))
-        pair = renderer.image_pair(above, below, Shot(0, 4 * SPP, seed), "path")
+        pair = renderer.image_pair(above, below, SampleRequest(0, 4 * SPP, seed), "path")
         change = np.array(pair.images).astype(np.float64) - np.array(pair.previous)
         return float((change * WEIGHT).sum()) / (way.step * (high - low))
 
@@ -107,7 +107,7 @@ def own(renderer: MitsubaRenderer) -> Callable[[int], dict[str, Any]]:
     renderer.select(keys, "path")
     current = renderer.values(keys)
     weight = renderer.array(WEIGHT)
-    return lambda seed: renderer.adjoint(current, renderer.image(current, Shot(0, SPP, seed)).paths, weight)
+    return lambda seed: renderer.adjoint(current, renderer.image(current, SampleRequest(0, SPP, seed)).paths, weight)
 
 
 SCENES: dict[str, Callable[[], dict[str, Any]]] = {
@@ -154,7 +154,7 @@ def test_the_variance_of_a_difference_of_gradients_falls_with_the_square_of_the_
         previous = {key: renderer.array(np.array(value) * (1 - step)) for key, value in current.items()}
         rows = []
         for seed in range(16):
-            paths = renderer.image_pair(current, previous, Shot(0, 16, seed), "path").paths
+            paths = renderer.image_pair(current, previous, SampleRequest(0, 16, seed), "path").paths
             a, b = renderer.adjoint_pair(current, previous, paths, weight, weight)
             rows.append(np.concatenate([(np.array(a[key]) - np.array(b[key])).ravel() for key in keys]))
         variances.append(np.var(rows, axis=0, ddof=1).sum())
@@ -174,9 +174,11 @@ def test_the_previous_state_s_gradient_is_its_own() -> None:
 
     shared, own = [], []
     for seed in range(32):
-        paths = renderer.image_pair(current, previous, Shot(0, 32, 2 * seed), "path").paths
+        paths = renderer.image_pair(current, previous, SampleRequest(0, 32, 2 * seed), "path").paths
         shared.append(sums(renderer.adjoint_pair(current, previous, paths, weight, weight)[1]))
-        own.append(sums(renderer.adjoint(previous, renderer.image(previous, Shot(0, 32, 2 * seed + 1)).paths, weight)))
+        own.append(
+            sums(renderer.adjoint(previous, renderer.image(previous, SampleRequest(0, 32, 2 * seed + 1)).paths, weight))
+        )
     a, b = np.array(shared), np.array(own)
     error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 32)
     assert (np.abs(a.mean(0) - b.mean(0)) < 4 * error).all()

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 SIZE = 24
 DEPTH = 5

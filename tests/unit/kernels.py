@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender import arrays
+from unrender.core import arrays
 
 
 def on_device(x: Any) -> mi.TensorXf:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from unrender.rendering.analytic import AnalyticRenderer
-from unrender.rendering.port import ParameterInfo, Rendering, Shot, Space
-from unrender.trees import Tree
+from unrender.core.trees import Tree
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
 KEY = "field"
 
@@ -86,15 +86,15 @@ class FieldRenderer:
     def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
         self.at(self.field.shape).select(keys, space, derivatives)
 
-    def image(self, parameters: Tree, shot: Shot) -> Rendering:
-        return self.at(parameters[KEY].shape).image(parameters, shot)
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        return self.at(parameters[KEY].shape).image(parameters, request)
 
-    def image_batch(self, parameters: Tree, shot: Shot) -> np.ndarray:
-        return self.at(parameters[KEY].shape[1:]).image_batch(parameters, shot)
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        return self.at(parameters[KEY].shape[1:]).image_batch(parameters, request)
 
-    def image_pair(self, current: Tree, previous: Tree, shot: Shot, space: Space) -> Rendering:
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         assert current[KEY].shape == previous[KEY].shape
-        return self.at(current[KEY].shape).image_pair(current, previous, shot, space)
+        return self.at(current[KEY].shape).image_pair(current, previous, request, space)
 
     def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
         return self.at(parameters[KEY].shape).adjoint(parameters, paths, weights)

@@ -15,12 +15,12 @@ import scipy.sparse.linalg
 from resizable import KEY, FieldRenderer, upsampled
 
 import unrender as ur
-from unrender import arrays
-from unrender.errors import InputError
-from unrender.gradients.meta import MetaState
-from unrender.problem.grids import write_grid
-from unrender.problem.resampling import downsample, resize, upsample
-from unrender.training import loop, refining
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.estimators.meta import MetaState
+from unrender.io.resampling import downsample, resize, upsample
+from unrender.io.volumes import write_grid
+from unrender.runs import loop, multiresolution
 
 TRUTH = np.random.default_rng(2).uniform(0.2, 0.8, (16, 12, 1))
 rcv = ur.images.RecursiveControlVariate
@@ -147,9 +147,9 @@ def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any
     for _ in range(steps):
         loop._step(run, memory)
     before = dict(run.parameters), loop.replace(memory)
-    assert refining.is_due(run)
-    refining.refine(run, memory)
-    assert not refining.is_due(run)
+    assert multiresolution.is_due(run)
+    multiresolution.refine(run, memory)
+    assert not multiresolution.is_due(run)
     return *before, run, memory
 
 
@@ -170,7 +170,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
     elif "meta" not in type(new).__name__.lower():
         np.testing.assert_allclose(new.first_moment[KEY], by_hand(old.first_moment[KEY], 1), rtol=1e-10, atol=1e-18)
         np.testing.assert_allclose(
-            new.second_moment[KEY], by_hand(old.second_moment[KEY], refining.SQUARES), rtol=1e-10
+            new.second_moment[KEY], by_hand(old.second_moment[KEY], multiresolution.SQUARES), rtol=1e-10
         )
         assert new.begun == 0
     old, new = before.estimator, memory.estimator
@@ -180,7 +180,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         assert image.views is past.views
     if name == "adaptive":
         np.testing.assert_allclose(
-            new.pixels.energy[KEY], by_hand(old.pixels.energy[KEY], refining.SQUARES), rtol=1e-10
+            new.pixels.energy[KEY], by_hand(old.pixels.energy[KEY], multiresolution.SQUARES), rtol=1e-10
         )
         assert new.pixels.maps is old.pixels.maps
     if isinstance(new, MetaState):
@@ -199,9 +199,9 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         ratio = lengths[0] / lengths[1]
         assert 0.3 < ratio < 0.9
         for part, power, factor in (
-            ("gradient", 1, 1), ("variance", refining.SQUARES, 1), ("alpha", 0, 1),
-            ("proportional.mean", 1, 1), ("proportional.square", refining.SQUARES, 1),
-            ("difference.mean", 1, ratio), ("difference.square", refining.SQUARES, ratio**2),
+            ("gradient", 1, 1), ("variance", multiresolution.SQUARES, 1), ("alpha", 0, 1),
+            ("proportional.mean", 1, 1), ("proportional.square", multiresolution.SQUARES, 1),
+            ("difference.mean", 1, ratio), ("difference.square", multiresolution.SQUARES, ratio**2),
         ):  # fmt: skip
             values = [a, b]
             for word in part.split("."):
@@ -246,7 +246,7 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     run, memory = loop.prepare(found, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02, schedule=schedule), 9, None, 0)
     for _ in range(3):
         loop._step(run, memory)
-    refining.refine(run, memory)
+    multiresolution.refine(run, memory)
     start = run.parameters[KEY]
     loop._step(run, memory)
     moved = run.parameters[KEY] - start

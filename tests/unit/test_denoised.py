@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import denoising
-from unrender.images.base import Beside
-from unrender.keys import Key
-from unrender.problem.frames import WholeView
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.core.random import Key
+from unrender.evaluation import denoising
+from unrender.images.base import PairRequest
+from unrender.problem.batches import WholeView
+from unrender.rendering.numpy.linear import AnalyticRenderer
 
 Denoised, Plain, CV = ur.images.Denoised, ur.images.Plain, ur.images.RecursiveControlVariate
 OIDN = pytest.param(
@@ -100,9 +100,9 @@ def test_samples_form_few_groups(most: int, asked: int, got: int) -> None:
 def test_the_previous_state_is_denoised_alike() -> None:
     asked = problem()
     image = Denoised(by="variation")
-    beside = Beside(asked.initial(), "path")
+    pair_request = PairRequest(asked.initial(), "path")
     found, _ = image.estimate(
-        asked, asked.initial(), image.init(asked, asked.initial()), WholeView(asked, 0), 4, 4, Key(0), beside
+        asked, asked.initial(), image.init(asked, asked.initial()), WholeView(asked, 0), 4, 4, Key(0), pair_request
     )
     np.testing.assert_array_equal(found.previous_others(), found.others())
 

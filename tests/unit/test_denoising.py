@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import denoising, variant
-from unrender.denoising import denoise
+from unrender.backend import variant
+from unrender.evaluation import denoising
+from unrender.evaluation.denoising import denoise
 
 OIDN = pytest.param(
     "oidn", marks=pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.exporting import folder as exporting
-from unrender.rendering import poses
-from unrender.rendering.poses import Pose
+from unrender.exporting import scene_folder as exporting
+from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.poses import Pose
 
 MADE_BEFORE: list[Any] = []
 

@@ -11,10 +11,11 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from unrender.gallery import specification
 from unrender.gallery import boxes, mesh_files, meshes, textures
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
-from unrender.rendering.quadratic import QuadraticRenderer
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.numpy.quadratic import QuadraticRenderer
+from unrender.rendering.renderer import SampleRequest
 
 NAMES = ur.gallery.names()
 SMALL = {"resolution": 16, "texture_resolution": 8, "reference_spp": 2048}
@@ -186,16 +187,15 @@ def test_reference_spp_lowers_the_noise_and_equal_calls_give_equal_references():
 
 
 def test_references_in_several_passes_weigh_each_by_its_samples(monkeypatch):
-    from unrender.gallery import recipe
 
     options = {"resolution": 8, "texture_resolution": 4, "reference_spp": 5}
     scene = ur.gallery.problem("sunlit-vase", **options).renderer.pair.current  # pyright: ignore[reportAttributeAccessIssue]
-    monkeypatch.setattr(recipe, "_LANES", 2 * 64)
-    whole = recipe.reference(scene, 0, 5, 5)
+    monkeypatch.setattr(specification, "_LANES", 2 * 64)
+    whole = specification.reference(scene, 0, 5, 5)
     integrator = mi.load_dict({"type": "path", "max_depth": 5})
     total = np.zeros((8, 8, 3))
     for done, take in ((0, 2), (2, 2), (4, 1)):
-        seed = recipe._REFERENCE.fold(0).fold(done).uint32()
+        seed = specification._REFERENCE.fold(0).fold(done).uint32()
         total += take * mi.render(scene, sensor=0, integrator=integrator, spp=take, seed=mi.UInt32(seed)).numpy()
     np.testing.assert_allclose(whole, total / 5, rtol=1e-5)
 
@@ -305,13 +305,14 @@ def test_the_spiral_is_five_numbers_by_default():
 def test_the_exponential_has_the_mean_that_it_shows():
     problem = ur.gallery.problem("exponential")
     renderer = problem.renderer
-    many = [renderer.image(problem.truth, Shot(0, 1000, seed)).images.mean() for seed in range(200)]
+    many = [renderer.image(problem.truth, SampleRequest(0, 1000, seed)).images.mean() for seed in range(200)]
     assert abs(np.mean(many) - 2) < 4 * np.std(many) / np.sqrt(200)
     step = 1e-5
     sides = [
-        renderer.image({"rate": np.array(0.8 + side)}, Shot(0, 64, 3, groups=4)).images.mean() for side in (step, -step)
+        renderer.image({"rate": np.array(0.8 + side)}, SampleRequest(0, 64, 3, groups=4)).images.mean()
+        for side in (step, -step)
     ]
-    paths = renderer.image({"rate": np.array(0.8)}, Shot(0, 64, 3, groups=4)).paths
+    paths = renderer.image({"rate": np.array(0.8)}, SampleRequest(0, 64, 3, groups=4)).paths
     slope = renderer.adjoint({"rate": np.array(0.8)}, paths, np.full((4, 1, 1, 3), 1 / 3))["rate"]
     assert slope == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-6)
 
@@ -323,7 +324,7 @@ def test_the_room_of_ajar_is_lit_through_the_gap_alone():
     renderer = MitsubaRenderer(problem.renderer.pair.description, max_depth=2)  # direct light alone
     truth = {key: renderer.array(value) for key, value in problem.truth.items()}
     renderer.select(list(truth), None)
-    direct = np.array(renderer.image(truth, Shot(0, 256, 1)).images)[0]
+    direct = np.array(renderer.image(truth, SampleRequest(0, 256, 1)).images)[0]
     reference = np.asarray(problem.views[0].reference)
     assert np.mean(direct.max(-1) == 0) > 0.6
     assert np.mean(reference.max(-1) > 0.01) > 0.9
@@ -363,7 +364,7 @@ def pictures(problem: ur.Problem, points: np.ndarray, spp: int = 256, seed: int 
     keys = [parameter.key for parameter in problem.parameters]
     problem.renderer.select(keys, None, derivatives=False)
     columns = np.asarray(points, np.float32).T
-    return problem.renderer.image_batch(dict(zip(keys, columns, strict=True)), Shot(0, spp, seed))
+    return problem.renderer.image_batch(dict(zip(keys, columns, strict=True)), SampleRequest(0, spp, seed))
 
 
 def start_of(problem: ur.Problem) -> np.ndarray:
@@ -568,11 +569,13 @@ def test_the_loss_of_the_quadratic_is_the_polynomial():
     problem = ur.gallery.problem("quad")
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20, 2))
-    batch = problem.renderer.image_batch({"x": points}, Shot(0, 1, 0))
+    batch = problem.renderer.image_batch({"x": points}, SampleRequest(0, 1, 0))
     polynomial = 5 * points[:, 0] ** 2 + 5 * points[:, 1] ** 2 + 7.5 * points[:, 0] * points[:, 1]
     np.testing.assert_allclose(problem.loss_values(0, batch), polynomial, rtol=1e-12)
     for point, image in zip(points, batch, strict=True):
-        np.testing.assert_allclose(problem.renderer.image({"x": point}, Shot(0, 4, 1, groups=2)).images, [image] * 2)
+        np.testing.assert_allclose(
+            problem.renderer.image({"x": point}, SampleRequest(0, 4, 1, groups=2)).images, [image] * 2
+        )
     assert np.asarray(problem.initial()["x"]).tolist() == [1.5, 1.0]
     assert problem.loss_value(0, np.zeros((1, 1, 3))) == 0
 
@@ -581,9 +584,9 @@ def test_the_gradient_of_the_quadratic_is_exact():
     problem = ur.gallery.problem("quad")
     point = np.array([0.3, -1.1])
     renderer = problem.renderer
-    for shot in (Shot(0, 2, 1, groups=2), Shot(0, 2, 1, groups=2, pixels=np.array([0]))):
-        rendering = renderer.image_pair({"x": point}, {"x": 2 * point}, shot, "path")
-        assert rendering.images.shape == ((2, 1, 1, 3) if shot.pixels is None else (2, 1, 3))
+    for request in (SampleRequest(0, 2, 1, groups=2), SampleRequest(0, 2, 1, groups=2, pixels=np.array([0]))):
+        rendering = renderer.image_pair({"x": point}, {"x": 2 * point}, request, "path")
+        assert rendering.images.shape == ((2, 1, 1, 3) if request.pixels is None else (2, 1, 3))
         weights, weights_before = (np.asarray(images) * 2 / 3 for images in (rendering.images, rendering.previous))
         now, before = renderer.adjoint_pair({"x": point}, {"x": 2 * point}, rendering.paths, weights, weights_before)
         np.testing.assert_allclose(now["x"], [10 * 0.3 - 7.5 * 1.1, -10 * 1.1 + 7.5 * 0.3], rtol=1e-12)

@@ -9,8 +9,8 @@ from scipy import stats
 
 import unrender as ur
 from unrender.gallery import skies, two_planets
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 SPP = 1024
 SMALL = {
@@ -88,7 +88,7 @@ def at_depth(problem: ur.Problem, depth: int, spp: int = 256, sensor: int = 0) -
     renderer = MitsubaRenderer(problem.renderer.pair.description, max_depth=depth)
     truth = {key: renderer.array(value) for key, value in problem.truth.items()}
     renderer.select(list(truth), None)
-    return np.array(renderer.image(truth, Shot(sensor, spp, 1)).images)[0]
+    return np.array(renderer.image(truth, SampleRequest(sensor, spp, 1)).images)[0]
 
 
 # ---------------------------------------------------------------------------------------------------- each problem

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.keys import Key
+from unrender.core.random import Key
 
 
 def bowl(x: np.ndarray) -> np.ndarray:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.errors import InputError
+from unrender.core.errors import InputError
+from unrender.io.volumes import read_grid, write_grid
 from unrender.problem import values
-from unrender.problem.grids import read_grid, write_grid
 
 GRID = np.random.default_rng(0).random((4, 3, 5, 2)).astype(np.float32)
 

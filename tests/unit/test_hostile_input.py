@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import files
-from unrender.errors import InputError
-from unrender.problem import pictures, scene_files
-from unrender.training import checkpoint
+from unrender.core.errors import InputError
+from unrender.io import files, images, scene_files
+from unrender.runs.folder import checkpoint
 
 _CANARY = "unrender_canary_that_no_module_is_called"
 
@@ -185,9 +184,9 @@ CHECKPOINTS: dict[str, Callable[[Path], Any]] = {
     "a state that is a number": lambda f: _edit_manifest(f, state=1e308),
     "a class of the standard library": lambda f: _node(f, lambda n: n.update(optimizer=_class("os.system", command="touch escape"))),
     "a class of another module": lambda f: _node(f, lambda n: n.update(optimizer=_class(f"unrender.{_CANARY}.State"))),
-    "a function of this package": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.files.write", path="escape"))),
-    "a class that is no state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.training.folder.Keeper", folder="."))),
-    "another state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.gradients.black_box.LossState"))),
+    "a function of this package": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.io.files.write", path="escape"))),
+    "a class that is no state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.runs.folder.writer.Keeper", folder="."))),
+    "another state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.estimators.loss_values.LossState"))),
     "a state with other fields": lambda f: _node(f, lambda n: n["optimizer"]["fields"].update(more=1)),
     "a state with a field of another type": lambda f: _node(f, lambda n: n["optimizer"]["fields"].update(step="4")),
     "a state nested deeply": lambda f: _node(f, lambda n: n.update(optimizer=_deep(200))),
@@ -405,7 +404,7 @@ def test_a_picture_of_enormous_size_is_refused_by_its_header(tmp_path: Path, nam
     inside = tmp_path / "inside"
     inside.mkdir()
     (inside / name).write_bytes(PICTURES[name])
-    said = refused(inside, lambda: pictures.read(inside / name))
+    said = refused(inside, lambda: images.read(inside / name))
     assert "declares" in said or "header is malformed" in said
 
 

@@ -8,8 +8,8 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
-from unrender import arrays
-from unrender.errors import InputError
+from unrender.core import arrays
+from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps
 from unrender.preconditioners.grid import CholeskySolver, TransformSolver
 

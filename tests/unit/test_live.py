@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.report.folder import read_record
-from unrender.report.reading import arrays
-from unrender.thumbnails import reduced
-from unrender.training import live as module
-from unrender.training.live import Live
+from unrender.io.bounded_files import arrays
+from unrender.io.thumbnails import reduced
+from unrender.runs import live as module
+from unrender.runs.folder.reader import read_record
+from unrender.runs.live import Live
 from unrender.watch.source import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, Source
 
 

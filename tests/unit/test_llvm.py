@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from unrender import llvm
+from unrender.backend import llvm
 
 ELF = b"\x7fELF\x02\x01\x01" + bytes(9) + b"\x03\x00"
 X86_64, I386 = b"\x3e\x00", b"\x03\x00"

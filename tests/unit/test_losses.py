@@ -4,8 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender import arrays, losses
-from unrender.errors import InputError
+from unrender import losses
+from unrender.core import arrays
+from unrender.core.errors import InputError
 
 ALL = [losses.L1(), losses.L2(), losses.RelativeL2(), losses.RelativeL2(0.5), losses.Huber(), losses.Huber(2.0)]
 REFERENCE = np.array([0.0, 0.2, 1.0, 3.0])

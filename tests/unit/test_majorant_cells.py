@@ -14,9 +14,10 @@ import pytest
 from kernels import on_device, recorded
 
 import unrender as ur
-from unrender.rendering import emissive, majorant_grid
-from unrender.rendering.majorant_grid import Cells, MajorantGrids
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba import emissive
+from unrender.rendering.mitsuba.integrators import majorant_grid
+from unrender.rendering.mitsuba.integrators.majorant_grid import Cells, MajorantSupergrids
+from unrender.rendering.renderer import SampleRequest
 
 SHAPE = (17, 33, 22)
 POINTS = 200_000
@@ -61,8 +62,8 @@ def volume(of: Any) -> Any:
     return mi.traverse(of).properties["sigma_t.data"][2]
 
 
-def tables(of: Any) -> tuple[MajorantGrids, dict[str, Any]]:
-    grids = MajorantGrids({number(of): of})
+def tables(of: Any) -> tuple[MajorantSupergrids, dict[str, Any]]:
+    grids = MajorantSupergrids({number(of): of})
     return grids, {"frames": grids.frames, "layout": grids.layout, "majorants": grids.values()}
 
 
@@ -181,7 +182,7 @@ def test_a_walk_uses_up_the_optical_depth_that_it_was_given(place: str) -> None:
 
 def test_new_values_are_seen_and_old_ones_are_not_worked_out_again() -> None:
     cloud = medium()
-    grids = MajorantGrids({number(cloud): cloud})
+    grids = MajorantSupergrids({number(cloud): cloud})
     before = grids.values()
     assert grids.values().index == before.index
     parameters = mi.traverse(cloud)
@@ -192,7 +193,7 @@ def test_new_values_are_seen_and_old_ones_are_not_worked_out_again() -> None:
 
 def test_new_values_compile_no_kernels() -> None:
     cloud = medium()
-    grids = MajorantGrids({number(cloud): cloud})
+    grids = MajorantSupergrids({number(cloud): cloud})
     parameters = mi.traverse(cloud)
     for seed in range(4):
         parameters["sigma_t.data"] = on_device(values(seed=seed))
@@ -212,7 +213,7 @@ def test_media_without_a_grid_that_pays_keep_one_majorant() -> None:
         {"type": "heterogeneous", "sigma_t": {"type": "constvolume", "value": 2.0}, "albedo": 0.5},
     ):
         plain = mi.load_dict(description)
-        assert not MajorantGrids({number(plain): plain})
+        assert not MajorantSupergrids({number(plain): plain})
 
 
 def test_a_grid_that_changes_its_resolution_has_new_cells() -> None:
@@ -220,12 +221,12 @@ def test_a_grid_that_changes_its_resolution_has_new_cells() -> None:
         ur.gallery.problem("smoke", resolution=8, grid_resolution=size, reference_spp=1) for size in (32, 16, 8)
     )
     truth = {key: fine.renderer.array(value) for key, value in fine.truth.items()}
-    shot = Shot(0, 4, 1)
+    request = SampleRequest(0, 4, 1)
     fine.renderer.select(list(truth), None)
-    expected = np.array(fine.renderer.image(truth, shot).images[0])
+    expected = np.array(fine.renderer.image(truth, request).images[0])
     for problem in (coarse, small):
         before = problem.initial()
         problem.renderer.select(list(before), None)
-        first = np.array(problem.renderer.image(before, shot).images[0])
-        np.testing.assert_allclose(np.array(problem.renderer.image(truth, shot).images[0]), expected, rtol=1e-4)
-        np.testing.assert_allclose(np.array(problem.renderer.image(before, shot).images[0]), first, rtol=1e-4)
+        first = np.array(problem.renderer.image(before, request).images[0])
+        np.testing.assert_allclose(np.array(problem.renderer.image(truth, request).images[0]), expected, rtol=1e-4)
+        np.testing.assert_allclose(np.array(problem.renderer.image(before, request).images[0]), first, rtol=1e-4)

@@ -9,7 +9,7 @@ import kernels
 import numpy as np
 import pytest
 
-from unrender import arrays
+from unrender.core import arrays
 from unrender.statistics import meta
 
 FORMS = {"independent": meta.update, "coupled": meta.update_coupled}

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from unrender import pixels
-from unrender.errors import InputError
-from unrender.gradients.black_box import LossValues
-from unrender.gradients.meta import MetaEstimator
-from unrender.gradients.path import PathGradient
-from unrender.gradients.smoothed import SmoothedDerivatives
+from unrender import pixels, schedules
+from unrender.core.errors import InputError
+from unrender.estimators.loss_values import LossValues
+from unrender.estimators.meta import MetaEstimator
+from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images import Plain, RecursiveControlVariate
-from unrender.methods import METHODS, method, parse_schedule
-from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG, schedules
+from unrender.methods.catalogue import METHODS, method, parse_schedule
+from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from unrender import metrics
-from unrender.errors import InputError
+from unrender.core.errors import InputError
+from unrender.evaluation import metrics
 
 RNG = np.random.default_rng(5)
 REFERENCE = RNG.uniform(0.05, 0.6, (32, 48, 3))

@@ -12,9 +12,9 @@ import pytest
 from kernels import recorded
 
 import unrender as ur
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
-from unrender.rendering.scene_pair import from_tensor, to_tensor
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.scene_pair import from_tensor, to_tensor
+from unrender.rendering.renderer import SampleRequest
 
 
 def box(**more: Any) -> dict[str, Any]:
@@ -153,13 +153,13 @@ def test_moving_geometry_runs_in_primary_space() -> None:
     renderer.select([key], "primary")
     current = renderer.values([key])
     previous = {key: current[key] + 0.02}
-    pair = renderer.image_pair(current, previous, Shot(0, 64, 1), "primary")
-    alone = renderer.image(previous, Shot(0, 64, 1))
+    pair = renderer.image_pair(current, previous, SampleRequest(0, 64, 1), "primary")
+    alone = renderer.image(previous, SampleRequest(0, 64, 1))
     assert pair.previous is not None
     assert np.array_equal(np.array(pair.previous[0]), np.array(alone.images[0]))
     assert not np.array_equal(np.array(pair.previous[0]), np.array(pair.images[0]))
     gradient = renderer.adjoint(
-        current, renderer.image(current, Shot(0, 64, 1)).paths, renderer.array(np.ones((1, 16, 16, 3)))
+        current, renderer.image(current, SampleRequest(0, 64, 1)).paths, renderer.array(np.ones((1, 16, 16, 3)))
     )
     assert np.isfinite(np.array(gradient[key])).all()
     assert np.abs(np.array(gradient[key])).max() > 0
@@ -173,10 +173,10 @@ def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
     current = renderer.values([key])
     previous = {key: current[key] + 0.02}
     weights = renderer.array(np.random.default_rng(0).random((2, 16, 16, 3)))
-    pair = renderer.image_pair(current, previous, Shot(0, 64, 1, groups=2), "primary")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, 64, 1, groups=2), "primary")
     both = renderer.adjoint_pair(current, previous, pair.paths, weights, weights)
     for state, found in zip((current, previous), both, strict=True):
-        alone = renderer.adjoint(state, renderer.image(state, Shot(0, 64, 1, groups=2)).paths, weights)
+        alone = renderer.adjoint(state, renderer.image(state, SampleRequest(0, 64, 1, groups=2)).paths, weights)
         a, b = np.array(found[key]), np.array(alone[key])
         assert np.abs(a - b).max() < 1e-4 * np.abs(b).max()
     assert np.abs(np.array(both[0][key]) - np.array(both[1][key])).max() > 0
@@ -195,9 +195,9 @@ def test_chosen_pixels_are_the_pixels_of_the_film() -> None:
     renderer = MitsubaRenderer(box(), 3)
     renderer.select([WALL], None)
     now = renderer.values([WALL])
-    whole = np.array(renderer.image(now, Shot(0, 4096, 1)).images[0]).reshape(-1, 3)
+    whole = np.array(renderer.image(now, SampleRequest(0, 4096, 1)).images[0]).reshape(-1, 3)
     chosen = np.array([3, 100, 17, 255])
-    some = np.array(renderer.image(now, Shot(0, 4096, 2, pixels=mi.UInt32(chosen))).images[0])
+    some = np.array(renderer.image(now, SampleRequest(0, 4096, 2, pixels=mi.UInt32(chosen))).images[0])
     assert some.shape == (4, 3)
     np.testing.assert_allclose(some, whole[chosen], rtol=0.15, atol=0.01)
 
@@ -242,10 +242,10 @@ def test_replayed_kernels_follow_every_value_that_numpy_hands_over(channels: int
     renderer = MitsubaRenderer(description, 3)
     renderer.select([key], None)
     values = [rng.uniform(0.1, 0.9, (8, 8, channels)).astype(np.float32) for _ in range(12)]
-    replayed = [np.array(renderer.image({key: renderer.array(v)}, Shot(0, 4, 5)).images) for v in values]
+    replayed = [np.array(renderer.image({key: renderer.array(v)}, SampleRequest(0, 4, 5)).images) for v in values]
     for value, image in zip(values, replayed, strict=True):
         renderer._frozen.clear()
-        fresh = np.array(renderer.image({key: renderer.array(value)}, Shot(0, 4, 5)).images)
+        fresh = np.array(renderer.image({key: renderer.array(value)}, SampleRequest(0, 4, 5)).images)
         np.testing.assert_array_equal(image, fresh)
 
 

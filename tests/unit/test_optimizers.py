@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender import arrays
-from unrender.errors import InputError
-from unrender.gradients.estimate import Estimate
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimate
 from unrender.optimizers import SGD, Adam, MetaAdam
-from unrender.optimizers.schedules import Constant, Cosine, Exponential, Steps, Warmup
+from unrender.schedules.functions import Constant, Cosine, Exponential, Steps, Warmup
 
 OPTIMIZERS = [SGD(0.1), SGD(0.1, momentum=0.9), Adam(0.1), Adam(0.1, beta_1=0.5, beta_2=0.9, epsilon=0.01)]
 
@@ -155,7 +155,7 @@ def test_a_changing_python_number_would_be_noticed(gradients, monkeypatch):
         (lambda: Adam(epsilon=0.0), "Adam: epsilon must be a finite number > 0, got 0.0"),
         (
             lambda: Adam(schedule="cosine"),  # type: ignore
-            "Adam: schedule must be one of unrender.optimizers.schedules or None, got 'cosine'",
+            "Adam: schedule must be one of unrender.schedules.functions or None, got 'cosine'",
         ),
         (lambda: SGD(float("nan")), "SGD: learning_rate must be a finite number > 0, got nan"),
         (lambda: SGD(momentum=1), "SGD: momentum must be a finite number >= 0 and < 1, got 1"),

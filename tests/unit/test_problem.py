@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from unrender import losses
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.analytic import AnalyticRenderer
-from unrender.rendering.port import ParameterInfo
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.renderer import ParameterInfo
 
 HEIGHT, WIDTH = 4, 5
 PIXELS = HEIGHT * WIDTH * 3

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from unrender import losses
-from unrender.errors import InputError
+from unrender.core.errors import InputError
+from unrender.io import toml_lines
 from unrender.preconditioners import LargeSteps
-from unrender.problem import lines
 from unrender.problem.problem import Problem
 
 SCENE = """<scene version="3.0.0">
@@ -282,4 +282,4 @@ p = 1  # [[l]]
     ],
 )
 def test_finds_lines(place: tuple, line: int):
-    assert lines.find(LINES, place) == line
+    assert toml_lines.find(LINES, place) == line

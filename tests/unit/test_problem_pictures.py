@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.errors import InputError
-from unrender.problem import pictures, values
+from unrender.core.errors import InputError
+from unrender.io import images
+from unrender.problem import values
 
 COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
 
@@ -22,7 +23,7 @@ def bitmap(array: np.ndarray, path: Path) -> Path:
 
 @pytest.mark.parametrize(("name", "tolerance"), [("a.exr", 1e-6), ("a.hdr", 1e-2), ("a.pfm", 1e-6)])
 def test_reads_linear_files_as_they_are(tmp_path: Path, name: str, tolerance: float):
-    picture = pictures.read(bitmap(COLOURS, tmp_path / name))
+    picture = images.read(bitmap(COLOURS, tmp_path / name))
     assert picture.notice == ""
     assert picture.values.dtype == np.float32
     np.testing.assert_allclose(picture.values, COLOURS, atol=tolerance)
@@ -30,37 +31,37 @@ def test_reads_linear_files_as_they_are(tmp_path: Path, name: str, tolerance: fl
 
 def test_reads_npy(tmp_path: Path):
     np.save(tmp_path / "a.npy", COLOURS.astype(np.float64))
-    np.testing.assert_array_equal(pictures.read(tmp_path / "a.npy").values, COLOURS)
+    np.testing.assert_array_equal(images.read(tmp_path / "a.npy").values, COLOURS)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_linearises_png(tmp_path: Path, bits: int):
     levels = np.linspace(0, 2**bits - 1, 6 * 8 * 3).reshape(6, 8, 3).astype(f"uint{bits}")
-    picture = pictures.read(bitmap(levels, tmp_path / "a.png"))
+    picture = images.read(bitmap(levels, tmp_path / "a.png"))
     assert picture.notice == f"a.png: {bits}-bit sRGB, linearised"
     encoded = levels / (2**bits - 1)
-    np.testing.assert_allclose(picture.values, pictures.srgb_to_linear(encoded), atol=2e-6)
-    np.testing.assert_allclose(pictures.read(tmp_path / "a.png", linearise=False).values, encoded, atol=1e-6)
+    np.testing.assert_allclose(picture.values, images.srgb_to_linear(encoded), atol=2e-6)
+    np.testing.assert_allclose(images.read(tmp_path / "a.png", linearise=False).values, encoded, atol=1e-6)
 
 
 def test_reads_jpeg_and_upper_case_endings(tmp_path: Path):
     Image.fromarray(np.full((6, 8, 3), 188, np.uint8)).save(tmp_path / "A.JPG")
-    picture = pictures.read(str(tmp_path / "A.JPG"))
+    picture = images.read(str(tmp_path / "A.JPG"))
     assert picture.notice == "A.JPG: 8-bit sRGB, linearised"
     np.testing.assert_allclose(picture.values, 0.5029, atol=5e-3)
 
 
 def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):
     rgba = np.concatenate([COLOURS, np.full((6, 8, 1), 0.25, np.float32)], axis=2)
-    np.testing.assert_array_equal(pictures.read(bitmap(rgba, tmp_path / "a.exr")).values, COLOURS)
-    assert pictures.read(bitmap(COLOURS[..., :1], tmp_path / "g.exr")).values.shape == (6, 8, 1)
+    np.testing.assert_array_equal(images.read(bitmap(rgba, tmp_path / "a.exr")).values, COLOURS)
+    assert images.read(bitmap(COLOURS[..., :1], tmp_path / "g.exr")).values.shape == (6, 8, 1)
 
 
 def test_takes_the_colours_of_a_file_of_many_layers(tmp_path: Path):
     layers = np.concatenate([COLOURS, np.full((6, 8, 1), 9, np.float32)], axis=2)
     names = ["R", "G", "B", "depth.T"]
     mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
-    np.testing.assert_array_equal(pictures.read(tmp_path / "a.exr").values, COLOURS)
+    np.testing.assert_array_equal(images.read(tmp_path / "a.exr").values, COLOURS)
 
 
 def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):
@@ -68,14 +69,14 @@ def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):
     names = ["a.X", "a.Y", "b.Z", "b.W"]
     mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
     with pytest.raises(InputError, match=r"a\.exr: has the channels .*a\.X.*, but not R, G and B"):
-        pictures.read(tmp_path / "a.exr")
+        images.read(tmp_path / "a.exr")
 
 
 def test_refuses_what_is_no_picture(tmp_path: Path):
     for name in ("a.png", "a.jpg", "a.exr", "a.hdr", "a.npy"):
         (tmp_path / name).write_bytes(b"this is not a picture at all")
         with pytest.raises(InputError, match=rf"{name}: .*(cannot be read|not a readable)") as caught:
-            pictures.read(tmp_path / name)
+            images.read(tmp_path / name)
         assert "\n" not in str(caught.value)
 
 
@@ -83,28 +84,28 @@ def test_refuses_a_file_cut_short(tmp_path: Path):
     whole = bitmap(np.zeros((64, 64, 3), np.uint8), tmp_path / "whole.png").read_bytes()
     (tmp_path / "half.png").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"half\.png: cannot be read"):
-        pictures.read(tmp_path / "half.png")
+        images.read(tmp_path / "half.png")
 
 
 def test_never_unpickles(tmp_path: Path):
     np.save(tmp_path / "a.npy", np.array([{"x": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match=r"a\.npy: expected real numbers, got object"):
-        pictures.read(tmp_path / "a.npy")
+        images.read(tmp_path / "a.npy")
 
 
 def test_refuses_folders_and_unknown_endings(tmp_path: Path):
     (tmp_path / "a.gif").write_bytes(b"GIF89a")
     with pytest.raises(InputError, match=r"a\.gif: unknown kind of picture, expected one of \.exr"):
-        pictures.read(tmp_path / "a.gif")
+        images.read(tmp_path / "a.gif")
     with pytest.raises(InputError, match="not a file"):
-        pictures.read(tmp_path)
+        images.read(tmp_path)
 
 
 def test_names_the_first_pixel_that_is_not_finite(tmp_path: Path):
     broken = COLOURS.copy()
     broken[4, 5] = np.inf
     with pytest.raises(InputError, match=r"a\.exr: 1 pixels are NaN or infinite, the first in row 4, column 5"):
-        pictures.read(bitmap(broken, tmp_path / "a.exr"))
+        images.read(bitmap(broken, tmp_path / "a.exr"))
 
 
 # ------------------------------------------------------------------ pictures as initial values

@@ -13,8 +13,8 @@ from PIL import Image
 from report_folders import KEY, Page, write_run
 
 from unrender import report
-from unrender.report import curves, panels, pictures, words
-from unrender.report.folder import read
+from unrender.report import curves, images, panels, words
+from unrender.runs.folder.reader import read
 
 
 def test_page_is_one_file_that_fetches_nothing_and_runs_only_its_own_script(tmp_path):
@@ -96,7 +96,7 @@ def test_page_opens_only_when_asked(tmp_path, monkeypatch):
 
 def test_srgb_has_the_standards_values():
     assert np.allclose(
-        pictures.srgb(np.array([-1.0, 0.0, 0.0031308, 0.5, 1.0, 9.0, np.nan])),
+        images.srgb(np.array([-1.0, 0.0, 0.0031308, 0.5, 1.0, 9.0, np.nan])),
         [0, 0, 0.04045, 0.735357, 1, 1, 0],
         atol=1e-5,
     )
@@ -104,11 +104,11 @@ def test_srgb_has_the_standards_values():
 
 def test_exposure_takes_the_references_percentile_to_its_place_and_ignores_a_lamp():
     flat = np.full((10, 10, 3), 0.02)
-    assert pictures.exposure(flat) == pytest.approx(0.7 / 0.02)
+    assert images.exposure(flat) == pytest.approx(0.7 / 0.02)
     with_lamp = flat.copy()
     with_lamp[0, :4] = 50.0
-    assert pictures.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
-    assert pictures.exposure(np.zeros((2, 2, 3))) == 1.0
+    assert images.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
+    assert images.exposure(np.zeros((2, 2, 3))) == 1.0
 
 
 def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
@@ -116,9 +116,9 @@ def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
     reference = rng.uniform(0.01, 0.1, (6, 8, 3)).astype(np.float32)
     views = {"view0/reference": reference, "view0/initial": 2 * reference, "view0/result": 0.7 * reference}
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
-    factor = pictures.exposure(reference)
+    factor = images.exposure(reference)
     for alt, linear in {"the reference": 1.0, "the result": 0.7, "before the first step": 2.0}.items():
-        expected = pictures.srgb(linear * reference * factor) * 255
+        expected = images.srgb(linear * reference * factor) * 255
         assert np.abs(page.picture(f"View 0: {alt}") - expected).max() <= 0.51
     assert words.number(factor) in page.words
 
@@ -141,7 +141,7 @@ def test_error_pictures_of_start_and_result_share_one_scale(tmp_path):
     views = {"view0/reference": reference, "view0/initial": reference + 0.4, "view0/result": result}
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
     start, end = (page.picture(f"View 0: error {of}") for of in ("before the first step", "of the result"))
-    expected = pictures.mapped(np.array([[1.0, 0.5, 0.0]]), 0.0, 1.0, pictures.ERRORS)[0] * 255
+    expected = images.mapped(np.array([[1.0, 0.5, 0.0]]), 0.0, 1.0, images.ERRORS)[0] * 255
     assert np.abs(start - expected[0]).max() <= 1  # 0.4 is the end of the scale
     assert np.abs(end[0, 0] - expected[1]).max() <= 2  # a quarter of it is half-way: square root
     assert np.abs(end[1:] - expected[2]).max() <= 1
@@ -150,10 +150,10 @@ def test_error_pictures_of_start_and_result_share_one_scale(tmp_path):
 def test_large_pictures_are_box_filtered():
     large = np.zeros((2, 3000, 3))
     large[:, ::3] = 0.3
-    shown = pictures.INLINE.colour(large, 1.0, "")
+    shown = images.INLINE.colour(large, 1.0, "")
     pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown.source.split(",")[1]))))
     assert pixels.shape == (1, 1000, 3)
-    assert np.abs(pixels - 255 * pictures.srgb(np.array(0.1))).max() <= 0.51
+    assert np.abs(pixels - 255 * images.srgb(np.array(0.1))).max() <= 0.51
 
 
 @pytest.mark.parametrize(
@@ -189,10 +189,10 @@ def test_maps_scalars_and_volumes(tmp_path):
     assert "0.125" in page.words
     assert "0.75, 0.5, 0.25" in page.words
     for axis, plane in {"z": volume[2], "y": volume[:, 2], "x": volume[:, :, 3]}.items():
-        expected = pictures.mapped(plane[..., 0], 0.0, volume.max(), pictures.VALUES) * 255
+        expected = images.mapped(plane[..., 0], 0.0, volume.max(), images.VALUES) * 255
         assert np.abs(page.picture(f"grid.data middle slice along {axis}: the truth") - expected).max() <= 0.51
     environment = page.picture("environment.data : the truth")
-    assert np.abs(environment - 255 * pictures.srgb(np.array(0.7))).max() <= 0.51  # exposed, for it passes 1
+    assert np.abs(environment - 255 * images.srgb(np.array(0.7))).max() <= 0.51  # exposed, for it passes 1
 
 
 def test_the_table_tells_errors_from_the_truth(tmp_path):

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from report_folders import KEY, Page, write_run
 
-from unrender import metrics, report
-from unrender.errors import InputError
+from unrender import report
+from unrender.core.errors import InputError
+from unrender.evaluation import metrics
 from unrender.report import groups
-from unrender.report.folder import read
+from unrender.runs.folder.reader import read
 
 
 def compared(tmp_path: Path, runs: list[Path]) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from report_folders import write_run
 
 from unrender.report import curves, plots, words
 from unrender.report.curves import Series
-from unrender.report.folder import read
 from unrender.report.plots import Line
+from unrender.runs.folder.reader import read
 
 
 def test_chart_places_points_on_a_logarithmic_axis():

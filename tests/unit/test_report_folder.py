@@ -11,7 +11,7 @@ import pytest
 from report_folders import KEY, write_run
 
 from unrender import report
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 
 
 def _json(name: str, **change: Any):

@@ -17,8 +17,9 @@ import pytest
 from report_folders import KEY, Page, write_run
 
 from unrender import report
-from unrender.errors import InputError
-from unrender.report import history, reading
+from unrender.core.errors import InputError
+from unrender.io import bounded_files
+from unrender.runs.folder import history_reader
 from unrender.watch.source import Source
 
 GOOD = np.ones((4, 5, 3), np.float32)
@@ -269,7 +270,7 @@ def test_an_archive_that_unpacks_to_more_than_memory_holds_is_not_unpacked(tmp_p
     (run / "truth.npz").write_bytes(data)
     with pytest.raises(InputError, match=r"declares the shape|archive"):
         report.page(run)
-    limit = reading.LARGEST_ARRAY // 4 + 1
+    limit = bounded_files.LARGEST_ARRAY // 4 + 1
     archive("truth.npz", a=npy(shape(f"({limit},)"), bytes(1 << 20)))(run)
     with pytest.raises(InputError, match="declares the shape"):
         report.page(run)
@@ -278,7 +279,7 @@ def test_an_archive_that_unpacks_to_more_than_memory_holds_is_not_unpacked(tmp_p
 def test_a_history_of_more_than_a_gigabyte_is_not_read(tmp_path):
     run = write_run(tmp_path / "run")
     with (run / "history.jsonl").open("r+b") as file:
-        file.truncate(history.LONGEST + 1)  # a hole: it takes no room
+        file.truncate(history_reader.LONGEST + 1)  # a hole: it takes no room
     with pytest.raises(InputError, match="larger than 1 GiB"):
         report.page(run)
 

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import files
-from unrender.errors import InputError
-from unrender.training import checkpoint, lock
-from unrender.training.lock import Holder, Lock
+from unrender.core.errors import InputError
+from unrender.io import files
+from unrender.runs.folder import checkpoint, lock
+from unrender.runs.folder.lock import Holder, Lock
 
 RATE = "rate"
 
@@ -236,7 +236,7 @@ def test_a_file_in_the_folder_s_place_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unrender.training.folder._WATCH_SECONDS", 0.0)
+    monkeypatch.setattr("unrender.runs.folder.writer._WATCH_SECONDS", 0.0)
     folder = tmp_path / "run"
     result = start(folder, every=4, callbacks=[At(5, lambda run: shutil.rmtree(folder))])
     assert result.warnings == [
@@ -249,7 +249,7 @@ def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: 
 
 
 def test_a_folder_deleted_and_taken_by_another_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unrender.training.folder._WATCH_SECONDS", 0.0)
+    monkeypatch.setattr("unrender.runs.folder.writer._WATCH_SECONDS", 0.0)
     folder = tmp_path / "run"
     other = Lock(folder)
 
@@ -286,7 +286,7 @@ def test_two_runs_in_one_folder(tmp_path: Path) -> None:
 
 
 def test_the_lock_of_a_process_that_died_is_no_lock(tmp_path: Path) -> None:
-    code = "import sys, time; from pathlib import Path; from unrender.training.lock import Lock\n"
+    code = "import sys, time; from pathlib import Path; from unrender.runs.folder.lock import Lock\n"
     code += "Lock(Path(sys.argv[1])).take(); print('held', flush=True); time.sleep(60)"
     environment = {**os.environ, "PYTHONPATH": str(Path(ur.__file__).parents[1])}
     words = [sys.executable, "-c", code, str(tmp_path)]

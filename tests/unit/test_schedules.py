@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from unrender.errors import InputError
-from unrender.optimizers.schedules import Constant, Cosine, Exponential, Steps, Warmup
+from unrender.core.errors import InputError
+from unrender.schedules.functions import Constant, Cosine, Exponential, Steps, Warmup
 
 
 @pytest.mark.parametrize(

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender import flat
-from unrender.errors import InputError
-from unrender.gradients.estimate import Estimate
+from unrender.core import vectors
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimate
 from unrender.optimizers import CMAES, LBFGS, Adam, Newton, NewtonCG
 from unrender.optimizers.cma_es import CMAESState
-from unrender.optimizers.schedules import Constant, Exponential
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.schedules.functions import Constant, Exponential
 
 LIKE = {"a": np.zeros((2, 2)), "b": np.zeros(2)}
 FIRST_STEPS = [Newton(), NewtonCG(), LBFGS()]
 
 
 def split(x, like=LIKE):
-    return flat.unravel(x, like)
+    return vectors.unravel(x, like)
 
 
 def bowl(n: int = 6, seed: int = 0, condition: float = 1000.0) -> tuple[np.ndarray, np.ndarray]:
@@ -39,13 +39,13 @@ def known(gradient, hessian=None, like=LIKE, losses=None) -> Estimate:
     if hessian is None:
         return Estimate(0.0, split(gradient, like), losses=losses)
     return Estimate(
-        0.0, split(gradient, like), None, hessian, lambda v: split(hessian @ flat.ravel(v), like), losses=losses
+        0.0, split(gradient, like), None, hessian, lambda v: split(hessian @ vectors.ravel(v), like), losses=losses
     )
 
 
 def first_step(optimizer, gradient, hessian=None, learning_rates=None, like=LIKE) -> np.ndarray:
     step, _ = optimizer.update(known(gradient, hessian, like), optimizer.init(like, learning_rates), like)
-    return flat.ravel(step)
+    return vectors.ravel(step)
 
 
 def descend(optimizer, function, x, steps, learning_rates=None):
@@ -147,7 +147,7 @@ def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
         estimate = dataclasses.replace(known(sign * gradient, 50 * hessian, like), losses=losses)
         optimizer = NewtonCG(trust_radius=radius, iterations=1, line=True)
         assert optimizer.requires == {"gradient", "hvp", "losses"}
-        return flat.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
+        return vectors.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
 
     found = step(1.0)
     assert np.linalg.norm(found) <= radius * (1 + 1e-9)
@@ -207,13 +207,13 @@ def test_a_later_product_that_is_not_finite_ends_the_iterations():
 
     def product(v):
         calls.append(1)
-        return split(hessian @ flat.ravel(v) * (np.nan if len(calls) == 3 else 1.0))
+        return split(hessian @ vectors.ravel(v) * (np.nan if len(calls) == 3 else 1.0))
 
     gradient = -hessian @ minimum
     estimate = Estimate(0.0, split(gradient), None, None, product)
     step, _ = optimizer.update(estimate, optimizer.init(LIKE), LIKE)
     expected = first_step(dataclasses.replace(optimizer, iterations=2), gradient, hessian)
-    np.testing.assert_array_equal(flat.ravel(step), expected)
+    np.testing.assert_array_equal(vectors.ravel(step), expected)
     assert len(calls) == 3
 
 
@@ -226,13 +226,13 @@ def test_noisy_products_lead_neither_upwards_nor_astray(noise):
         gradient = -hessian @ minimum
 
         def product(v, rng=rng, hessian=hessian):
-            exact = hessian @ flat.ravel(v)
+            exact = hessian @ vectors.ravel(v)
             return split(exact + noise * np.linalg.norm(exact) / math.sqrt(6) * rng.normal(size=6))
 
         optimizer = NewtonCG(trust_radius=0.5, iterations=12, tolerance=0.0)
         step, _ = optimizer.update(Estimate(0.0, split(gradient), None, None, product), optimizer.init(LIKE), LIKE)
-        assert flat.ravel(step) @ gradient < 0
-        assert 0 < np.linalg.norm(flat.ravel(step)) <= 0.5 * (1 + 1e-9)
+        assert vectors.ravel(step) @ gradient < 0
+        assert 0 < np.linalg.norm(vectors.ravel(step)) <= 0.5 * (1 + 1e-9)
 
 
 def test_damping_helps_against_a_noisy_hessian():
@@ -304,9 +304,9 @@ def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
     for step in range(5):
         estimate = known(rng.normal(size=6), hessian)
         direction, states = plain.update(estimate, states, LIKE)
-        expected, state = adam.update(Estimate(0.0, split(-flat.ravel(direction))), state, LIKE)
+        expected, state = adam.update(Estimate(0.0, split(-vectors.ravel(direction))), state, LIKE)
         found, own = passed.update(estimate, own, LIKE)
-        np.testing.assert_allclose(flat.ravel(found), 0.5 ** (step / 3) * flat.ravel(expected), rtol=1e-12)
+        np.testing.assert_allclose(vectors.ravel(found), 0.5 ** (step / 3) * vectors.ravel(expected), rtol=1e-12)
 
 
 @pytest.mark.parametrize("optimizer", [Newton(through=Adam(0.05)), NewtonCG(through=Adam(0.05))], ids=["Newton", "CG"])
@@ -404,7 +404,7 @@ def search(optimizer, losses, state, parameters, steps, project=lambda x: x):
     for _ in range(steps):
         step, state = optimizer.update(Estimate(0.0, {}, losses=losses), state, parameters)
         parameters = {key: project(x + step[key]) for key, x in parameters.items()}
-        path.append(flat.ravel(parameters))
+        path.append(vectors.ravel(parameters))
         states.append(state)
     return np.array(path), states, parameters
 
@@ -555,7 +555,7 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
         like, other = LIKE, device
         states, compiled = [optimizer.init(like), optimizer.init(other)], []
         for _ in range(6):
-            place = minimum - flat.ravel(like)
+            place = minimum - vectors.ravel(like)
             expected, states[0] = optimizer.update(known(-hessian @ place, hessian, like, sphere), states[0], like)
             with kernels.recorded() as new:
                 found, states[1] = optimizer.update(known(-hessian @ place, hessian, other, sphere), states[1], other)
@@ -563,7 +563,7 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
             compiled.append(sum(new))
             assert all(isinstance(x, mi.TensorXf) for x in found.values())
             assert all(found[key].shape == x.shape for key, x in LIKE.items())
-            np.testing.assert_allclose(flat.ravel(found), flat.ravel(expected), rtol=2e-4, atol=1e-6)
+            np.testing.assert_allclose(vectors.ravel(found), vectors.ravel(expected), rtol=2e-4, atol=1e-6)
             like = {key: x + expected[key] for key, x in like.items()}
             other = {key: kernels.on_device(x) for key, x in like.items()}
         # One more may be an input in another order; a number that became a literal makes four.
@@ -573,12 +573,12 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
 def test_steps_have_the_parameters_type_and_memory_of_their_own():
     single = {"x": np.ones((2, 3), np.float32)}
     vector = np.arange(6.0)
-    found = flat.unravel(vector, single)
+    found = vectors.unravel(vector, single)
     vector[:] = 0
     assert found["x"].dtype == np.float32
     np.testing.assert_array_equal(found["x"], np.arange(6.0).reshape(2, 3))
     lone = {"a": mi.Float([1, 2]), "b": mi.TensorXf(np.array(3.0, np.float32))}
-    np.testing.assert_array_equal(flat.ravel(flat.unravel(np.array([4.0, 5.0, 6.0]), lone)), [4, 5, 6])
+    np.testing.assert_array_equal(vectors.ravel(vectors.unravel(np.array([4.0, 5.0, 6.0]), lone)), [4, 5, 6])
 
 
 @pytest.mark.parametrize(
@@ -653,9 +653,13 @@ def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
         scale = np.array([width["a"], width["a"], width["b"]]) if width else np.ones(3)
         hessian = np.diag(1 / scale**2)
         found = Estimate(
-            0.0, gradient, hessian=hessian, hvp=lambda v: flat.unravel(hessian @ flat.ravel(v), parameters), width=width
+            0.0,
+            gradient,
+            hessian=hessian,
+            hvp=lambda v: vectors.unravel(hessian @ vectors.ravel(v), parameters),
+            width=width,
         )
-        return flat.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
+        return vectors.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
 
     for width in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
         step = first(width)

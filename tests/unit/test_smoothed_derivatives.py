@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.keys import Key
-from unrender.optimizers.schedules import Exponential
-from unrender.rendering.analytic import AnalyticRenderer
+from unrender.core.random import Key
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.schedules.functions import Exponential
 
 
 def problem(n: int = 3, **more: Any) -> ur.Problem:
@@ -95,9 +95,9 @@ def test_gradient_and_curvature_take_one_launch(order: Any) -> None:
     assert isinstance(renderer, AnalyticRenderer)
     render = renderer.image_batch
 
-    def watch(parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
+    def watch(parameters: dict[str, np.ndarray], request: Any) -> np.ndarray:
         counts.append(len(parameters["x"]))
-        return render(parameters, shot)
+        return render(parameters, request)
 
     renderer.image_batch = watch  # pyright: ignore[reportAttributeAccessIssue]
     estimator = ur.SmoothedDerivatives(0.1, samples=16, order=order)
@@ -124,8 +124,8 @@ class _Landscape:
         truth.image_batch = self.render  # pyright: ignore[reportAttributeAccessIssue]
         self.height = height
 
-    def render(self, parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
-        del shot
+    def render(self, parameters: dict[str, np.ndarray], request: Any) -> np.ndarray:
+        del request
         return np.broadcast_to(self.height(parameters["x"])[:, :, None, None], (len(parameters["x"]), 2, 2, 3))
 
     def age(self, at: float, steps: int = 40, **options: Any) -> float:
@@ -159,10 +159,10 @@ def test_sigma_follows_its_schedule() -> None:
     assert isinstance(renderer, AnalyticRenderer)
     render = renderer.image_batch
 
-    def watch(parameters: dict[str, np.ndarray], shot: Any) -> np.ndarray:
+    def watch(parameters: dict[str, np.ndarray], request: Any) -> np.ndarray:
         if len(parameters["x"]) > 1:
             seen.append(float(np.abs(parameters["x"] - parameters["x"].mean(0)).max()))
-        return render(parameters, shot)
+        return render(parameters, request)
 
     renderer.image_batch = watch  # pyright: ignore[reportAttributeAccessIssue]
     estimator = ur.SmoothedDerivatives(0.1, samples=64, schedule=Exponential(1, floor=0.2))

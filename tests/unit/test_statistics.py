@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender import arrays, statistics
+from unrender import statistics
+from unrender.core import arrays
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from unrender import llvm, variant
-from unrender.errors import VariantError
+from unrender.backend import llvm, variant
+from unrender.core.errors import VariantError
 
 TOO_OLD = [
     pytest.param(path, major, marks=pytest.mark.skipif(not Path(path).exists(), reason=f"{path} is not here"))
@@ -61,9 +61,9 @@ def python(code: str, **environment: str | None) -> subprocess.CompletedProcess[
 
 
 USE = """
-from unrender.errors import VariantError
+from unrender.core.errors import VariantError
 try:
-    from unrender import variant
+    from unrender.backend import variant
     print(variant.{call})
 except VariantError as error:
     print(error)
@@ -110,7 +110,7 @@ def test_no_kernel_with_an_old_llvm(
     monkeypatch.setattr(variant, "llvm_version", lambda: version)
     monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "choose", lambda: None)
-    monkeypatch.setattr(variant.packages, "command", lambda needs: f"get {needs[0]}")
+    monkeypatch.setattr(variant.install_hints, "command", lambda needs: f"get {needs[0]}")
     for call in (lambda: variant.use("llvm_ad_rgb"), lambda: variant.ensure()):
         fake.name = "llvm_ad_rgb"  # as if the user had set it
         with pytest.raises(VariantError, match=f"needs LLVM {llvm.OLDEST} or newer; install: get llvm$"):

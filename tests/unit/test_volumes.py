@@ -14,8 +14,8 @@ import pytest
 
 import unrender as ur
 from unrender.gallery import parts, volumes
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 KEY = "cloud.interior_medium.sigma_t.data"
 
@@ -39,12 +39,12 @@ def test_parameters_of_media_are_differentiable_carried_and_bounded() -> None:
     found = MitsubaRenderer(scene(cloud())).parameters()
     extinction, albedo = found[KEY], found["cloud.interior_medium.albedo.data"]
     assert extinction.differentiable
-    assert extinction.carried
+    assert extinction.shares_paths
     assert (extinction.lowest, extinction.highest) == (0, None)
     assert (albedo.lowest, albedo.highest) == (0, 1)
     glow = {"type": "emissive", "sigma_t": cloud()["sigma_t"], "emission": cloud()["albedo"]}
     emission = MitsubaRenderer(scene(glow)).parameters()["cloud.interior_medium.emission.data"]
-    assert emission.carried
+    assert emission.shares_paths
     assert (emission.lowest, emission.highest) == (0, None)
 
 
@@ -102,7 +102,7 @@ def test_equal_states_give_equal_images_and_gradients_and_seeds_repeat(space: An
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1, (2, 8, 8, 3)))
     rows = []
     for _ in range(3):
-        pair = renderer.image_pair(current, current, Shot(0, 8, 5, groups=2), space)
+        pair = renderer.image_pair(current, current, SampleRequest(0, 8, 5, groups=2), space)
         np.testing.assert_array_equal(np.array(pair.images), np.array(pair.previous))
         both = renderer.adjoint_pair(current, current, pair.paths, weight, weight)
         a, b = (np.array(gradient[KEY]) for gradient in both)
@@ -120,7 +120,7 @@ def test_the_adjoint_of_a_pair_s_current_state_needs_no_weights_of_the_previous(
     current = renderer.values([KEY])
     previous = {KEY: current[KEY] * 1.5}
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1, (1, 8, 8, 3)))
-    pair = renderer.image_pair(current, previous, Shot(0, 16, 5), "path")
+    pair = renderer.image_pair(current, previous, SampleRequest(0, 16, 5), "path")
     alone = renderer.adjoint(current, pair.paths, weight)[KEY]
     both = renderer.adjoint_pair(current, previous, pair.paths, weight, weight * 0.5)[0][KEY]
     np.testing.assert_allclose(np.array(alone), np.array(both), rtol=1e-3, atol=1e-4 * np.abs(np.array(both)).max())
@@ -132,7 +132,7 @@ def test_density_that_was_zero_everywhere_is_found() -> None:
     renderer.select([KEY], "path")
     current = {KEY: renderer.values([KEY])[KEY] * 0.0}
     weight = renderer.array(np.ones((1, 8, 8, 3)))
-    paths = renderer.image(current, Shot(0, 256, 5)).paths
+    paths = renderer.image(current, SampleRequest(0, 256, 5)).paths
     gradient = np.array(renderer.adjoint(current, paths, weight)[KEY])
     assert np.isfinite(gradient).all()
     # Under a sky of one colour, what scatters gives a share of it back, and extinction takes all: a share 1 - albedo is lost.
@@ -145,7 +145,7 @@ def test_a_grid_made_by_others_is_rendered_and_differentiated(assets: Path) -> N
     renderer = MitsubaRenderer(scene({"type": "heterogeneous", "scale": 4.0, "sigma_t": smoke, "albedo": 0.8}), 4)
     renderer.select([KEY], "path")
     current = renderer.values([KEY])
-    rendering = renderer.image(current, Shot(0, 16 * 64, 5, groups=16))
+    rendering = renderer.image(current, SampleRequest(0, 16 * 64, 5, groups=16))
     gradient = np.array(renderer.adjoint(current, rendering.paths, renderer.array(np.ones((16, 8, 8, 3))))[KEY])
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import mitsuba_renderer, write
 
 import unrender as ur
-from unrender.keys import Key
+from unrender.core.random import Key
 
 HERE = Path(__file__).resolve().parent
 REFRESH = 20

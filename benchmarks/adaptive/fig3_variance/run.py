@@ -26,7 +26,7 @@ from schemes import SCHEMES, pixels
 from variance import gradients, spread
 
 import unrender as ur
-from unrender.gradients.path import PathGradient
+from unrender.estimators.path import PathGradient
 
 HERE = Path(__file__).resolve().parent
 FIVE_LEVELS = "adaptive, five levels"

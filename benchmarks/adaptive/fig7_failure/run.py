@@ -24,10 +24,10 @@ from common import read, write
 from variance import gradients, spread
 
 import unrender as ur
-from unrender.gradients.path import PathGradient
-from unrender.keys import Key
+from unrender.core.random import Key
+from unrender.estimators.path import PathGradient
 from unrender.pixels.base import PixelSampler
-from unrender.pixels.refreshed import MapDenoiser
+from unrender.pixels.guided import MapDenoiser
 
 HERE = Path(__file__).resolve().parent
 PROBLEMS = ("caustic", "plain-and-textured", "mirror-trio")

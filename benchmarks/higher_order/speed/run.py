@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import median_time, mitsuba_renderer, read, write
 
 import unrender as ur
-from unrender.gradients.black_box import BlackBox
-from unrender.keys import Key
+from unrender.core.random import Key
+from unrender.estimators.loss_values import BlackBox
 
 HERE = Path(__file__).resolve().parent
 BATCHES = (1, 2, 4, 8, 16, 32, 64)

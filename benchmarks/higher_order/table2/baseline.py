@@ -16,7 +16,7 @@ from common import mitsuba_renderer
 from race import GOALS, WINDOW, Descent, measured, truth_of
 
 import unrender as ur
-from unrender import flat
+from unrender.core import vectors
 
 MITSUBA = ("BUNNY", "TEXTURE")
 _SPP = {"BUNNY": 4, "TEXTURE": 8}
@@ -26,7 +26,7 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
     """One run of `mi.render`, `dr.backward`, `mi.ad.Adam`: projective sampling of silhouettes for BUNNY, `prb` for TEXTURE."""
     renderer = mitsuba_renderer(problem)
     scene, parameters = renderer.pair.previous, renderer.pair.previous_parameters
-    start = flat.ravel(problem.initial())
+    start = vectors.ravel(problem.initial())
     truth = truth_of(problem)
     place: Callable[[Any], None]
     if name == "BUNNY":

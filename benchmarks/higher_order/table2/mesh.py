@@ -25,9 +25,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import write
 
 import unrender as ur
-from unrender import flat
-from unrender.gradients.black_box import BlackBox
-from unrender.keys import Key
+from unrender.core import vectors
+from unrender.core.random import Key
+from unrender.estimators.loss_values import BlackBox
 
 HERE = Path(__file__).resolve().parent / "mesh"
 SIGMA = 0.05
@@ -69,7 +69,7 @@ class _Track(ur.Callback):
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         self.seconds.append(self.seconds[-1] + time.process_time() - self.resumed)
-        self.points.append(flat.ravel(run.parameters))
+        self.points.append(vectors.ravel(run.parameters))
         if self.seconds[-1] >= self.budget:
             run.stop("seconds")
         self.resumed = time.process_time()
@@ -77,7 +77,7 @@ class _Track(ur.Callback):
 
 def one(problem: ur.Problem, method: str, seconds: float, seed: int) -> dict[str, Any]:
     """One run: the pictures' loss at some steps."""
-    start = flat.ravel(problem.initial())
+    start = vectors.ravel(problem.initial())
     track = _Track(start, seconds)
     estimator, optimizer = METHODS[method](start.size)
     ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[track])
@@ -109,7 +109,7 @@ def main() -> None:
         for method in METHODS:
             found[method].append(one(problem, method, asked.seconds, run))
             print(method, found[method][-1], flush=True)
-    numbers = flat.ravel(problem.initial()).size
+    numbers = vectors.ravel(problem.initial()).size
     write(HERE, {**options, "numbers": numbers, "runs": asked.runs, "seconds": asked.seconds, "methods": found})
     figure, axis = plt.subplots(figsize=(5.5, 4), layout="constrained")
     grid = np.linspace(0, asked.seconds, 100)

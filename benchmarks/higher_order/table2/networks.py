@@ -34,7 +34,7 @@ from cnn import RESOLUTION, PoseNetwork, parameter_count
 from common import mitsuba_renderer, write
 
 import unrender as ur
-from unrender.rendering.port import Shot
+from unrender.rendering.renderer import SampleRequest
 
 HERE = Path(__file__).resolve().parent / "networks"
 GOALS = (0.1, 0.01)
@@ -86,7 +86,7 @@ class Data:
             key: np.clip(part, 0.0, 1.0) if key == COLOUR else part[:, 0]
             for key, part in zip(self.keys, parts, strict=True)
         }
-        images: mi.TensorXf = renderer.image_batch(state, Shot(0, spp, seed))
+        images: mi.TensorXf = renderer.image_batch(state, SampleRequest(0, spp, seed))
         dr.eval(images)
         return images.numpy()
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender import flat
-from unrender.gradients.black_box import BlackBox
-from unrender.keys import Key
+from unrender.core import vectors
+from unrender.core.random import Key
+from unrender.estimators.loss_values import BlackBox
 
 GOALS = (0.1, 0.01, 0.001)
 """Errors relative to the start: reductions of 90, 99 and 99.9 %."""
@@ -75,7 +75,7 @@ class _Track(ur.Callback):
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         self.clock += time.process_time() - self.resumed
-        self.add(flat.ravel(run.parameters), self.clock)
+        self.add(vectors.ravel(run.parameters), self.clock)
         self.samples = record["samples"]
         if np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1]:
             run.stop("goal")
@@ -91,7 +91,7 @@ class _Track(ur.Callback):
 
 def descend(problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int) -> Descent:
     """One run of the library's."""
-    truth, start = truth_of(problem), flat.ravel(problem.initial())
+    truth, start = truth_of(problem), vectors.ravel(problem.initial())
     track = _Track(truth, start, seconds)
     ur.optimize(problem, estimator, optimizer, seconds=_PATIENCE * seconds, seed=seed, callbacks=[track])
     size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender.trees import Tree
+from unrender.core.trees import Tree
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
 
 import unrender as ur
-from unrender import flat, smoothed
-from unrender.gradients.black_box import BlackBox
-from unrender.keys import Key
+from unrender import smoothing as smoothed
+from unrender.core import vectors
+from unrender.core.random import Key
+from unrender.estimators.loss_values import BlackBox
 
 HERE = Path(__file__).resolve().parent
 SIGMA = {"quad": 0.3, "box10": 0.3, "mug": 0.5}
@@ -50,7 +51,7 @@ def efficiency(
     parameters = problem.initial()
     problem.renderer.select(list(parameters), None, derivatives=False)
     box = BlackBox(problem, parameters, 1, Key(0))
-    theta = flat.ravel(parameters)
+    theta = vectors.ravel(parameters)
     counted = [0]
 
     def losses(points: np.ndarray) -> np.ndarray:

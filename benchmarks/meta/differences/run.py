@@ -21,13 +21,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import median_time, read, write
 
 import unrender as ur
-from unrender import arrays, trees
-from unrender.gradients.gather import gather
-from unrender.images.base import Beside
+from unrender.core import arrays, trees
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.estimators.sample_groups import gather
+from unrender.images.base import PairRequest
 from unrender.images.plain import PlainState
-from unrender.keys import Key
-from unrender.rendering.port import Shot
-from unrender.trees import Tree
+from unrender.rendering.renderer import SampleRequest
 
 HERE = Path(__file__).resolve().parent
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
@@ -37,7 +37,9 @@ STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 
 def difference(problem: ur.Problem, current: Tree, previous: Tree, space: Any, spp: int, key: Key) -> tuple[Tree, Tree]:
     """(F, ΔF) on `spp` coupled samples."""
-    found = gather(problem, current, ur.images.Plain(), PlainState(), spp, key, beside=Beside(previous, space))
+    found = gather(
+        problem, current, ur.images.Plain(), PlainState(), spp, key, pair_request=PairRequest(previous, space)
+    )
     assert found.previous is not None
     return found.gradient, trees.subtract(found.gradient, found.previous)
 
@@ -91,17 +93,19 @@ def costs(problem: ur.Problem) -> dict[str, float]:
             kept[0] = estimator.estimate(problem, points[-1], kept[0], Key(0, seed))[1]
 
         found[name] = median_time(step)[0]
-    shot = Shot(problem.views[0].sensor, 1, 5)
+    request = SampleRequest(problem.views[0].sensor, 1, 5)
     renderer = problem.renderer
-    pair = renderer.image_pair(parameters, previous, shot, "path")
+    pair = renderer.image_pair(parameters, previous, request, "path")
     weights = problem.loss_derivative(0, pair.images)
     found["one pair of images, 1 spp"] = median_time(
-        lambda seed: renderer.image_pair(parameters, previous, Shot(shot.sensor, 1, seed), "path")
+        lambda seed: renderer.image_pair(parameters, previous, SampleRequest(request.sensor, 1, seed), "path")
     )[0]
     found["one pair of adjoints, 1 spp"] = median_time(
         lambda seed: renderer.adjoint_pair(parameters, previous, pair.paths, weights, weights)
     )[0]
-    found["one image, 1 spp"] = median_time(lambda seed: renderer.image(parameters, Shot(shot.sensor, 1, seed)))[0]
+    found["one image, 1 spp"] = median_time(
+        lambda seed: renderer.image(parameters, SampleRequest(request.sensor, 1, seed))
+    )[0]
     found["one adjoint, 1 spp"] = median_time(lambda seed: renderer.adjoint(parameters, pair.paths, weights))[0]
     found["meta / plain 4 spp"] = found["meta 2 + 1"] / found["plain 4 spp"]
     print(problem.name, {k: round(v, 2) for k, v in found.items()}, flush=True)

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import read, write
 
 import unrender as ur
-from unrender.rendering.exponential import RATE
+from unrender.rendering.numpy.exponential import RATE
 
 HERE = Path(__file__).resolve().parent
 HORIZONS = (200, 400)

@@ -23,9 +23,9 @@ from along import drift
 from common import read, write
 
 import unrender as ur
-from unrender import arrays
-from unrender.keys import Key
-from unrender.trees import Tree
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 BETA_1, BETA_2 = 0.9, 0.999

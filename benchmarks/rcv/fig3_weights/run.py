@@ -32,9 +32,10 @@ from common import read, write
 from rcv.fig3_weights.track import squares, track
 
 import unrender as ur
-from unrender import arrays, statistics
-from unrender.keys import Key
-from unrender.rendering.port import Shot
+from unrender import statistics
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.rendering.renderer import SampleRequest
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 
@@ -81,7 +82,7 @@ def one_run(
     problem.renderer.select(list(start), "path")
     sensor = problem.views[0].sensor
     renders = [
-        arrays.numpy(problem.renderer.image(start, Shot(sensor, spp, Key(seed, step).uint32())).images[0])
+        arrays.numpy(problem.renderer.image(start, SampleRequest(sensor, spp, Key(seed, step).uint32())).images[0])
         for step in range(steps)
     ]
     renders = np.stack(renders).astype(np.float64)

@@ -8,8 +8,8 @@ import numpy as np
 from along import follow
 
 import unrender as ur
-from unrender import arrays
-from unrender.trees import Tree
+from unrender.core import arrays
+from unrender.core.trees import Tree
 
 
 def track(problem: ur.Problem, path: Sequence[Tree], spp: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

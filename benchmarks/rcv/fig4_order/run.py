@@ -29,11 +29,11 @@ from along import Moments, bias, converged, drift, follow, gallery, paired_bias,
 from common import read, write
 
 import unrender as ur
-from unrender import arrays
-from unrender.keys import Key
-from unrender.rendering.port import Shot
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import SampleRequest
 from unrender.statistics.recursion import advance
-from unrender.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 METHODS = {
@@ -63,8 +63,8 @@ def fixed(problem: ur.Problem, path: list[Tree], weights: list[Any], spp: int, s
     problem.renderer.select(list(path[0]), "path")
     memory: Any = None
     for step, (now, before) in enumerate(zip(path, [path[0], *path], strict=False)):
-        shot = Shot(problem.views[0].sensor, spp, Key(seed, step).uint32())
-        rendering = problem.renderer.image_pair(now, before, shot, "path")
+        request = SampleRequest(problem.views[0].sensor, spp, Key(seed, step).uint32())
+        rendering = problem.renderer.image_pair(now, before, request, "path")
         assert rendering.previous is not None
         F, H = (arrays.numpy(images[0]).astype(np.float64) for images in (rendering.images, rendering.previous))
         memory = F if memory is None else advance(memory, F, H, weights[step])

@@ -10,11 +10,11 @@ from along import Moments
 from matplotlib.lines import Line2D
 
 import unrender as ur
-from unrender import arrays
-from unrender.keys import Key
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
 from unrender.losses import Loss
-from unrender.rendering.port import Shot
-from unrender.trees import Tree
+from unrender.rendering.renderer import SampleRequest
 
 LOSSES: dict[str, Loss] = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 SPP = (1, 4, 16, 64)
@@ -30,8 +30,8 @@ def slopes(problem: ur.Problem, at: State, factor: float, spp: int, change: floa
     higher, lower, found = at(factor + change), at(factor - change), Moments()
     problem.renderer.select(list(higher), "path")
     for number in range(max(1, spp // 64)):
-        shot = Shot(problem.views[0].sensor, 64, Key(31_337, number).uint32())
-        pair = problem.renderer.image_pair(higher, lower, shot, "path")
+        request = SampleRequest(problem.views[0].sensor, 64, Key(31_337, number).uint32())
+        pair = problem.renderer.image_pair(higher, lower, request, "path")
         assert pair.previous is not None
         found.add((arrays.numpy(pair.images[0]) - arrays.numpy(pair.previous[0])) / (2 * change))
     return found.mean
@@ -56,8 +56,8 @@ def sample(
         problem.renderer.select(list(parameters), None)
         for spp in SPP:
             for run in range(runs):
-                shot = Shot(problem.views[0].sensor, spp, Key(run, 0 if common else index, spp).uint32())
-                image = arrays.numpy(problem.renderer.image(parameters, shot).images[0]).astype(np.float64)
+                request = SampleRequest(problem.views[0].sensor, spp, Key(run, 0 if common else index, spp).uint32())
+                image = arrays.numpy(problem.renderer.image(parameters, request).images[0]).astype(np.float64)
                 for name, loss in LOSSES.items():
                     value, derivative = loss.value(image, reference), loss.derivative(image, reference) * slope
                     found[name][str(spp)][index, run] = value.mean(), derivative.mean()

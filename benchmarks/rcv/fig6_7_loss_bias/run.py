@@ -30,8 +30,8 @@ from common import read, write
 from rcv.fig6_7_loss_bias.landscape import LOSSES, check, places, plot_landscape, sample, table
 
 import unrender as ur
-from unrender import arrays
-from unrender.trees import Tree
+from unrender.core import arrays
+from unrender.core.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 KEY = "back.bsdf.reflectance.data"

@@ -25,11 +25,11 @@ from along import Moments, converged, descent, follow, gallery, read_maps, write
 from common import median_time, read, write
 
 import unrender as ur
-from unrender import arrays
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimator
-from unrender.keys import Key
-from unrender.problem.frames import WholeView
-from unrender.trees import Tree
+from unrender.problem.batches import WholeView
 
 HERE = Path(__file__).resolve().parent
 SCENES = ("glossy-room", "indirect-room")

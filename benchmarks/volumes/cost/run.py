@@ -27,7 +27,7 @@ from common import mitsuba_renderer, write
 
 import unrender as ur
 from unrender.gallery import volumes
-from unrender.rendering.port import Shot
+from unrender.rendering.renderer import SampleRequest
 
 HERE = Path(__file__).resolve().parent
 
@@ -67,8 +67,8 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
     previous = {key: value * 0.98 for key, value in current.items()}
     size = np.asarray(problem.views[0].reference).shape
     weight = renderer.array(np.ones((1, *size)))
-    image = renderer.image(current, Shot(0, spp, 1)).paths
-    pair = renderer.image_pair(current, previous, Shot(0, spp, 1), "path").paths
+    image = renderer.image(current, SampleRequest(0, spp, 1)).paths
+    pair = renderer.image_pair(current, previous, SampleRequest(0, spp, 1), "path").paths
 
     description = renderer.pair.description
     assert callable(description)
@@ -92,12 +92,12 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
 
     return {
         "volpath": lambda n: dr.eval(mi.render(stock, integrator=volpath, spp=spp, seed=mi.UInt32(n))),
-        "primal": lambda n: renderer.image(current, Shot(0, spp, n)),
-        "pair": lambda n: renderer.image_pair(current, previous, Shot(0, spp, n), "path"),
+        "primal": lambda n: renderer.image(current, SampleRequest(0, spp, n)),
+        "pair": lambda n: renderer.image_pair(current, previous, SampleRequest(0, spp, n), "path"),
         "adjoint": lambda n: renderer.adjoint(current, image, weight),
         "adjoint of a pair": lambda n: renderer.adjoint_pair(current, previous, pair, weight, weight),
         "primal and adjoint": lambda n: renderer.adjoint(
-            current, renderer.image(current, Shot(0, spp, n)).paths, weight
+            current, renderer.image(current, SampleRequest(0, spp, n)).paths, weight
         ),
         "prbvolpath, primal and adjoint": prbvolpath_step,
     }

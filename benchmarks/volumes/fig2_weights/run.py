@@ -23,7 +23,7 @@ from common import read, write
 from rcv.fig3_weights.track import squares, track
 
 import unrender as ur
-from unrender import arrays
+from unrender.core import arrays
 
 HERE = Path(__file__).resolve().parent
 METHODS = {"rcv": ur.images.RecursiveControlVariate(), "plain": ur.images.Plain()}

@@ -24,7 +24,7 @@ from common import read, write
 from rcv.fig6_7_loss_bias.landscape import LOSSES, SPP, Values, check, places, plot_landscape, sample, table
 
 import unrender as ur
-from unrender.trees import Tree
+from unrender.core.trees import Tree
 
 HERE = Path(__file__).resolve().parent
 KEY = "fog.interior_medium.sigma_t.value.value"

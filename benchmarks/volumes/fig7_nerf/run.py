@@ -29,12 +29,12 @@ from judged import at, compete, follow
 from races import TUNING_SEED, Entrant, colours, draw
 
 import unrender as ur
-from unrender import arrays
-from unrender.gradients.estimate import Estimator
-from unrender.keys import Key
-from unrender.optimizers.schedules import Constant, Cosine, Schedule
-from unrender.rendering.port import Shot
-from unrender.trees import Tree
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimator
+from unrender.rendering.renderer import SampleRequest
+from unrender.schedules.functions import Constant, Cosine, Schedule
 
 HERE = Path(__file__).resolve().parent
 SPP = (2, 4, 8)
@@ -85,8 +85,8 @@ class Pictures:
         """Root mean square over the views "seen", and over those "unseen"."""
         squares: dict[str, list[float]] = {"seen": [], "unseen": []}
         for number, (sensor, reference) in enumerate(zip(self.sensors, self.references, strict=True)):
-            shot = Shot(sensor, self.spp, Key(424_242, number).uint32(), 2)
-            a, b = arrays.numpy(self.renderer.image(parameters, shot).images).astype(np.float64) - reference
+            request = SampleRequest(sensor, self.spp, Key(424_242, number).uint32(), 2)
+            a, b = arrays.numpy(self.renderer.image(parameters, request).images).astype(np.float64) - reference
             squares["unseen" if number in UNSEEN else "seen"].append(float(np.mean(a * b)))
         return {name: max(float(np.mean(x)), 0.0) ** 0.5 for name, x in squares.items()}
 

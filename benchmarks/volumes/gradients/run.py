@@ -26,8 +26,8 @@ from common import write
 
 import unrender as ur
 from unrender.gallery import parts, volumes
-from unrender.rendering.mitsuba_renderer import MitsubaRenderer
-from unrender.rendering.port import Shot
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
 
 HERE = Path(__file__).resolve().parent
 SIZE, SPP, VOXELS, DEPTH = 16, 64, 6, 5
@@ -97,7 +97,7 @@ def main() -> None:
     current, weight = renderer.values([EXTINCTION, ALBEDO]), renderer.array(WEIGHT)
     methods = {
         "differential ratio tracking": lambda seed: renderer.adjoint(
-            current, renderer.image(current, Shot(0, SPP, seed)).paths, weight
+            current, renderer.image(current, SampleRequest(0, SPP, seed)).paths, weight
         ),
         "prbvolpath": stock(current),
     }
@@ -105,7 +105,7 @@ def main() -> None:
 
     def difference(key: str, high: np.ndarray, low: np.ndarray, seed: int) -> float:
         states = [{**current, key: renderer.array(value)} for value in (high, low)]
-        pair = renderer.image_pair(states[0], states[1], Shot(0, 4 * SPP, seed), "path")
+        pair = renderer.image_pair(states[0], states[1], SampleRequest(0, 4 * SPP, seed), "path")
         return float(((np.array(pair.images).astype(np.float64) - np.array(pair.previous)) * WEIGHT).sum())
 
     table = {}

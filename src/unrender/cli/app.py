@@ -15,7 +15,7 @@ from unrender.cli.report import report
 from unrender.cli.resume import resume
 from unrender.cli.run import run
 from unrender.cli.watch import watch
-from unrender.training.result import versions
+from unrender.runs.result import versions
 
 app = typer.Typer(
     help="Recover what a scene is made of (textures, materials, light) from images of it.",

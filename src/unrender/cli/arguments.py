@@ -12,9 +12,10 @@ from typing import Annotated, Any
 
 import typer
 
-from unrender import gallery, variant
-from unrender.errors import InputError
-from unrender.names import did_you_mean
+from unrender import gallery
+from unrender.backend import variant
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 from unrender.problem.problem import Problem
 
 DEFAULT_STEPS = 300

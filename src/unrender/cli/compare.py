@@ -17,9 +17,9 @@ from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import Plan, execute, introduce
-from unrender.errors import InputError
-from unrender.methods import METHODS, Method, method
-from unrender.metrics import has_flip
+from unrender.core.errors import InputError
+from unrender.evaluation.metrics import has_flip
+from unrender.methods.catalogue import METHODS, Method, method
 from unrender.report import words
 from unrender.report.equal_time import Comparison, Spread
 

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from unrender import llvm, variant
-from unrender.errors import VariantError
+from unrender.backend import llvm, variant
+from unrender.core.errors import VariantError
 
 TOLERANCE = 1e-3
 """The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""

@@ -13,11 +13,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from unrender.cli.progress import Progress
-from unrender.methods import Method
+from unrender.methods.catalogue import Method
 from unrender.problem.problem import Problem
-from unrender.training.live import Live
-from unrender.training.loop import About, optimize
-from unrender.training.result import Result
+from unrender.runs.live import Live
+from unrender.runs.loop import RunAnnotations, optimize
+from unrender.runs.result import Result
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def execute(plan: Plan, directory: Path, console: Console) -> Result:
     options = plan.method.configure(plan.settings).model_dump()
     kept = {"options": options, "problem_options": dict(plan.problem_settings)}
     kept = {name: value for name, value in kept.items() if value}
-    about = About(plan.method.name, kept, plan.command, plan.final_spp)
+    about = RunAnnotations(plan.method.name, kept, plan.command, plan.final_spp)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
     with Progress(console) as progress:
         result = optimize(

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Variant
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 
 
 def export(
@@ -26,7 +26,7 @@ def export(
     if not directory.is_dir():
         raise InputError(f"{directory}: no such run folder")
     arguments.use_variant(variant)
-    from unrender.exporting.folder import export as write
+    from unrender.exporting.scene_folder import export as write
 
     done = write(directory, directory / "scene" if out is None else out, overwrite, spp)
     for notice in done.notices:

@@ -17,10 +17,10 @@ from unrender import gallery as problems
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import introduce
-from unrender.files import write
+from unrender.io.files import write
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
-from unrender.report import pictures
+from unrender.report import images
 
 _SPP = 64
 
@@ -85,16 +85,16 @@ def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
     written: list[Path] = []
     for index, view in enumerate(problem.views):
         reference = np.asarray(view.reference, np.float32)
-        shots = {"reference": reference, "start": render(problem, None, index, spp or _SPP)}
+        requests = {"reference": reference, "start": render(problem, None, index, spp or _SPP)}
         if set(problem.truth) == {parameter.key for parameter in problem.parameters}:
-            shots["truth"] = render(problem, problem.truth, index, spp or _SPP)
-        for what, picture in shots.items():
+            requests["truth"] = render(problem, problem.truth, index, spp or _SPP)
+        for what, picture in requests.items():
             path = folder / f"view{index}-{what}.png"
-            written.append(write(path, _png(picture * pictures.exposure(reference))))
+            written.append(write(path, _png(picture * images.exposure(reference))))
     return written
 
 
 def _png(linear: np.ndarray) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray((pictures.srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    Image.fromarray((images.srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
     return buffer.getvalue()

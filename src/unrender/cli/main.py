@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import typer
 
-from unrender import variant
+from unrender.backend import variant
 from unrender.cli.doctor import doctor
-from unrender.errors import UnrenderError, VariantError
+from unrender.core.errors import UnrenderError, VariantError
 
 INPUT, ENVIRONMENT, INTERRUPTED = 2, 3, 130
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.methods import METHODS, Method, method
+from unrender.methods.catalogue import METHODS, Method, method
 
 
 def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None) -> None:

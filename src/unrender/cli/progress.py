@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
-from unrender.training.callbacks import Callback
+from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
-    from unrender.training.loop import Run
-    from unrender.training.result import Result
+    from unrender.runs.loop import Run
+    from unrender.runs.result import Result
 
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 2.0

@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from unrender import reopen
 from unrender.cli import arguments
 from unrender.cli.arguments import Threads
 from unrender.cli.execute import introduce
 from unrender.cli.progress import Progress
 from unrender.cli.run import conclude
-from unrender.training.live import Live
-from unrender.training.resume import go_on, look
+from unrender.runs import reopen
+from unrender.runs.live import Live
+from unrender.runs.resume import load_run, resume_run
 
 
 def resume(
@@ -37,13 +37,13 @@ def resume(
     console = Console(highlight=False)
     if steps is not None or seconds is not None:
         steps, seconds = arguments.budget(steps, seconds)
-    found = look(directory, steps, seconds)
+    found = load_run(directory, steps, seconds)
     alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
     running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)
     problem = reopen.problem_of(directory)
     introduce(console, problem, running)
     live = Live(directory, problem.name, found.record.method, found.record.command)
     with Progress(console) as progress:
-        result = go_on(found, problem, force, [progress, live])
+        result = resume_run(found, problem, force, [progress, live])
     live.clear()
     conclude(console, problem, result, directory)

@@ -14,10 +14,10 @@ from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
 from unrender.cli.execute import Plan, execute, introduce, summarise
-from unrender.errors import InputError
-from unrender.methods import method
+from unrender.core.errors import InputError
+from unrender.methods.catalogue import method
 from unrender.problem.problem import Problem
-from unrender.training.result import Result
+from unrender.runs.result import Result
 
 INTERRUPTED = 130
 

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from unrender.errors import InputError
-from unrender.names import did_you_mean
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 from unrender.watch import server
 
 _NICE = 10
@@ -28,9 +28,11 @@ def watch(
     """
     for directory in directories:
         if not directory.is_dir():
-            beside = [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []
+            pair_request = (
+                [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []
+            )
             what = "a file, expected a run folder" if directory.exists() else "no such folder"
-            raise InputError(f"{directory}: {what}{did_you_mean(directory.name, beside)}")
+            raise InputError(f"{directory}: {what}{did_you_mean(directory.name, pair_request)}")
     if len({directory.resolve() for directory in directories}) < len(directories):
         raise InputError("watch: a run folder is given twice")
     with server.listen(port) as opened:

@@ -16,8 +16,8 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 
-from unrender.errors import InputError
-from unrender.variant import ensure
+from unrender.backend.variant import ensure
+from unrender.core.errors import InputError
 
 _LABEL = re.compile(r"n(\d+)")
 _MARK = "unrender_node"

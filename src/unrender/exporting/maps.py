@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from unrender.exporting.ready_made import as_bitmap, file_name
-from unrender.problem.grids import write_grid
-from unrender.report.pictures import srgb
+from unrender.io.volumes import write_grid
+from unrender.report.images import srgb
 
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
 _LARGEST = 64

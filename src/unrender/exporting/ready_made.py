@@ -14,8 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.errors import InputError
-from unrender.problem.grids import write_grid
+from unrender.core.errors import InputError
+from unrender.io.volumes import write_grid
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """The folders of a scene's files."""

@@ -8,10 +8,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 from unrender.exporting.graph import Place, SceneGraph
 from unrender.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name
-from unrender.problem.grids import write_grid
+from unrender.io.volumes import write_grid
 
 _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 _METALS = ("conductor", "roughconductor")

@@ -26,7 +26,7 @@ class Bunny:
 
     resolution: int = fields.resolution(48)
     mesh: str = mesh_files.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
-    detail: int = fields.whole(
+    detail: int = fields.integer(
         1, "how fine the mesh made by code is: 3600 vertices at 1, times the square", at_least=1, at_most=16
     )
     reference_spp: int = fields.reference_spp(1024)

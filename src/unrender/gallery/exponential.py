@@ -11,7 +11,7 @@ from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.exponential import RATE, ExponentialRenderer
+from unrender.rendering.numpy.exponential import RATE, ExponentialRenderer
 
 _MEAN, _START = 2.0, 1.5
 

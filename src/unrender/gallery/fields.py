@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from unrender import checks
-from unrender.errors import InputError
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 from unrender.losses import Loss
-from unrender.names import did_you_mean
 from unrender.problem.components import LOSSES, make
 
 
@@ -31,11 +31,11 @@ class Option:
     about: str
 
 
-def whole(default: int, about: str, at_least: int = 1, at_most: int | None = None) -> Any:
+def integer(default: int, about: str, at_least: int = 1, at_most: int | None = None) -> Any:
     """A dataclass field: a whole number in [at_least, at_most]."""
 
     def check(owner: str, name: str, value: Any) -> int:
-        number = checks.whole(owner, name, value, at_least)
+        number = checks.integer(owner, name, value, at_least)
         if at_most is not None and number > at_most:
             raise InputError(f"{owner}: {name} must be at most {at_most}, got {number}")
         return number
@@ -45,22 +45,22 @@ def whole(default: int, about: str, at_least: int = 1, at_most: int | None = Non
 
 def resolution(default: int) -> Any:
     """The field `resolution`."""
-    return whole(default, "pixels along a side of each view", at_least=4)
+    return integer(default, "pixels along a side of each view", at_least=4)
 
 
 def texture_resolution(default: int) -> Any:
     """The field `texture_resolution`."""
-    return whole(default, "texels along a side of each unknown map", at_least=2)
+    return integer(default, "texels along a side of each unknown map", at_least=2)
 
 
 def reference_spp(default: int) -> Any:
     """The field `reference_spp`."""
-    return whole(default, "samples per pixel of the reference pictures")
+    return integer(default, "samples per pixel of the reference pictures")
 
 
 def max_depth(default: int, at_least: int) -> Any:
     """The field `max_depth`."""
-    return whole(default, "longest light path in segments", at_least=at_least)
+    return integer(default, "longest light path in segments", at_least=at_least)
 
 
 def _check_loss(owner: str, name: str, value: Any) -> Loss:
@@ -78,17 +78,19 @@ LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber or Perceptual", "check
 """The metadata of the field `loss`."""
 
 
-def of(recipe: type) -> list[Option]:
+def of(specification: type) -> list[Option]:
     """The options that a recipe has, in its order."""
-    return [Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(recipe)]
+    return [
+        Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(specification)
+    ]
 
 
-def fill(name: str, recipe: type, given: Mapping[str, Any]) -> Any:
+def fill(name: str, specification: type, given: Mapping[str, Any]) -> Any:
     """The recipe with these options, the others at their defaults.
 
     Raises `InputError` for one that is unknown (with the nearest known one) or out of its range.
     """
-    fields = {f.name: f for f in dataclasses.fields(recipe)}
+    fields = {f.name: f for f in dataclasses.fields(specification)}
     owner = f"gallery problem {name}"
     taken = {}
     for key, value in given.items():
@@ -96,4 +98,4 @@ def fill(name: str, recipe: type, given: Mapping[str, Any]) -> Any:
             hint = did_you_mean(key, fields) or f"; it has {', '.join(fields)}"
             raise InputError(f"{owner}: no option {key}{hint}")
         taken[key] = fields[key].metadata["check"](owner, key, value)
-    return recipe(**taken)
+    return specification(**taken)

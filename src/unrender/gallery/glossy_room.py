@@ -38,7 +38,7 @@ class GlossyRoom:
 
     resolution: int = fields.resolution(128)
     texture_resolution: int = fields.texture_resolution(32)
-    views: int = fields.whole(3, "cameras, side by side", at_least=1, at_most=16)
+    views: int = fields.integer(3, "cameras, side by side", at_least=1, at_most=16)
     reference_spp: int = fields.reference_spp(192)
     max_depth: int = fields.max_depth(5, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 
 _KINDS = (".ply", ".obj")
 

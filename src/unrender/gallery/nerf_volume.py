@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from unrender.gallery import fields, parts, staging, volumes
-from unrender.gallery.recipe import reference
+from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.scene_pair import load
+from unrender.rendering.mitsuba.scene_pair import load
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class NerfVolume:
     """
 
     resolution: int = fields.resolution(32)
-    grid_resolution: int = fields.whole(16, "voxels along a side of each unknown grid", at_least=2)
-    views: int = fields.whole(16, "cameras, evenly around the toy", at_least=1, at_most=64)
+    grid_resolution: int = fields.integer(16, "voxels along a side of each unknown grid", at_least=2)
+    views: int = fields.integer(16, "cameras, evenly around the toy", at_least=1, at_most=64)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)

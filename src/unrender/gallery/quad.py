@@ -11,7 +11,7 @@ from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.quadratic import POINT, QuadraticRenderer
+from unrender.rendering.numpy.quadratic import POINT, QuadraticRenderer
 
 _MATRIX = np.array([[5.0, 3.75], [3.75, 5.0]])
 _START = (1.5, 1.0)

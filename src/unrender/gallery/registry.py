@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from unrender.errors import InputError
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 from unrender.gallery import fields
 from unrender.gallery.ajar import Ajar
 from unrender.gallery.boxes import Box2, Box10
@@ -22,9 +23,9 @@ from unrender.gallery.nerf_volume import NerfVolume
 from unrender.gallery.plain_and_textured import PlainAndTextured
 from unrender.gallery.poster import Poster
 from unrender.gallery.quad import Quad
-from unrender.gallery.recipe import cook
 from unrender.gallery.shadow import Shadow
 from unrender.gallery.smoke import Smoke
+from unrender.gallery.specification import build_problem
 from unrender.gallery.sphere_to_mesh import SphereToMesh
 from unrender.gallery.spiral import Spiral
 from unrender.gallery.sun_glossy import SunGlossy
@@ -32,7 +33,6 @@ from unrender.gallery.sunlit_vase import SunlitVase
 from unrender.gallery.tea import Tea
 from unrender.gallery.three_bodies import ThreeBodies
 from unrender.gallery.two_planets import TwoPlanets
-from unrender.names import did_you_mean
 from unrender.problem.problem import Problem
 
 _RECIPES: dict[str, type] = {
@@ -74,12 +74,12 @@ def names() -> list[str]:
 
 def summary(name: str) -> str:
     """One line: what is to be recovered, and from what. Raises `InputError` for an unknown name."""
-    return (_recipe(name).__doc__ or "").split("\n")[0]
+    return (_specification(name).__doc__ or "").split("\n")[0]
 
 
 def options(name: str) -> list[Option]:
     """What `problem(name, ...)` may be asked for. Raises `InputError` for an unknown name."""
-    return fields.of(_recipe(name))
+    return fields.of(_specification(name))
 
 
 def problem(name: str, **options: Any) -> Problem:
@@ -100,13 +100,13 @@ def problem(name: str, **options: Any) -> Problem:
         InputError: the name or an option is unknown, or an option is out of its range.
         VariantError: Mitsuba cannot run on this machine.
     """
-    recipe = fields.fill(name, _recipe(name), options)
-    made = recipe.problem(name) if isinstance(recipe, _OWN) else cook(name, recipe)
+    specification = fields.fill(name, _specification(name), options)
+    made = specification.problem(name) if isinstance(specification, _OWN) else build_problem(name, specification)
     made.origin |= {"gallery": name, "options": options}
     return made
 
 
-def _recipe(name: str) -> type:
+def _specification(name: str) -> type:
     if not isinstance(name, str) or name not in _RECIPES:
         hint = did_you_mean(str(name), _RECIPES) or f"; it has {', '.join(_RECIPES)}"
         raise InputError(f"gallery: no problem {name}{hint}")

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from unrender.gallery import fields, mesh_files, meshes, parts, staging, textures
-from unrender.gallery.recipe import reference
+from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.scene_pair import load
+from unrender.rendering.mitsuba.scene_pair import load
 
 _RADIUS = 0.7
 """Of the sphere; the body fits into a ball of radius 1 or so."""
@@ -33,8 +33,8 @@ class SphereToMesh:
     """
 
     resolution: int = fields.resolution(48)
-    views: int = fields.whole(6, "cameras, around the body, by turns lower and higher", at_least=1, at_most=32)
-    subdivisions: int = fields.whole(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
+    views: int = fields.integer(6, "cameras, around the body, by turns lower and higher", at_least=1, at_most=32)
+    subdivisions: int = fields.integer(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
     mesh: str = mesh_files.option("PLY or OBJ file of the body, in place of the one made by code")
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(2, at_least=2)

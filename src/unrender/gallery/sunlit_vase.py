@@ -29,7 +29,7 @@ class SunlitVase:
 
     resolution: int = fields.resolution(128)
     texture_resolution: int = fields.texture_resolution(64)
-    views: int = fields.whole(3, "cameras, evenly around the vase", at_least=1, at_most=16)
+    views: int = fields.integer(3, "cameras, evenly around the vase", at_least=1, at_most=16)
     reference_spp: int = fields.reference_spp(384)
     max_depth: int = fields.max_depth(5, at_least=2)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from unrender import arrays
-from unrender.arrays import Array
-from unrender.keys import Key
-from unrender.problem.frames import Frame
+from unrender.core import arrays
+from unrender.core.arrays import Array
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Space
-from unrender.trees import Tree
+from unrender.rendering.renderer import Space
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _others(images: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Beside:
+class PairRequest:
     """The state that is to be rendered beside the current one, from the same samples.
 
     Attributes:
@@ -96,9 +96,9 @@ class ImageEstimator(Protocol):
         spp: int,
         groups: int,
         key: Key,
-        beside: Beside | None = None,
+        pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """The image of one frame, and what is to be kept of it; with `beside`, that of the previous parameters too."""
+        """The image of one frame, and what is to be kept of it; with `pair_request`, that of the previous parameters too."""
         ...
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:

@@ -6,17 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from unrender import arrays, checks, denoising
-from unrender.arrays import Array
-from unrender.denoising import Denoiser
-from unrender.errors import InputError
-from unrender.images.base import Beside, ImageEstimate, ImageEstimator
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.evaluation import denoising
+from unrender.evaluation.denoising import Denoiser
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import Plain
-from unrender.keys import Key
-from unrender.problem.frames import Frame
+from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Space
-from unrender.trees import Tree
+from unrender.rendering.renderer import Space
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Denoised:
     groups: int = 2
 
     def __post_init__(self):
-        checks.whole("Denoised", "groups", self.groups, 2)
+        checks.integer("Denoised", "groups", self.groups, 2)
         if isinstance(self.inner, (type, Denoised)):
             raise InputError(f"Denoised: inner must be an image estimator such as Plain(), got {self.inner!r}")
 
@@ -76,10 +77,12 @@ class Denoised:
         spp: int,
         groups: int,
         key: Key,
-        beside: Beside | None = None,
+        pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
         """See `ImageEstimator.estimate`."""
-        found, kept = self.inner.estimate(problem, parameters, state, frame, spp, self._groups(groups), key, beside)
+        found, kept = self.inner.estimate(
+            problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
+        )
         return replace(found, clean=self._cleaner(problem)), kept
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:

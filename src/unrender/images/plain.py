@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from unrender.images.base import Beside, ImageEstimate
-from unrender.keys import Key
-from unrender.problem.frames import Frame
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.images.base import ImageEstimate, PairRequest
+from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Space
-from unrender.trees import Tree
+from unrender.rendering.renderer import Space
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,15 @@ class Plain:
         spp: int,
         groups: int,
         key: Key,
-        beside: Beside | None = None,
+        pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, None]:
         """See `ImageEstimator.estimate`."""
         del state
-        shot = frame.shot(spp, key.uint32(), groups)
-        if beside is None:
-            rendering = problem.renderer.image(parameters, shot)
+        request = frame.request(spp, key.uint32(), groups)
+        if pair_request is None:
+            rendering = problem.renderer.image(parameters, request)
         else:
-            rendering = problem.renderer.image_pair(parameters, beside.previous, shot, beside.space)
+            rendering = problem.renderer.image_pair(parameters, pair_request.previous, request, pair_request.space)
         return ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous), None
 
     def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:

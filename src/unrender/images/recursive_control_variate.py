@@ -8,17 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from unrender import arrays, checks, statistics, trees
-from unrender.arrays import Array
-from unrender.errors import InputError
-from unrender.images.base import Beside, ImageEstimate
-from unrender.keys import Key
-from unrender.problem.frames import Frame, PixelBatch, WholeView
+from unrender import statistics
+from unrender.core import arrays, checks, trees
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.images.base import ImageEstimate, PairRequest
+from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Space
+from unrender.rendering.renderer import Space
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
-from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class RecursiveControlVariate:
     whole_views: int = 20
 
     def __post_init__(self):
-        checks.whole("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
+        checks.integer("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
         if self.space not in ("path", "primary"):
             raise InputError(f'RecursiveControlVariate: space must be "path" or "primary", got {self.space!r}')
         for name in ("alpha", "beta"):
@@ -141,19 +142,19 @@ class RecursiveControlVariate:
         spp: int,
         groups: int,
         key: Key,
-        beside: Beside | None = None,
+        pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, ViewMemory | None]:
         """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone.
 
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
         one as far as the two can share it: they differ by F − H.
         """
-        shot = frame.shot(spp, key.uint32(), groups)
+        request = frame.request(spp, key.uint32(), groups)
         fresh = self._fresh(parameters, state)
         previous = parameters if fresh or state.parameters is None else state.parameters
         # Two memories that are carried together must be of the same step.
-        assert beside is None or all(previous[key] is value for key, value in beside.previous.items())
-        rendering = problem.renderer.image_pair(parameters, previous, shot, self.space)
+        assert pair_request is None or all(previous[key] is value for key, value in pair_request.previous.items())
+        rendering = problem.renderer.image_pair(parameters, previous, request, self.space)
         assert rendering.previous is not None
         if isinstance(frame, PixelBatch):
             assert state.snapshot is not None
@@ -183,9 +184,9 @@ class RecursiveControlVariate:
         )
         known = var_current > 0
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
-        told = {"control_weight": weight, "variance": variance}
+        info = {"control_weight": weight, "variance": variance}
         beside_it = advance(memory.image, rendering.previous, rendering.previous, weight)
-        estimate = ImageEstimate(images, rendering.paths, told, beside_it)
+        estimate = ImageEstimate(images, rendering.paths, info, beside_it)
         return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
 
     def advance(

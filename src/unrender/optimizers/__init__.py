@@ -1,6 +1,6 @@
 """What turns estimates into steps."""
 
-from unrender.optimizers import schedules
+from unrender import schedules
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.cma_es import CMAES

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from unrender import arrays, checks, trees
-from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.core import arrays, checks, trees
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Adam:
         beta_1: decay of the mean, in [0, 1).
         beta_2: decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
-        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 0.01

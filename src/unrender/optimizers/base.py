@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from unrender.gradients.estimate import Estimate
-from unrender.trees import Tree
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
 
 
 class Optimizer(Protocol):

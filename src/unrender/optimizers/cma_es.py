@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from unrender import checks, flat
-from unrender.errors import InputError
-from unrender.gradients.estimate import LOSSES, Estimate
+from unrender.core import checks, vectors
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.estimators.base import LOSSES, Estimate
 from unrender.optimizers import rates
-from unrender.trees import Tree
 
 _NEAR = 0.01
 """How far parameters may be from the search's mean, in its standard deviations, and still count as there."""
@@ -85,9 +85,9 @@ class CMAES:
     def __post_init__(self):
         rates.check("CMAES", self.learning_rate, None)
         checks.number("CMAES", "sigma0", self.sigma0, above=0.0)
-        checks.whole("CMAES", "seed", self.seed, at_least=0)
+        checks.integer("CMAES", "seed", self.seed, at_least=0)
         if self.population is not None:
-            checks.whole("CMAES", "population", self.population, at_least=4)
+            checks.integer("CMAES", "population", self.population, at_least=4)
         if not isinstance(self.diagonal, bool):
             raise InputError(f"CMAES: diagonal must be True or False, got {self.diagonal!r}")
 
@@ -99,7 +99,7 @@ class CMAES:
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
         """See `Optimizer.init`."""
         own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
-        start = flat.ravel(parameters) / flat.spread(own, parameters)
+        start = vectors.ravel(parameters) / vectors.spread(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))
         ranks, held = np.zeros((0, population), np.int32), np.zeros(0, np.int32)
         return CMAESState(own, start, ranks, held, np.zeros((0, start.size)))
@@ -109,8 +109,8 @@ class CMAES:
         assert estimate.losses is not None
         search = state._search or self._again(state)
         object.__setattr__(state, "_search", None)  # whatever comes now, it is no longer this state's
-        scale = flat.spread(state.learning_rates, parameters)
-        here, generation = flat.ravel(parameters) / scale, len(state.ranks)
+        scale = vectors.spread(state.learning_rates, parameters)
+        here, generation = vectors.ravel(parameters) / scale, len(state.ranks)
         if search.is_elsewhere(here):
             search.hold(here)
             held = np.append(state.held, np.int32(generation))
@@ -124,7 +124,7 @@ class CMAES:
         state = replace(state, ranks=np.concatenate([state.ranks, ranks[None]]))
         object.__setattr__(state, "_search", search)
         step = scale * (search.mean - here) if ranks.any() else np.zeros_like(here)
-        return flat.unravel(step, parameters), state
+        return vectors.unravel(step, parameters), state
 
     def _again(self, state: CMAESState) -> _Search:
         """The search of a state that has none: it is told everything once more."""

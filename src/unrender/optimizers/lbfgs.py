@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import LbfgsInvHessProduct
 
-from unrender import arrays, checks, flat
-from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.core import arrays, checks, vectors
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 _FIRST = 0.1
 """Length of a step before any curvature is known, as a share of the trust radius."""
@@ -63,7 +63,7 @@ class LBFGS:
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, and makes a step of its own length, by its own
             learning rate or the parameter's.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 1.0
@@ -77,7 +77,7 @@ class LBFGS:
     def __post_init__(self):
         check("LBFGS", self)
         checks.number("LBFGS", "trust_radius", self.trust_radius, above=0.0)
-        checks.whole("LBFGS", "history", self.history, at_least=1)
+        checks.integer("LBFGS", "history", self.history, at_least=1)
         checks.number("LBFGS", "curvature", self.curvature, above=0.0, below=1.0)
 
     @property
@@ -94,7 +94,7 @@ class LBFGS:
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
         """See `Optimizer.update`. On the host."""
         scale = scales(estimate, state.directed, parameters)
-        here, gradient = flat.ravel(parameters), flat.ravel(estimate.gradient)
+        here, gradient = vectors.ravel(parameters), vectors.ravel(estimate.gradient)
         if state.directed.step:
             state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)
         direction = scale * self._direction(state, scale * gradient, scale)
@@ -123,4 +123,4 @@ class LBFGS:
         # SciPy's B starts from the identity: in coordinates u / √β that is β in those of u.
         beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])
         inverse = LbfgsInvHessProduct(moves / math.sqrt(beta), changes * math.sqrt(beta))
-        return flat.within(-beta * inverse.matvec(gradient), self.trust_radius)
+        return vectors.clip_norm(-beta * inverse.matvec(gradient), self.trust_radius)

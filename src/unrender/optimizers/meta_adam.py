@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from unrender import arrays, checks
-from unrender.gradients.estimate import GRADIENT, VARIANCE, Estimate
+from unrender.core import arrays, checks
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
 from unrender.optimizers import rates
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class MetaAdam:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
         epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 stay where they are.
             It is far below Adam's (whose ε stands outside the root): a texel's share of a mean over pixels is small.
-        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
         longest: the longest step of an element in units of η, > 0; None for no limit.
     """
 

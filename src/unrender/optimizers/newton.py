@@ -12,13 +12,13 @@ from typing import Protocol
 
 import numpy as np
 
-from unrender import arrays, checks, flat
-from unrender.errors import InputError
-from unrender.gradients.estimate import GRADIENT, HESSIAN, Estimate
+from unrender.core import arrays, checks, vectors
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, HESSIAN, Estimate
 from unrender.optimizers import rates
 from unrender.optimizers.adam import Adam, AdamState
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 _SECULAR_ITERATIONS = 60
 
@@ -65,7 +65,7 @@ class Newton:
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
             optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`.
+        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 1.0
@@ -95,7 +95,7 @@ class Newton:
         assert estimate.hessian is not None
         scale = scales(estimate, state, parameters)
         hessian = scale[:, None] * arrays.numpy(estimate.hessian).astype(np.float64) * scale
-        step = self._solve(scale * flat.ravel(estimate.gradient), hessian)
+        step = self._solve(scale * vectors.ravel(estimate.gradient), hessian)
         return finish("Newton", self, scale * step, state, parameters)
 
     def _solve(self, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
@@ -127,7 +127,7 @@ def _least(bend: np.ndarray, slope: np.ndarray, radius: float | None) -> np.ndar
             break
         extra += length**2 / float(np.sum(step * step / (bend + extra))) * (length - radius) / radius
         step = -slope / (bend + extra)
-    return flat.within(step, radius)
+    return vectors.clip_norm(step, radius)
 
 
 class Directed(Protocol):
@@ -167,7 +167,7 @@ def begin(owner: str, options: Directed, parameters: Tree, learning_rates: Mappi
 def scales(estimate: Estimate, state: NewtonState, parameters: Tree) -> np.ndarray:
     """The unit of each element's coordinate u, (n,): its learning rate, times the width that the estimate holds for, if any."""
     width = estimate.width
-    return flat.spread({k: η * (width[k] if width else 1.0) for k, η in state.learning_rates.items()}, parameters)
+    return vectors.spread({k: η * (width[k] if width else 1.0) for k, η in state.learning_rates.items()}, parameters)
 
 
 def finish(
@@ -181,8 +181,8 @@ def finish(
         direction = np.zeros_like(direction)
     step, adam = options.share * direction, state.adam
     if options.through is not None and adam is not None:
-        opposite = flat.unravel(-direction, adam.first_moment)
+        opposite = vectors.unravel(-direction, adam.first_moment)
         steps, adam = options.through.update(Estimate(0.0, opposite), adam, opposite)
-        step = flat.ravel(steps)
+        step = vectors.ravel(steps)
     factor = rates.factor(owner, options.schedule, state.step)
-    return flat.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)
+    return vectors.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender import checks, flat
-from unrender.gradients.estimate import GRADIENT, HVP, LOSSES, Estimate
+from unrender.core import checks, vectors
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, HVP, LOSSES, Estimate
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class NewtonCG:
         share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
         through: an Adam that takes the step's opposite in place of the gradient, as in the paper ("All methods use the Adam
             optimizer"), and makes a step of its own length, by its own learning rate or the parameter's.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.optimizers.schedules`. Near the optimum the step
+        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`. Near the optimum the step
             is as noisy as the gradient: shrinking steps average the noise, which Adam's mean does for its own.
         line: take the step's direction alone, and its length from a parabola through the losses here and a step to either side: two
             evaluations (and the estimator must provide losses). For many parameters, where the gradient is mostly noise and the
@@ -65,7 +65,7 @@ class NewtonCG:
     def __post_init__(self):
         check("NewtonCG", self)
         checks.number("NewtonCG", "trust_radius", self.trust_radius, above=0.0)
-        checks.whole("NewtonCG", "iterations", self.iterations, at_least=1)
+        checks.integer("NewtonCG", "iterations", self.iterations, at_least=1)
         checks.number("NewtonCG", "tolerance", self.tolerance, above=0.0, below=1.0, inclusive=True)
         checks.number("NewtonCG", "damping", self.damping, above=0.0, below=1.0, inclusive=True)
 
@@ -85,9 +85,9 @@ class NewtonCG:
         scale = scales(estimate, state, parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
-            return scale * flat.ravel(hvp(flat.unravel(scale * v, parameters)))
+            return scale * vectors.ravel(hvp(vectors.unravel(scale * v, parameters)))
 
-        step = self._solve(scale * flat.ravel(estimate.gradient), product)
+        step = self._solve(scale * vectors.ravel(estimate.gradient), product)
         if self.line and step.any():
             step = self._to_the_least(step, self._losses(estimate, scale * step, parameters))
         return finish("NewtonCG", self, scale * step, state, parameters)
@@ -96,7 +96,7 @@ class NewtonCG:
     def _losses(estimate: Estimate, step: np.ndarray, parameters: Tree) -> np.ndarray:
         """The losses a step behind, here, and a step ahead."""
         assert estimate.losses is not None
-        here = flat.ravel(parameters)
+        here = vectors.ravel(parameters)
         return estimate.losses(np.stack([here - step, here, here + step]))
 
     def _to_the_least(self, step: np.ndarray, losses: np.ndarray) -> np.ndarray:

@@ -6,17 +6,17 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from unrender import checks
-from unrender.errors import InputError
-from unrender.names import did_you_mean
-from unrender.optimizers.schedules import Schedule
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.schedules.functions import Schedule
 
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
     """Raise `InputError` unless `learning_rate` is a positive number and `schedule` a schedule or None."""
     checks.number(owner, "learning_rate", learning_rate, above=0.0)
     if schedule is not None and not callable(schedule):
-        raise InputError(f"{owner}: schedule must be one of unrender.optimizers.schedules or None, got {schedule!r}")
+        raise InputError(f"{owner}: schedule must be one of unrender.schedules.functions or None, got {schedule!r}")
 
 
 def per_parameter(owner: str, keys: Iterable[str], common: float, own: Mapping[str, float] | None) -> dict[str, float]:

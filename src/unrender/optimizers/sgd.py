@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from unrender import arrays, checks, trees
-from unrender.gradients.estimate import GRADIENT, Estimate
+from unrender.core import arrays, checks, trees
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
-from unrender.optimizers.schedules import Schedule
-from unrender.trees import Tree
+from unrender.schedules.functions import Schedule
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class SGD:
     Args:
         learning_rate: η, in units of the parameter squared per unit of loss, > 0; for the parameters without their own.
         momentum: μ, in [0, 1).
-        schedule: factor of every learning rate by step; see `unrender.optimizers.schedules`.
+        schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 0.01

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.keys import Key
-from unrender.pixels.base import Pick
-from unrender.pixels.cells import Cells
-from unrender.pixels.moments import Slopes
-from unrender.pixels.refreshed import Clean, MapDenoiser, Maps, RefreshedState, Refreshing
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.pixels.base import MiniBatch
+from unrender.pixels.guided import Clean, GuidedSampler, GuidedSamplerState, MapDenoiser, Maps
+from unrender.pixels.pixel_statistics import PixelStatistics
+from unrender.pixels.tiles import Tiles
 from unrender.problem.problem import Problem
-from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,13 @@ class Adaptive:
             pixels. None for a third of `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths
             of what the steps cost.
         uniform: share of the draws that every pixel has equally, in (0, 1].
-        stratified: spread the draws evenly over the probabilities (`cells.Table.draw`); otherwise they are independent, as in the paper.
+        stratified: spread the draws evenly over the probabilities (`tiles.InverseCdfTable.draw`); otherwise
+            they are independent, as in the paper.
         relative: weigh each parameter element's variance by one over its mean squared gradient, which is what Adam divides by: noise counts
             in units of its steps, and the mean over each parameter's elements is what is summed. The sum of plain variances, the
             paper's, looks most at what has the largest gradients.
-        denoiser: of the estimated maps: "oidn", "optix", "variation" (see `unrender.denoising`), "none", or "auto": optix on a GPU, oidn
-            where it is installed, else variation.
+        denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "none", or "auto": optix on a GPU, oidn where
+            it is installed, else variation.
     """
 
     count: int
@@ -56,11 +57,11 @@ class Adaptive:
     denoiser: MapDenoiser = "auto"
 
     def __post_init__(self):
-        self._refreshing.check()
+        self._sampler.check()
 
     @property
-    def _refreshing(self) -> Refreshing:
-        return Refreshing(
+    def _sampler(self) -> GuidedSampler:
+        return GuidedSampler(
             "Adaptive",
             self.count,
             self.refresh,
@@ -74,33 +75,35 @@ class Adaptive:
             density=_density,
         )
 
-    def init(self, problem: Problem, parameters: Tree) -> RefreshedState:
+    def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
         del parameters
-        return self._refreshing.init(problem)
+        return self._sampler.init(problem)
 
-    def draw(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[Pick, RefreshedState]:
+    def draw(
+        self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
+    ) -> tuple[MiniBatch, GuidedSamplerState]:
         """See `PixelSampler.draw`."""
-        return self._refreshing.draw(problem, parameters, state, key)
+        return self._sampler.draw(problem, parameters, state, key)
 
-    def observe(self, problem: Problem, state: RefreshedState, gradient: Tree) -> RefreshedState:
+    def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Keep the mean square of the gradient's elements, where variances are `relative`."""
-        return self._refreshing.observe(problem, state, gradient) if self.relative else state
+        return self._sampler.observe(problem, state, gradient) if self.relative else state
 
 
-def _maps(seen: Slopes) -> Maps:
+def _maps(seen: PixelStatistics) -> Maps:
     assert seen.moments is not None
     return (seen.moments, *seen.squares)
 
 
-def _density(cells: Cells, maps: Maps, clean: Clean) -> np.ndarray:
+def _density(tiles: Tiles, maps: Maps, clean: Clean) -> np.ndarray:
     """The sum over the levels of their probabilities (Eq. 18). Coarser levels average noise away by themselves."""
     moments, *squares = maps
     fine = clean(moments), clean(squares[0])
     total = np.zeros(len(moments))
     for level, square in enumerate(squares):
-        product = fine[0] * fine[1] if level == 0 else cells.coarser(square, level) * cells.coarser(moments, level)
+        product = fine[0] * fine[1] if level == 0 else tiles.coarser(square, level) * tiles.coarser(moments, level)
         density = np.sqrt(np.maximum(product, 0).sum(axis=1))
-        share = float((density * cells.sizes).sum())
+        share = float((density * tiles.sizes).sum())
         total += density / share if share > 0 else 0.0
     return total

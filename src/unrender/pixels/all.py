@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from unrender.keys import Key
-from unrender.pixels.base import Pick
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.pixels.base import MiniBatch
 from unrender.problem.problem import Problem
-from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class All:
         del problem, parameters
         return AllState()
 
-    def draw(self, problem: Problem, parameters: Tree, state: AllState, key: Key) -> tuple[Pick, AllState]:
+    def draw(self, problem: Problem, parameters: Tree, state: AllState, key: Key) -> tuple[MiniBatch, AllState]:
         """See `PixelSampler.draw`."""
         del problem, parameters, key
-        return Pick(None), state
+        return MiniBatch(None), state
 
     def observe(self, problem: Problem, state: AllState, gradient: Tree) -> AllState:
         """Nothing to learn from."""

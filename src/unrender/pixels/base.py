@@ -7,15 +7,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unrender.errors import InputError
-from unrender.keys import Key
-from unrender.problem.frames import Draw
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
-from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
-class Pick:
+class MiniBatch:
     """What one step looks at.
 
     Attributes:
@@ -25,7 +25,7 @@ class Pick:
             the film; empty where all are alike.
     """
 
-    draw: Draw | None
+    draw: PixelSample | None
     samples: int = 0
     probability: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -41,7 +41,7 @@ class PixelSampler(Protocol):
         """The state before the first step. Raises `InputError` where pixels are drawn and the problem's loss is not one per pixel."""
         ...
 
-    def draw(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[Pick, Any]:
+    def draw(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[MiniBatch, Any]:
         """The pixels of one step, and the next state."""
         ...
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.keys import Key
-from unrender.pixels.base import Pick
-from unrender.pixels.cells import Cells
-from unrender.pixels.refreshed import Clean, MapDenoiser, Maps, RefreshedState, Refreshing
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.pixels.base import MiniBatch
+from unrender.pixels.guided import Clean, GuidedSampler, GuidedSamplerState, MapDenoiser, Maps
+from unrender.pixels.tiles import Tiles
 from unrender.problem.problem import Problem
-from unrender.trees import Tree
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class LossProportional:
     denoiser: MapDenoiser = "auto"
 
     def __post_init__(self):
-        self._refreshing.check()
+        self._sampler.check()
 
     @property
-    def _refreshing(self) -> Refreshing:
-        return Refreshing(
+    def _sampler(self) -> GuidedSampler:
+        return GuidedSampler(
             "LossProportional",
             self.count,
             self.refresh,
@@ -48,21 +48,23 @@ class LossProportional:
             density=_density,
         )
 
-    def init(self, problem: Problem, parameters: Tree) -> RefreshedState:
+    def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
         del parameters
-        return self._refreshing.init(problem)
+        return self._sampler.init(problem)
 
-    def draw(self, problem: Problem, parameters: Tree, state: RefreshedState, key: Key) -> tuple[Pick, RefreshedState]:
+    def draw(
+        self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
+    ) -> tuple[MiniBatch, GuidedSamplerState]:
         """See `PixelSampler.draw`."""
-        return self._refreshing.draw(problem, parameters, state, key)
+        return self._sampler.draw(problem, parameters, state, key)
 
-    def observe(self, problem: Problem, state: RefreshedState, gradient: Tree) -> RefreshedState:
+    def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Nothing to learn from."""
         del problem, gradient
         return state
 
 
-def _density(cells: Cells, maps: Maps, clean: Clean) -> np.ndarray:
-    del cells
+def _density(tiles: Tiles, maps: Maps, clean: Clean) -> np.ndarray:
+    del tiles
     return clean(maps[0]).sum(axis=1)

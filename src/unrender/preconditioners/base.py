@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from unrender.arrays import Array
+from unrender.core.arrays import Array
 
 
 class Preconditioner(Protocol):

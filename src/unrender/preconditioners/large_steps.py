@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender import arrays, checks
-from unrender.arrays import Array
-from unrender.errors import InputError
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.preconditioners import grid
 
 

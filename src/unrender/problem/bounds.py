@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 
 MARGIN = 1e-4
 """Parameters stop this share of their range before a bound (of 1 where the range is open). At a reflectance of exactly 0 no

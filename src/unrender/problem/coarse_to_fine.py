@@ -8,9 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unrender import checks
-from unrender.errors import InputError
-from unrender.problem import components, resampling
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.io import resampling
+from unrender.problem import components
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class CoarseToFine:
     (`resampling.upsample`), which shows the same up to the kinks of linear interpolation.
 
     What optimizer, estimator and pixel sampler remember is either carried through a change or starts anew (`states`), see
-    `unrender.training.refining`. Learning rates and their schedules go on in any case.
+    `unrender.runs.multiresolution`. Learning rates and their schedules go on in any case.
 
     Args:
         steps: before which of the run's steps the resolution grows, counted from 0: ascending, each at least 1.
@@ -47,7 +48,7 @@ class CoarseToFine:
                 f"CoarseToFine: steps must be whole numbers of at least 1 that ascend, such as [200, 400], got {self.steps!r}"
             )
         object.__setattr__(self, "steps", steps)
-        checks.whole("CoarseToFine", "factor", self.factor, at_least=2)
+        checks.integer("CoarseToFine", "factor", self.factor, at_least=2)
         wrap = tuple(self.wrap) if isinstance(self.wrap, (list, tuple)) else self.wrap
         object.__setattr__(self, "wrap", wrap)
         if not all(isinstance(wraps, bool) for wraps in (wrap if isinstance(wrap, tuple) else (wrap,))):

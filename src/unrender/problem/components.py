@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from unrender import losses, preconditioners
-from unrender.errors import InputError
-from unrender.names import did_you_mean
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 
 LOSSES: dict[str, type] = {
     "L1": losses.L1,

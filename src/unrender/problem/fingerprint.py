@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from unrender import arrays
-from unrender.problem import scene_files
+from unrender.core import arrays
+from unrender.io import scene_files
 from unrender.problem.problem import Problem
 
 _DIGEST = "sha256:"

@@ -10,20 +10,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from unrender import arrays
-from unrender.arrays import Array
-from unrender.errors import InputError
+from unrender.core import arrays
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.core.trees import Tree
+from unrender.io import images, scene_files
 from unrender.losses import L2, Loss
-from unrender.names import did_you_mean
 from unrender.preconditioners.base import Preconditioner
-from unrender.problem import coarse_to_fine, pictures, scene_files, values
+from unrender.problem import coarse_to_fine, values
 from unrender.problem.coarse_to_fine import CoarseToFine
-from unrender.problem.field import FieldError
+from unrender.problem.errors import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.view import View
-from unrender.rendering.port import ParameterInfo, Renderer
-from unrender.trees import Tree
+from unrender.rendering.renderer import ParameterInfo, Renderer
 
 Bounds = tuple[float | None, float | None]
 
@@ -116,7 +117,7 @@ class Problem:
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
         """The problem that a TOML file describes. Raises `InputError` that names the line."""
-        from unrender.problem.file import read
+        from unrender.problem.toml_file import read
 
         return read(path)
 
@@ -272,7 +273,7 @@ class Problem:
             raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
         height, width = sizes[view.sensor]
         try:
-            picture = pictures.read(view.reference)
+            picture = images.read(view.reference)
             _check_size(picture.values, height, width, view.sensor)
         except InputError as error:
             raise wrong("reference", error) from error
@@ -282,7 +283,7 @@ class Problem:
         mask = None
         if view.mask is not None:
             try:
-                mask = pictures.read(view.mask, linearise=False).values
+                mask = images.read(view.mask, linearise=False).values
                 _check_size(mask, height, width, view.sensor)
                 mask = mask.mean(axis=2)
                 if mask.min() < 0 or mask.max() > 1:
@@ -311,7 +312,7 @@ def _open(scene: Any, max_depth: int) -> Renderer:
     if not isinstance(scene, (str, Path, dict)) and not callable(scene):
         got = type(scene).__name__
         raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
-    from unrender.variant import ensure
+    from unrender.backend.variant import ensure
 
     try:
         if isinstance(scene, (str, Path)) and Path(scene).is_file() and Path(scene).suffix.lower() == ".xml":
@@ -319,7 +320,7 @@ def _open(scene: Any, max_depth: int) -> Renderer:
     except InputError as error:
         raise FieldError(("scene",), str(error).removeprefix("scene ")) from error
     ensure()
-    from unrender.rendering.mitsuba_renderer import MitsubaRenderer
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
     try:
         return MitsubaRenderer(scene, max_depth)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 from unrender.problem.view import View
 
 ON_DEVICE = 1 << 29

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unrender import arrays
-from unrender.errors import InputError
-from unrender.keys import Key
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.trees import Tree
 from unrender.problem.problem import Problem
-from unrender.rendering.port import Shot
-from unrender.trees import Tree
+from unrender.rendering.renderer import SampleRequest
 
 _LANES = 1 << 21
 """Paths per pass: what fits a small machine's memory."""
@@ -49,8 +49,8 @@ def render(
     total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
     while done < spp:
         take = min(per_pass, spp - done)
-        shot = Shot(sensor, take, key.fold(done).uint32())
-        total += take * arrays.numpy(problem.renderer.image(point, shot).images[0])
+        request = SampleRequest(sensor, take, key.fold(done).uint32())
+        total += take * arrays.numpy(problem.renderer.image(point, request).images[0])
         done += take
     return (total / spp).astype(np.float32)
 
@@ -75,8 +75,8 @@ def render_pair(
     """
     points = as_tree(problem, current), as_tree(problem, previous)
     problem.renderer.select(list(points[0]), "path")
-    shot = Shot(problem.views[0].sensor, spp, Key(seed).uint32())
-    rendering = problem.renderer.image_pair(*points, shot, "path")
+    request = SampleRequest(problem.views[0].sensor, spp, Key(seed).uint32())
+    rendering = problem.renderer.image_pair(*points, request, "path")
     assert rendering.previous is not None
     return arrays.numpy(rendering.images[0]), arrays.numpy(rendering.previous[0])
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from unrender.errors import InputError
-from unrender.problem import grids, pictures, resampling
+from unrender.core.errors import InputError
+from unrender.io import images, resampling, volumes
 
 
 def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
@@ -48,15 +48,15 @@ def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, st
     if ending == ".vol":
         return _from_grid(Path(path), shape)
     if ending in (".npy", ".npz"):
-        array = grids.read_numpy(Path(path), lambda found: _check_shape(found, shape))
+        array = volumes.read_numpy(Path(path), lambda found: _check_shape(found, shape))
         return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape)
-    picture = pictures.read(path)
+    picture = images.read(path)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
     height, width, channels = shape
     values, remarks = picture.values, [picture.notice.partition(": ")[2]] if picture.notice else []
     if channels == 1 and values.shape[2] == 3:
-        values = pictures.luminance(values)
+        values = images.luminance(values)
         remarks.append("reduced to its luminance")
     elif channels in (3, 4) and values.shape[2] == 1:
         values = np.repeat(values, 3, axis=2)
@@ -66,7 +66,7 @@ def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, st
         raise InputError(f"{path}: a picture cannot fill a parameter of {channels} channels")
     if values.shape[:2] != (height, width):
         remarks.append(f"scaled from {values.shape[1]}x{values.shape[0]} to {width}x{height}")
-        values = pictures.resize(values, height, width)
+        values = images.resize(values, height, width)
     return np.ascontiguousarray(values, np.float32), f"{Path(path).name}: {', '.join(remarks)}" if remarks else ""
 
 
@@ -77,7 +77,7 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
         if found[-1] != shape[-1]:
             raise InputError(f"a grid of {found[-1]} channels cannot fill a parameter of {shape[-1]}")
 
-    grid = grids.read_grid(path, check).values
+    grid = volumes.read_grid(path, check).values
     if grid.shape == shape:
         return grid, ""
     sizes = ["x".join(map(str, reversed(size[:-1]))) for size in (grid.shape, shape)]

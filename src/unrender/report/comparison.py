@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from unrender.files import write
+from unrender.io.files import write
 from unrender.report import curves, html, measures, panels, plots
 from unrender.report import groups as grouping
 from unrender.report.equal_time import Comparison, measure
-from unrender.report.folder import RunFolder, read
 from unrender.report.plots import Chart, Line
 from unrender.report.poster import poster
+from unrender.runs.folder.reader import RunFolder, read
 
 _VIEWS = 4
 _MAPS = 8

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report.folder import RunFolder, root_mean_square
+from unrender.runs.folder.reader import RunFolder, root_mean_square
 
 _BUCKETS = 200
 _SMOOTHED_POINTS = 500

@@ -9,13 +9,13 @@ from statistics import median
 
 import numpy as np
 
-from unrender.errors import InputError
+from unrender.core.errors import InputError
 from unrender.report import curves, measures
 from unrender.report.curves import Band, Series
-from unrender.report.folder import RunFolder
 from unrender.report.groups import Group
 from unrender.report.measures import Measure
 from unrender.report.plots import AXES
+from unrender.runs.folder.reader import RunFolder
 
 SHARES = (0.25, 0.5, 1.0)
 """Of the shortest run's time, or of the fewest samples: where methods are compared."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.errors import InputError
-from unrender.report import reading
-from unrender.report.folder import RunFolder
+from unrender.core.errors import InputError
+from unrender.io import bounded_files
 from unrender.report.html import flattened
+from unrender.runs.folder.reader import RunFolder
 
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
 _ALIKE = 0.01
@@ -61,7 +61,7 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
             raise InputError(f"{run.path / 'history.jsonl'}: no step was taken, there is nothing to compare")
         for key in run.parameters.keys() ^ first.parameters.keys():
             raise InputError(
-                f"{run.path}: another problem than {first.path}: only one of them recovers {reading.shown(key)}"
+                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.shown(key)}"
             )
         for view in run.views.keys() | first.views.keys():
             sizes = [of.views[view].reference.shape[:2] if view in of.views else None for of in (first, run)]
@@ -79,7 +79,7 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
         for key in run.truth.keys() & first.truth.keys():
             if _apart(run.truth[key], first.truth[key]) > _ALIKE:
                 raise InputError(
-                    f"{run.path}: another problem than {first.path}: {reading.shown(key)} has another true value"
+                    f"{run.path}: another problem than {first.path}: {bounded_files.shown(key)} has another true value"
                 )
     records = [run.record for run in runs]
     for what, values in {

@@ -14,7 +14,7 @@ from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictU
 from markupsafe import Markup
 
 from unrender.report import words
-from unrender.report.folder import RunRecord
+from unrender.runs.folder.reader import RunRecord
 
 _SCRIPT = "viewer.js"
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender import metrics
-from unrender.report.folder import RunFolder
+from unrender.evaluation import metrics
+from unrender.runs.folder.reader import RunFolder
 
 MOST_PIXELS = 1 << 21
 """Of all views' pictures that are measured. FLIP takes a second or two for a megapixel."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 
-from unrender.files import write
-from unrender.report import html, measures, panels, plots, progress, tables
-from unrender.report.folder import read
+from unrender.io.files import write
+from unrender.report import convergence, html, measures, panels, plots, tables
+from unrender.runs.folder.reader import read
 
 _VIEWS = 8
 _MAPS = 24
@@ -43,7 +43,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         maps=[panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k)) for k in maps[:_MAPS]],
         more_maps=max(0, len(maps) - _MAPS),
         rows=[tables.row(run, key) for key in run.parameters],
-        charts={over: progress.charts(run, over) for over in plots.AXES},
+        charts={over: convergence.charts(run, over) for over in plots.AXES},
     )
     path = write(run.path / "report.html", content)
     if open_after:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import pictures, words
-from unrender.report.folder import ViewPictures
-from unrender.report.pictures import INLINE, ColourBar, Painter, Picture
+from unrender.report import images, words
+from unrender.report.images import INLINE, ColourBar, Painter, Picture
+from unrender.runs.folder.reader import ViewPictures
 
 _VALUES_IN_A_TABLE = 16
 
@@ -73,11 +73,11 @@ def view_of_run(view: int, shown: ViewPictures, paint: Painter = INLINE, name: s
         paint: makes them.
         name: of the result, "Current" while the run goes on.
     """
-    factor = pictures.exposure(shown.reference)
+    factor = images.exposure(shown.reference)
     what = name.lower()
-    error = pictures.absolute_error(shown.result, shown.reference)
-    before = None if shown.initial is None else pictures.absolute_error(shown.initial, shown.reference)
-    high = pictures.top(error if before is None else before)
+    error = images.absolute_error(shown.result, shown.reference)
+    before = None if shown.initial is None else images.absolute_error(shown.initial, shown.reference)
+    high = images.top(error if before is None else before)
     result = paint.colour(shown.result, factor, f"View {view}: the {what}")
     stacks: list[tuple[Slider | Figure, ...]] = [
         (Slider(paint.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
@@ -97,15 +97,15 @@ def _maps_of_view(view: int, shown: ViewPictures, paint: Painter) -> list[Figure
     found = []
     if shown.control_weight is not None:
         weight = np.mean(shown.control_weight, axis=-1)
-        picture = paint.false_colour(weight, 0.0, 1.0, pictures.VALUES, f"View {view}: control weight per pixel")
-        bar = pictures.colour_bar(0.0, 1.0, pictures.VALUES, "Control weight")
+        picture = paint.false_colour(weight, 0.0, 1.0, images.VALUES, f"View {view}: control weight per pixel")
+        bar = images.colour_bar(0.0, 1.0, images.VALUES, "Control weight")
         note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
         found.append(Figure(picture, "Control weight", note, bar))
     if shown.pixel_probability is not None:
         density = shown.pixel_probability
-        high = pictures.top(density)
-        picture = paint.false_colour(density, 0.0, high, pictures.VALUES, f"View {view}: probability of each pixel")
-        bar = pictures.colour_bar(0.0, high, pictures.VALUES, "Probability that a pixel is drawn")
+        high = images.top(density)
+        picture = paint.false_colour(density, 0.0, high, images.VALUES, f"View {view}: probability of each pixel")
+        bar = images.colour_bar(0.0, high, images.VALUES, "Probability that a pixel is drawn")
         found.append(Figure(picture, "Pixel probability", f"mean {words.number(_finite_mean(density))}", bar))
     return found
 
@@ -113,9 +113,9 @@ def _maps_of_view(view: int, shown: ViewPictures, paint: Painter) -> list[Figure
 def view_of_methods(view: int, shown: Mapping[str, ViewPictures], paint: Painter = INLINE) -> Panel:
     """Each method's result against the reference, and its error, all on one exposure and one scale."""
     reference = next(iter(shown.values())).reference
-    factor = pictures.exposure(reference)
-    errors = {label: pictures.absolute_error(of.result, of.reference) for label, of in shown.items()}
-    high = max(pictures.top(error) for error in errors.values())
+    factor = images.exposure(reference)
+    errors = {label: images.absolute_error(of.result, of.reference) for label, of in shown.items()}
+    high = max(images.top(error) for error in errors.values())
     stacks = tuple(
         (
             Slider(
@@ -141,11 +141,11 @@ def map_of_run(
     for label, plane in planes.items():
         start, wanted = _planes(initial).get(label), _planes(truth).get(label)
         errors = {
-            caption: pictures.absolute_error(one, wanted)
+            caption: images.absolute_error(one, wanted)
             for caption, one in (("Error at the start", start), ("Error", plane))
             if one is not None and wanted is not None and one.shape == wanted.shape
         }
-        high = pictures.top(next(iter(errors.values()))) if errors else 1.0
+        high = images.top(next(iter(errors.values()))) if errors else 1.0
         column: list[Slider | Figure] = [_against(paint, scale, key, label, plane, start, wanted)]
         if wanted is not None and start is not None:
             column.append(
@@ -170,11 +170,11 @@ def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarra
     label, wanted = next(iter(_planes(truth).items()))
     found = {name: _planes(result).get(label) for name, result in results.items()}
     errors = {
-        name: pictures.absolute_error(plane, wanted)
+        name: images.absolute_error(plane, wanted)
         for name, plane in found.items()
         if plane is not None and plane.shape == wanted.shape
     }
-    high = max([pictures.top(error) for error in errors.values()], default=1.0)
+    high = max([images.top(error) for error in errors.values()], default=1.0)
     stacks = []
     for name, plane in found.items():
         if plane is None:
@@ -196,26 +196,26 @@ class Scale:
         finite = fixed_by[np.isfinite(fixed_by)]
         self.low, self.high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
         self.scalar = fixed_by.ndim == 2 or fixed_by.shape[-1] == 1
-        self.factor = 1.0 if self.scalar or self.high <= 1.0 else pictures.exposure(fixed_by[..., :3])
+        self.factor = 1.0 if self.scalar or self.high <= 1.0 else images.exposure(fixed_by[..., :3])
         if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
             self.low, self.high = min(0.0, self.low), max(1.0, self.high)
 
     def colours(self, plane: np.ndarray) -> np.ndarray:
         """(H, W, C) values as (H, W, 3) in [0, 1], ready to be seen."""
         if plane.shape[-1] == 1:
-            return pictures.mapped(plane[..., 0], self.low, self.high, pictures.VALUES)
-        return pictures.srgb(plane[..., :3] * self.factor)
+            return images.mapped(plane[..., 0], self.low, self.high, images.VALUES)
+        return images.srgb(plane[..., :3] * self.factor)
 
     def picture(self, paint: Painter, plane: np.ndarray, alt: str) -> Picture:
         """The same as a picture of the page."""
         if plane.shape[-1] == 1:
-            return paint.false_colour(plane[..., 0], self.low, self.high, pictures.VALUES, alt)
+            return paint.false_colour(plane[..., 0], self.low, self.high, images.VALUES, alt)
         return paint.colour(plane[..., :3], self.factor, alt)
 
     @property
     def bar(self) -> ColourBar | None:
         """The legend, where there is one channel."""
-        return pictures.colour_bar(self.low, self.high, pictures.VALUES, "Value") if self.scalar else None
+        return images.colour_bar(self.low, self.high, images.VALUES, "Value") if self.scalar else None
 
 
 def plane(array: np.ndarray) -> np.ndarray | None:
@@ -260,7 +260,7 @@ def _against(
 
 def _error(paint: Painter, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
     note = f"mean {words.number(_finite_mean(error))}"
-    return Figure(paint.error(error, high, alt), caption, note, pictures.error_bar(high))
+    return Figure(paint.error(error, high, alt), caption, note, images.error_bar(high))
 
 
 def _finite_mean(values: np.ndarray) -> float:

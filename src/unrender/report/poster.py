@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from unrender.report import panels, pictures, plots, words
+from unrender.report import images, panels, plots, words
 from unrender.report.curves import Band
 from unrender.report.equal_time import Comparison, Metric
 
@@ -53,10 +53,10 @@ def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     if not first.views:
         return []
     view, of = next(iter(first.views.items()))
-    factor = pictures.exposure(of.reference)
+    factor = images.exposure(of.reference)
     found = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
     found += [(label, run.views[view].result) for label, run in comparison.chosen.items()]
-    return [(title, pictures.srgb(picture * factor)) for title, picture in found]
+    return [(title, images.srgb(picture * factor)) for title, picture in found]
 
 
 def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:

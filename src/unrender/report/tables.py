@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import curves, measures, pictures, words
-from unrender.report.folder import RunFolder, root_mean_square
+from unrender.report import curves, images, measures, words
+from unrender.runs.folder.reader import RunFolder, root_mean_square
 
 STOPPED = {
     "steps": "all steps done",
@@ -119,7 +119,7 @@ def _swatch(array: np.ndarray) -> str:
     """The colour of a parameter of three values within [0, 1], as #rrggbb; empty for others."""
     if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
         return ""
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in pictures.srgb(array.reshape(-1)))
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in images.srgb(array.reshape(-1)))
 
 
 def view_rows(run: RunFolder) -> list[ViewRow]:

@@ -7,8 +7,8 @@ numbers.
 
 from __future__ import annotations
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 
 
 def control_weight(cov: Array, var_previous: Array, var_cv: Array) -> Array:

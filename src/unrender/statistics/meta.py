@@ -30,8 +30,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 from unrender.statistics.control_weight import control_variate_variance, control_weight
 from unrender.statistics.recursion import advance
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 
 
 def advance(memory: Array, current: Array, previous: Array, weight: Array) -> Array:

@@ -29,8 +29,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from unrender import arrays
-from unrender.arrays import Array
+from unrender.core import arrays
+from unrender.core.arrays import Array
 
 
 @dataclass(frozen=True)

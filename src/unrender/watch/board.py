@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader
 
-from unrender.report import html, panels, plots, progress, tables, words
-from unrender.report.folder import RunFolder
-from unrender.report.pictures import Drawing, Painter
+from unrender.report import convergence, html, panels, plots, tables, words
+from unrender.report.images import Drawing, Painter
+from unrender.runs.folder.reader import RunFolder
 from unrender.watch import source
 from unrender.watch.source import Snapshot
 
@@ -182,10 +182,10 @@ def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
 def _charts(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> dict[str, list[plots.Chart]]:
     runs = {label: s.run for label, s in zip(labels, snapshots, strict=True) if s.run is not None}
     if len(snapshots) == 1 and runs:
-        found = {over: progress.charts(next(iter(runs.values())), over) for over in plots.AXES}
+        found = {over: convergence.charts(next(iter(runs.values())), over) for over in plots.AXES}
     else:
         colours = {label: i % _COLOURS for i, label in enumerate(labels)}
-        found = {over: progress.overlaid(runs, colours, over) for over in plots.AXES}
+        found = {over: convergence.overlaid(runs, colours, over) for over in plots.AXES}
     return found
 
 

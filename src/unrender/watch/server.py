@@ -22,9 +22,9 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from unrender import files
-from unrender.errors import InputError
-from unrender.training.live import COMMANDS, CONTROL
+from unrender.core.errors import InputError
+from unrender.io import files
+from unrender.runs.live import COMMANDS, CONTROL
 from unrender.watch import board
 from unrender.watch.source import Source
 

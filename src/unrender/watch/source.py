@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from unrender.errors import InputError
-from unrender.report import reading
-from unrender.report.folder import RunFolder, ViewPictures, pictures_by_view, read, read_record
-from unrender.report.history import History, Reader
-from unrender.training.live import FOLDER
+from unrender.core.errors import InputError
+from unrender.io import bounded_files
+from unrender.runs.folder.history_reader import History, Reader
+from unrender.runs.folder.reader import RunFolder, ViewPictures, pictures_by_view, read, read_record
+from unrender.runs.live import FOLDER
 
 _FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz")
 _LIVE_FILES = ("status.json", "start.npz", "views.npz", *_FILES)
@@ -115,11 +115,13 @@ class Source:
             return Snapshot(self.path, VANISHED)
         problems: list[str] = []
         status = self._try(problems, self._status)
-        if status is not None and (status.status in (RUNNING, PAUSED) or not reading.exists(self.path / "run.json")):
+        if status is not None and (
+            status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / "run.json")
+        ):
             run = self._try(problems, lambda: self._live(status, problems))
             state = SAVING if status.status not in (RUNNING, PAUSED) else status.status
             return Snapshot(self.path, state if _alive(status) else LOST, run, status, tuple(problems))
-        if status is None and not reading.exists(self.path / "run.json"):
+        if status is None and not bounded_files.exists(self.path / "run.json"):
             return Snapshot(self.path, WAITING, problems=tuple(problems))
         run = self._try(problems, lambda: read(self.path))
         if run is None and status is not None:
@@ -128,15 +130,17 @@ class Source:
 
     def _status(self) -> Status | None:
         path = self.path / FOLDER / "status.json"
-        if not reading.exists(path):
+        if not bounded_files.exists(path):
             return None
-        found = reading.parse(reading.text(path, self.path), str(path))
+        found = bounded_files.parse(bounded_files.text(path, self.path), str(path))
         try:
             return Status.model_validate(found)
         except ValidationError as error:
             first = error.errors()[0]
-            name = reading.shown(".".join(str(part) for part in first["loc"]))
-            raise InputError(f"{path}: {name}: {first['msg']}, got {reading.shown(repr(first['input']))}") from error
+            name = bounded_files.shown(".".join(str(part) for part in first["loc"]))
+            raise InputError(
+                f"{path}: {name}: {first['msg']}, got {bounded_files.shown(repr(first['input']))}"
+            ) from error
 
     def _live(self, status: Status, problems: list[str]) -> RunFolder:
         """A run that goes on, from live/. What is missing is left out; what cannot be read is told in `problems`."""
@@ -166,14 +170,14 @@ class Source:
     def _history(self) -> History | None:
         """The one that grows: in live/ where there is one, else the folder's own."""
         for path in (self.path / FOLDER / "history.jsonl", self.path / "history.jsonl"):
-            if reading.exists(path):
+            if bounded_files.exists(path):
                 return self._histories.setdefault(path, Reader(path, self.path)).read(to_the_end=False)
         return None
 
     def _arrays(self, path: Path, problems: list[str]) -> dict[str, np.ndarray]:
-        if not reading.exists(path):
+        if not bounded_files.exists(path):
             return {}
-        return self._try(problems, lambda: reading.arrays(path, self.path)) or {}
+        return self._try(problems, lambda: bounded_files.arrays(path, self.path)) or {}
 
     def _try(self, problems: list[str], function: Callable[[], Any]) -> Any:
         """What `function` returns; None, and a line in `problems`, where what it reads is malformed."""

@@ -1,0 +1,1 @@
+"""Which Mitsuba variant runs, and what this machine needs for it."""

@@ -1,0 +1,232 @@
+"""The few array functions that operators do not give, for NumPy arrays and Dr.Jit arrays alike.
+
+Every formula of `statistics/`, `losses.py` and `optimizers/` is written with operators and with these, so that it is
+tested in NumPy against closed forms and runs unchanged on the device.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+Array = Any
+"""A NumPy array, or a Dr.Jit array or tensor."""
+
+
+def is_drjit(x: Array) -> bool:
+    """Whether `x` lives in Dr.Jit (and so may be lazy, symbolic, on a GPU)."""
+    return dr.is_array_v(x)
+
+
+def where(mask: Array, a: Array, b: Array) -> Array:
+    """`a` where `mask` holds, else `b`; either may be a number."""
+    return dr.select(mask, a, b) if is_drjit(mask) else np.where(mask, a, b)
+
+
+def minimum(a: Array, b: Array) -> Array:
+    """The smaller, per element."""
+    return dr.minimum(a, b) if is_drjit(a) or is_drjit(b) else np.minimum(a, b)
+
+
+def maximum(a: Array, b: Array) -> Array:
+    """The larger, per element."""
+    return dr.maximum(a, b) if is_drjit(a) or is_drjit(b) else np.maximum(a, b)
+
+
+def clip(x: Array, low: Array, high: Array) -> Array:
+    """`x` held within [low, high]."""
+    return minimum(maximum(x, low), high)
+
+
+def sqrt(x: Array) -> Array:
+    """The square root, per element."""
+    return dr.sqrt(x) if is_drjit(x) else np.sqrt(x)
+
+
+def log(x: Array) -> Array:
+    """The natural logarithm, per element."""
+    return dr.log(x) if is_drjit(x) else np.log(x)
+
+
+def exp(x: Array) -> Array:
+    """e to the power of each element."""
+    return dr.exp(x) if is_drjit(x) else np.exp(x)
+
+
+def absolute(x: Array) -> Array:
+    """The magnitude, per element."""
+    return dr.abs(x) if is_drjit(x) else np.abs(x)
+
+
+def sign(x: Array) -> Array:
+    """-1, 0 or 1 per element. Zero at zero, unlike `drjit.sign`, which never returns 0."""
+    return dr.select(x == 0, 0.0, dr.sign(x)) if is_drjit(x) else np.sign(x)
+
+
+def is_finite(x: Array) -> Array:
+    """A mask: neither infinite nor NaN."""
+    return dr.isfinite(x) if is_drjit(x) else np.isfinite(x)
+
+
+def all_finite(x: Array) -> bool:
+    """Whether every element is finite. Waits for the device."""
+    return bool(np.all(np.isfinite(numpy(x)))) if not is_drjit(x) else bool(dr.all(dr.isfinite(x), axis=None))
+
+
+def zeros_like(x: Array) -> Array:
+    """Zeros of the shape and kind of `x`."""
+    return dr.zeros(type(x), dr.shape(x)) if is_drjit(x) else np.zeros_like(x)
+
+
+def shape(x: Array) -> tuple[int, ...]:
+    """The shape as a tuple of integers."""
+    return tuple(x.shape)
+
+
+def mean(x: Array) -> Array:
+    """The mean over all elements, left lazy on Dr.Jit."""
+    return dr.mean(x, axis=None) if is_drjit(x) else np.mean(x)
+
+
+def mean_first(x: Array) -> Array:
+    """The mean over the first axis, (n, ...) -> (...), left lazy on Dr.Jit."""
+    return dr.mean(x, axis=0) if is_drjit(x) else np.mean(x, axis=0)
+
+
+def mean_rest(x: Array) -> Array:
+    """The mean over all axes but the first, (n, ...) -> (n,), left lazy on Dr.Jit."""
+    axes = tuple(range(1, len(x.shape)))
+    return dr.mean(x, axis=axes) if is_drjit(x) else np.mean(x, axis=axes)
+
+
+def stacked(x: Array) -> Array:
+    """`x` with a first axis of length 1, (...) -> (1, ...)."""
+    return type(x)(x.array, (1, *x.shape)) if is_drjit(x) else x[None]
+
+
+def concatenated(parts: list[Array]) -> Array:
+    """Arrays (n, ...) one behind the other, along their first axis."""
+    if len(parts) == 1:
+        return parts[0]
+    return dr.concat(parts, axis=0) if is_drjit(parts[0]) else np.concatenate(parts)
+
+
+def total(x: Array) -> Array:
+    """The sum over all elements, left lazy on Dr.Jit."""
+    return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)
+
+
+def scalar(value: float, like: Array) -> Array:
+    """A number that changes from step to step, in a form that does not compile a new kernel each time."""
+    if not is_drjit(like):
+        return value
+    return dr.opaque(type(like), value, ()) if dr.is_tensor_v(like) else dr.opaque(dr.leaf_t(like), value)
+
+
+def evaluate(*arrays: Any) -> None:
+    """Start the computation of lazy arrays (nothing to do for NumPy). Accepts nested lists, tuples and dicts."""
+    dr.eval(*arrays)
+
+
+def numpy(x: Array) -> np.ndarray:
+    """A NumPy copy, whatever `x` was."""
+    return np.array(x.numpy() if is_drjit(x) else x)
+
+
+def owned(values: Array, kind: type) -> Array:
+    """A flat Dr.Jit array of type `kind` (32 bits an element) with the elements of `values`, in memory of its own.
+
+    Dr.Jit borrows NumPy's memory where it can. What is written there later would change the array, frozen kernels read stale
+    texels or abort (Dr.Jit 1.5), and kernels are compiled once for memory that starts on a multiple of 64 bytes and once more for
+    any other, which in NumPy is chance. So the elements are laid on such a multiple, and copied by one and the same kernel.
+    """
+    given = np.ravel(values)
+    room = np.empty(given.size + 16, np.uint32 if dr.is_integral_v(kind) else np.float32)
+    start = -room.ctypes.data % 64 // 4
+    room = room[start : start + given.size]
+    room[:] = given
+    copy = kind(room) * dr.opaque(kind, 1)
+    dr.eval(copy)
+    return copy
+
+
+def like(values: np.ndarray, x: Array) -> Array:
+    """`values` as an array of the kind of `x`, in memory of its own."""
+    if not is_drjit(x):
+        return np.array(values, x.dtype)
+    flat = owned(values, dr.array_t(x))
+    return type(x)(flat, np.shape(values)) if dr.is_tensor_v(x) else flat
+
+
+def number(x: Array) -> float:
+    """A Python float from an array of one element. Waits for the device."""
+    return float(numpy(x).reshape(-1)[0]) if is_drjit(x) else float(x)
+
+
+def like_integers(values: np.ndarray, like: Array) -> Array:
+    """Whole numbers in [0, 2**32) in the form that indexes arrays such as `like`: `np.uint32`, or Dr.Jit's UInt32 in memory of its own."""
+    if not is_drjit(like):
+        return np.ascontiguousarray(values, np.uint32)
+    return owned(values, dr.uint32_array_t(dr.array_t(like)))
+
+
+def gather_rows(x: Array, index: Array) -> Array:
+    """The rows `index` (N,) of `x` (P, C): (N, C)."""
+    if not is_drjit(x):
+        return x[index]
+    width = x.shape[1]
+    kind = type(index)
+    element = dr.arange(kind, dr.width(index) * width)
+    row = element // width
+    flat = dr.gather(dr.array_t(x), x.array, dr.gather(kind, index, row) * width + (element - row * width))
+    return type(x)(flat, (dr.width(index), width))
+
+
+def gather(x: Array, index: Array) -> Array:
+    """The elements `index` of a one-dimensional array."""
+    return dr.gather(type(x), x, index) if is_drjit(x) else x[index]
+
+
+def searchsorted(ascending: Array, values: Array) -> Array:
+    """For each value the index of the last element of `ascending` that is not above it; the first element must not be."""
+    if not is_drjit(ascending):
+        return (np.searchsorted(ascending, values, side="right") - 1).astype(np.uint32)
+    kind = type(values)
+    found = dr.binary_search(0, dr.width(ascending), lambda index: dr.gather(kind, ascending, index) <= values)
+    return kind(found) - 1
+
+
+def arange(like: Array, count: int) -> Array:
+    """0, 1, 2, ..., whole numbers that index arrays such as `like`."""
+    return (
+        dr.arange(dr.uint32_array_t(dr.array_t(like)), count) if is_drjit(like) else np.arange(count, dtype=np.uint32)
+    )
+
+
+def integer(value: int, like: Array) -> Array:
+    """A whole number in [0, 2**32) that changes from step to step, in a form that does not compile a new kernel each time."""
+    return dr.opaque(dr.uint32_array_t(dr.array_t(like)), value) if is_drjit(like) else np.uint32(value)
+
+
+def random_integers(like: Array, seed: int, count: int, below: int) -> Array:
+    """`count` whole numbers, uniform in [0, below)."""
+    if not is_drjit(like):
+        return np.random.default_rng(seed).integers(below, size=count, dtype=np.uint32)
+    return dr.rng(seed).integers(dr.uint32_array_t(dr.array_t(like)), count, 0, below)
+
+
+def random_below(bounds: Array, like: Array, seed: int) -> Array:
+    """For each whole number one that is uniform below it."""
+    if not is_drjit(like):
+        return np.random.default_rng(seed).integers(bounds, dtype=np.uint32)
+    kind = type(bounds)
+    number = dr.rng(seed).random(dr.array_t(like), dr.width(bounds))
+    return dr.minimum(kind(number * bounds), bounds - 1)
+
+
+def rows(x: Array) -> Array:
+    """(..., C) to (N, C)."""
+    width = x.shape[-1]
+    return type(x)(x.array, (len(x.array) // width, width)) if is_drjit(x) else x.reshape(-1, width)

@@ -1,0 +1,31 @@
+"""Checks of numbers that a user gives; each failure is one line that names the field and what it should be."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+from unrender.core.errors import InputError
+
+
+def number(
+    owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False
+) -> float:
+    """`value` as a finite float in (above, below), or in [above, below) with `inclusive`.
+
+    Raises `InputError` naming `owner` (the class or section) and `name` (the argument or field).
+    """
+    found = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if math.isfinite(found) and (above < found < below or (inclusive and found == above)):
+        return found
+    limits = [f"{'>=' if inclusive else '>'} {above:g}"] if above > -math.inf else []
+    limits += [f"< {below:g}"] if below < math.inf else []
+    raise InputError(f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {value!r}")
+
+
+def integer(owner: str, name: str, value: Any, at_least: int) -> int:
+    """`value` as an integer >= `at_least`. Raises `InputError`."""
+    if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
+        return int(value)
+    raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")

@@ -1,0 +1,1 @@
+"""From images to an estimate of the loss gradient."""

@@ -1,0 +1,244 @@
+"""Meta-estimation: a gradient that remembers its past, moved along by finite differences, and knows its variance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from unrender.core import arrays, checks, trees
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
+from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
+from unrender.images.base import ImageEstimator, PairRequest
+from unrender.images.plain import Plain
+from unrender.pixels.all import All
+from unrender.pixels.base import PixelSampler
+from unrender.problem.problem import Problem
+from unrender.rendering.renderer import Space
+from unrender.statistics import meta
+
+_PROPORTIONAL, _DIFFERENCE, _OBSERVED = 0, 1, 2  # streams of a step's key
+
+
+@dataclass(frozen=True)
+class MetaState:
+    """State between steps.
+
+    Attributes:
+        parameters: of the last step; None before the first.
+        elements: {key: what is known of each element of its gradient}; empty before the first step.
+        image: the image estimator's, in the coupled form.
+        pixels: the pixel sampler's.
+    """
+
+    parameters: Tree | None
+    elements: dict[str, meta.State]
+    image: Any
+    pixels: Any = None
+
+
+@dataclass(frozen=True)
+class MetaEstimator:
+    """M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i: Eq. 7 of Balint et al. 2023, per element of each parameter.
+
+    The independent form is the paper's. F comes from `proportional_spp` samples per pixel. ΔF comes from `difference_spp`
+    others: one set of paths, traced in the current scene, gives the images and the adjoints of both states, and the loss
+    derivative of each state comes from a pair of images that knows nothing of those paths (the other groups of the same
+    samples; for one sample per pixel, a pair of its own).
+
+    The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and writes
+    M = F + w (M − H), with w from their covariance: each sample serves both terms, for little more than a plain one costs. With
+    `image=RecursiveControlVariate()` the images that the loss sees remember too, from the same passes.
+
+    In path space the two states share directions, weighted by the current state's density: the paper's shift mapping, which
+    reuses BSDF samples, in the solid angle measure, where its Jacobian is one. Var ΔF then falls with the square of the step.
+    Where any parameter moves geometry, a path of one state is none of the other, and the whole difference is taken in
+    primary sample space, from the same random numbers: `info["space"]` says which was taken, for each parameter.
+
+    Gradient and variance are those of u where a parameter with a preconditioner S is x = S u (`Estimate.preconditioned`): a
+    variance per element does not pass through S.
+
+    Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does not
+    depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α knows the
+    samples that it weighs, which pulls the gradient toward zero, most at the start. The variance is that of the recurrence (15):
+    zero-centred, so too large where the gradient stands out of the noise of one step. On a control variate's images, successive
+    steps share the image's memory besides, which the recurrence does not know of: biased as that image is, and somewhat noisier
+    than its variance says. The memory starts anew when a parameter changes its shape.
+
+    Args:
+        proportional_spp: samples per pixel and view of F in the independent form, >= 1; 2 where none is given.
+        difference_spp: of ΔF in the independent form, >= 1; 1 where none is given.
+        coupled: take the coupled form.
+        spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
+        image: what the loss sees, in the coupled form; the independent one sees plain renderings.
+        pixels: which pixels a step looks at; F and ΔF of the independent form draw their own. Drawn ones go with plain images.
+        space: "path", "primary", or "auto": path space where it carries all parameters.
+        beta_proportional: β_F, decay of the mean square of F, in [0, 1).
+        beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
+        clip: hold α below 1 / (2 − α_{i-1}) (Eq. 17).
+        centred: variances about the mean in place of mean squares. For comparison (Fig. 5).
+        decouple: divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
+        statistics: "shared" learns variances from the samples that it sums; "independent" from as many more, at twice the cost.
+    """
+
+    proportional_spp: int | None = None
+    difference_spp: int | None = None
+    coupled: bool = False
+    spp: int | None = None
+    image: ImageEstimator = field(default_factory=Plain)
+    space: Space | Literal["auto"] = "auto"
+    beta_proportional: float = meta.BETA_PROPORTIONAL
+    beta_difference: float = meta.BETA_DIFFERENCE
+    clip: bool = True
+    centred: bool = False
+    decouple: bool = True
+    statistics: Literal["shared", "independent"] = "shared"
+    pixels: PixelSampler = field(default_factory=All)
+
+    def __post_init__(self):
+        for name, coupled, default in (
+            ("proportional_spp", False, 2),
+            ("difference_spp", False, 1),
+            ("spp", True, 3),
+        ):
+            given = getattr(self, name)
+            if given is not None:
+                checks.integer("MetaEstimator", name, given, at_least=1)
+                if coupled != self.coupled:
+                    form = "coupled" if coupled else "independent"
+                    raise InputError(f"MetaEstimator: {name} is for the {form} form; give coupled={coupled} with it")
+            elif coupled == self.coupled:
+                object.__setattr__(self, name, default)
+        for name in ("beta_proportional", "beta_difference"):
+            checks.number("MetaEstimator", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
+        for name, choices in (("space", ("auto", "path", "primary")), ("statistics", ("shared", "independent"))):
+            if getattr(self, name) not in choices:
+                raise InputError(
+                    f"MetaEstimator: {name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                )
+        if not self.coupled and not isinstance(self.image, Plain):
+            raise InputError("MetaEstimator: image is for the coupled form; give coupled=True with it")
+        if self.statistics == "independent" and not isinstance(self.image, Plain):
+            raise InputError(
+                'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
+            )
+        check_pixels("MetaEstimator", self.pixels, self.image)
+        if not isinstance(self.pixels, All) and not isinstance(self.image, Plain):
+            raise InputError(
+                "MetaEstimator: drawn pixels go with plain images; a control variate's snapshot is of another step"
+            )
+        if self.image.space is not None and self.space not in ("auto", self.image.space):
+            raise InputError(
+                f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'
+            )
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """A gradient and its variance."""
+        return frozenset({GRADIENT, VARIANCE})
+
+    def init(self, problem: Problem, parameters: Tree) -> MetaState:
+        """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
+        problem.renderer.select(list(parameters), self._space(problem, parameters))
+        return MetaState(None, {}, self.image.init(problem, parameters), self.pixels.init(problem, parameters))
+
+    def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
+        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space" and
+        "alpha" (the weight of the past) per parameter, and what the image estimator tells, per view."""
+        fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
+        if fresh or state.parameters is None:
+            elements, previous = {name: meta.init(x) for name, x in parameters.items()}, parameters
+            step_norm: Array = 0.0
+        else:
+            elements, previous = state.elements, state.parameters
+            moved = trees.subtract(parameters, previous)
+            step_norm = arrays.sqrt(sum(arrays.total(x * x) for x in moved.values()))
+        space = self._space(problem, parameters)
+        pair_request = PairRequest(previous, space)
+        take = self._coupled if self.coupled else self._independent
+        first, second, step, pixels = take(problem, parameters, state, pair_request, fresh, key)
+        observed, samples = None, step.samples
+        if self.statistics == "independent":
+            again = replace(state, pixels=pixels)
+            *observed, more, pixels = take(problem, parameters, again, pair_request, fresh, key.fold(_OBSERVED))
+            samples += more.samples
+        rule = meta.update_coupled if self.coupled else meta.update
+        found = {
+            name: rule(
+                elements[name],
+                first[name],
+                second[name],
+                step_norm,
+                beta_proportional=self.beta_proportional,
+                beta_difference=self.beta_difference,
+                clip=self.clip,
+                centred=self.centred,
+                decouple=self.decouple,
+                observed=None if observed is None else (observed[0][name], observed[1][name]),
+            )
+            for name in parameters
+        }
+        gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
+        after = MetaState(parameters, {name: parts[3] for name, parts in found.items()}, step.image, pixels)
+        arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
+        info = {
+            "samples": samples,
+            "images": step.images,
+            "space": dict.fromkeys(parameters, space),
+            "alpha": alpha,
+            **step.info,
+        }
+        loss = sum(arrays.number(value) for value in step.losses)
+        return Estimate(loss, gradient, variance, preconditioned=True, info=info), after
+
+    def _space(self, problem: Problem, parameters: Tree) -> Space:
+        if self.space != "auto":
+            return self.space
+        if self.image.space is not None:
+            return self.image.space
+        known = problem.renderer.parameters()
+        return "path" if all(known[key].shares_paths for key in parameters) else "primary"
+
+    def _independent(
+        self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
+    ) -> tuple[Tree, Tree, GradientSample, Any]:
+        """F, ΔF from other samples, what else the step brought, and the pixel sampler's next state."""
+        assert self.proportional_spp is not None
+        assert self.difference_spp is not None
+        step, pixels = self._gather(problem, parameters, state, self.proportional_spp, key.fold(_PROPORTIONAL))
+        F = problem.precondition(step.gradient)
+        if fresh:  # no change to be estimated
+            return F, trees.zeros_like(F), step, pixels
+        again = replace(state, pixels=pixels)
+        pair, pixels = self._gather(
+            problem, parameters, again, self.difference_spp, key.fold(_DIFFERENCE), pair_request
+        )
+        assert pair.previous is not None
+        difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
+        return F, difference, replace(step, samples=step.samples + pair.samples), pixels
+
+    def _coupled(
+        self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
+    ) -> tuple[Tree, Tree, GradientSample, Any]:
+        """F, H of the previous state from the same samples, and the rest as for `_independent`."""
+        del fresh
+        assert self.spp is not None
+        step, pixels = self._gather(problem, parameters, state, self.spp, key, pair_request)
+        assert step.previous is not None
+        return problem.precondition(step.gradient), problem.precondition(step.previous), step, pixels
+
+    def _gather(
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: MetaState,
+        spp: int,
+        key: Key,
+        pair_request: PairRequest | None = None,
+    ) -> tuple[GradientSample, Any]:
+        batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
+        step = gather(problem, parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
+        return step, self.pixels.observe(problem, pixels, step.gradient)

@@ -1,0 +1,267 @@
+"""A scene folder that plain Mitsuba loads: scene.xml, the files that it names, and the recovered values alone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from unrender.backend.variant import ensure
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.exporting import maps, ready_made
+from unrender.exporting.graph import SceneGraph
+from unrender.exporting.setters import store
+from unrender.problem.problem import Problem
+from unrender.problem.render import as_tree
+from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.scene_pair import from_tensor, to_tensor
+from unrender.runs import reopen
+from unrender.runs.folder import reader as folders
+
+SCENE = "scene.xml"
+_FOLDERS = {
+    mi.ObjectType.Shape: ready_made.MESHES,
+    mi.ObjectType.Volume: ready_made.VOLUMES,
+    mi.ObjectType.Texture: ready_made.BITMAPS,
+    mi.ObjectType.Emitter: ready_made.BITMAPS,
+}
+_OWN = {SCENE, maps.RECORD, maps.TABLE, maps.FOLDER, *_FOLDERS.values(), "files"}
+_SPP = 256
+_ROUNDING = 1e-4
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        folder: where.
+        scene: the XML file; None where there is none, as plain Mitsuba has no emissive media.
+        notices: one line for each thing that its user should know of.
+    """
+
+    folder: Path
+    scene: Path | None
+    notices: tuple[str, ...]
+
+
+def export(
+    what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
+    out: str | Path,
+    overwrite: bool = False,
+    spp: int = _SPP,
+) -> Exported:
+    """Write a scene with its recovered parameters as a folder that plain Mitsuba loads.
+
+        ur.export("out/indirect-room-rcv", "out/room")
+        ur.export((problem, result.parameters), "out/room")
+
+    The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
+    maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
+    integrator is `path`, or `volpath` where there are participating media, with the problem's depth, every film has a box filter. Sensors
+    come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not have, only the
+    recovered values are written.
+
+    Args:
+        what: a run folder, or a problem and {key: array} of all its parameters.
+        out: the new folder.
+        overwrite: whether an earlier export may be replaced.
+        spp: samples per pixel that scene.xml asks for.
+
+    Raises:
+        InputError: the run folder or the problem cannot be read, `out` cannot be written, or a parameter has no place in a description.
+            Nothing is left behind then.
+    """
+    ensure()
+    out = Path(out)
+    _check_place(out, overwrite)
+    if isinstance(what, (str, Path)):
+        problem, parameters = reopen.problem_of(what), folders.read(what).parameters
+    else:
+        problem, parameters = what
+    if not isinstance(problem.renderer, MitsubaRenderer):
+        raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
+    as_tree(problem, parameters)
+    values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
+    pair_request = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        try:
+            pair_request.mkdir(parents=True)
+            notices = maps.write(values, pair_request)
+            plain = not problem.renderer.pair.emissive
+            if plain:
+                notices = _fill(pair_request, problem.renderer, values, problem.max_depth, spp) + notices
+            else:
+                notices.append(
+                    f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
+                )
+            _swap(pair_request, out)
+        finally:
+            shutil.rmtree(pair_request, ignore_errors=True)
+    except OSError as error:
+        raise InputError(f"export to {out}: {error.strerror or error}") from error
+    return Exported(out, out / SCENE if plain else None, tuple(notices))
+
+
+def _check_place(out: Path, overwrite: bool) -> None:
+    try:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"export to {out}: a file, expected a folder")
+        found = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    except OSError as error:
+        raise InputError(f"export to {out}: {error.strerror or error}") from error
+    if not found:
+        return
+    if maps.RECORD not in found or not found <= _OWN:
+        raise InputError(f"export to {out}: the folder holds other things; give a new one")
+    if not overwrite:
+        raise InputError(f"export to {out}: holds an earlier export; give --overwrite (overwrite=True) to replace it")
+
+
+def _swap(pair_request: Path, out: Path) -> None:
+    if out.is_dir():
+        old = out.with_name(f".{out.name}.{os.getpid()}.old")
+        out.rename(old)
+        pair_request.rename(out)
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        pair_request.rename(out)
+
+
+def _fill(
+    folder: Path, renderer: MitsubaRenderer, values: dict[str, np.ndarray], max_depth: int, spp: int
+) -> list[str]:
+    """Write scene.xml and the files that it names."""
+    graph = SceneGraph(_description(renderer.pair.description, folder))
+    scene = renderer.pair.current
+    moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
+    own = {key: value for key, value in values.items() if key not in moved}
+    places = graph.places(renderer.pair.current_parameters)
+    for key, value in own.items():
+        live = graph.live[places[key].key]
+        graph.live[places[key].key] = from_tensor(renderer.array(value), live)
+    graph.live.update()
+    for key, value in own.items():
+        try:
+            store(graph, places[key], value, key, folder)
+        except InputError as error:
+            raise InputError(f"parameter {key} cannot be exported: {error}") from error
+    posed = [_move(graph, target, matrix) for target, matrix in poses.matrices(scene, moved).items()]
+    _set_up_rendering(graph, "volpath" if renderer.pair.volumetric else "path", max_depth, spp)
+    _gather_files(graph, folder)
+    path = folder / SCENE
+    path.write_bytes(graph.xml())
+    return _verify(graph, path, {key: places[key].key for key in own}, posed)
+
+
+def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
+    """An XML file, or a dictionary without ready-made objects."""
+    if isinstance(description, (str, Path)):
+        return Path(description)
+    given, heard = ready_made.listen(description) if callable(description) else (description, [])
+    return ready_made.FilesOnly(folder, heard).dictionary(given)
+
+
+def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
+    """Put a pose before the `to_world` of a shape or sensor, and tell which node that is."""
+    index = next(
+        i for kind in (mi.ObjectType.Shape, mi.ObjectType.Sensor) for i in graph.of(kind) if graph.names[i] == target
+    )
+    props = graph.nodes[index].props
+    before = props["to_world"] if "to_world" in props else mi.ScalarTransform4d()
+    before = np.array(before.matrix, float).reshape(4, 4)
+    props["to_world"] = mi.ScalarTransform4d((matrix @ before).tolist())
+    return index
+
+
+def _set_up_rendering(graph: SceneGraph, integrator: str, max_depth: int, spp: int) -> None:
+    """What the run's pictures were rendered with: paths of that depth, independent samples, pixels without a filter."""
+    graph.child(0, mi.ObjectType.Integrator, integrator)["max_depth"] = max_depth
+    films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
+    for index in graph.of(mi.ObjectType.Sensor):
+        graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
+        film = films[f"n{index}"]
+        props = graph.child(index, mi.ObjectType.Film, "hdrfilm")
+        for axis, (size, part, offset) in enumerate(
+            (("width", "crop_width", "crop_offset_x"), ("height", "crop_height", "crop_offset_y"))
+        ):
+            props[size] = int(film.size()[axis])
+            if tuple(film.size()) != tuple(film.crop_size()):
+                props[part], props[offset] = int(film.crop_size()[axis]), int(film.crop_offset()[axis])
+        props["pixel_format"], props["component_format"] = "rgb", "float32"
+        node = next(i for i in graph.children(index).values() if graph.nodes[i].type == mi.ObjectType.Film)
+        graph.child(node, mi.ObjectType.ReconstructionFilter, "box")
+
+
+def _gather_files(graph: SceneGraph, folder: Path) -> None:
+    """Copy what the description names into the folder, and name it from there."""
+    taken: dict[Path, str] = {}
+    for index in sorted(graph.used()):
+        node = graph.nodes[index]
+        if "filename" not in node.props:
+            continue
+        path = Path(node.props["filename"])
+        if path not in taken:
+            if path.is_relative_to(folder):
+                taken[path] = path.relative_to(folder).as_posix()
+            else:
+                kind = _FOLDERS.get(node.type, "files")
+                name = f"{ready_made.file_name(path.stem)}{path.suffix}"
+                if (folder / kind / name).exists():
+                    name = f"{ready_made.file_name(path.stem)}-{index}{path.suffix}"
+                (folder / kind).mkdir(exist_ok=True)
+                shutil.copyfile(path, folder / kind / name)
+                taken[path] = f"{kind}/{name}"
+        node.props["filename"] = taken[path]
+    for path in folder.glob("*/*"):  # what a recovered value took the place of
+        if path.parent.name != maps.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
+            path.unlink()
+
+
+def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> list[str]:
+    """Load the exported scene and hold it to the values that it should have.
+
+    Args:
+        graph: with its live scene at these values.
+        path: of the XML file.
+        recovered: {the parameter's key: its key in the live scene}.
+        posed: nodes that were moved, which the live scene's are not.
+
+    Returns:
+        a line for each parameter that has another name now.
+    """
+    try:
+        found = mi.traverse(mi.load_file(str(path), parallel=False, optimize=False))
+    except Exception as error:
+        raise InputError(
+            f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"
+        ) from error
+    ends = [[key.rpartition(".")[2] for key in scene.properties] for scene in (graph.live, found)]
+    if ends[0] != ends[1]:
+        raise InputError("export: the scene that was written has other parameters than the one it was made of")
+    names = dict(zip(graph.live.properties, found.properties, strict=True))
+    given = {own: key for key, own in recovered.items()}
+    notices = []
+    moved = tuple(f"n{index}." for index in posed)
+    for own, name in names.items():
+        if own.startswith(moved):
+            continue
+        try:
+            before, after = (to_tensor(scene[key]).numpy() for scene, key in ((graph.live, own), (found, name)))
+        except TypeError:  # what is no array, such as a transformation
+            continue
+        key = given.get(own, name)
+        scale = max(1.0, float(np.max(np.abs(before), initial=0)))
+        if before.shape != after.shape or not np.allclose(before, after, rtol=0, atol=_ROUNDING * scale):
+            raise InputError(f"parameter {key} cannot be exported: the scene that was written has another value")
+        if own in given and name != key:
+            notices.append(f"{key} is called {name} in the exported scene")
+    return notices

@@ -1,0 +1,147 @@
+"""Reading pictures: files and arrays become linear float32 arrays, or one clear line says why not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.backend import variant
+from unrender.core.errors import InputError
+from unrender.io import files, image_size
+
+READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
+"""File name endings that `read` knows."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture in linear values.
+
+    Attributes:
+        values: (H, W, C) float32, C in {1, 3}.
+        notice: one line on what was done to the values, "" if they were taken as they are.
+    """
+
+    values: np.ndarray
+    notice: str = ""
+
+
+def read(source: Any, linearise: bool = True) -> Picture:
+    """The picture in a file or an array.
+
+    Args:
+        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Alpha is dropped.
+            Floating-point values are linear; 8- and 16-bit integers are taken as sRGB in [0, 1].
+        linearise: whether to undo the sRGB curve of 8- and 16-bit values; masks want them as they are.
+
+    Raises:
+        InputError: no such file, unreadable, of another shape, or not finite.
+    """
+    if isinstance(source, (str, Path)):
+        path = Path(source)
+        if not path.exists():
+            raise InputError(f"{path}: no such file")
+        if not path.is_file():
+            raise InputError(f"{path}: not a file")
+        if path.suffix.lower() not in READABLE:
+            raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
+        try:
+            numpy_file = path.suffix.lower() == ".npy"
+            picture = _from_array(files.read_array(path), linearise) if numpy_file else _read(path, linearise)
+            _check_finite(picture.values)
+        except InputError as error:
+            raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+        return Picture(picture.values, f"{path.name}: {picture.notice}" if picture.notice else "")
+    try:
+        array = np.asarray(source)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"expected a file or an array, got {type(source).__name__}") from error
+    picture = _from_array(array, linearise)
+    _check_finite(picture.values)
+    return picture
+
+
+def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(H, W, C) to (height, width, C): smoothed before it shrinks, linear between pixels where it grows."""
+    if values.shape[:2] == (height, width):
+        return values
+    from skimage import transform
+
+    scaled = transform.resize(values, (height, width, values.shape[2]), order=1, anti_aliasing=True, mode="edge")
+    return np.asarray(scaled, np.float32)
+
+
+def srgb_to_linear(values: np.ndarray) -> np.ndarray:
+    """The inverse of the sRGB transfer curve (IEC 61966-2-1), values in [0, 1]."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def luminance(values: np.ndarray) -> np.ndarray:
+    """(..., 3) linear sRGB to (..., 1), by the weights of ITU-R BT.709."""
+    return (values @ np.array([0.212671, 0.715160, 0.072169], np.float32))[..., None]
+
+
+def _read(path: Path, linearise: bool) -> Picture:
+    image_size.check(path)
+    variant.ensure()
+    import mitsuba as mi
+
+    try:
+        bitmap = mi.Bitmap(str(path))
+        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+            return Picture(_colour_channels(bitmap))
+        encoded = bool(bitmap.srgb_gamma())
+        bits = 8 * np.array(bitmap).itemsize
+        single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
+        kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
+        if encoded and not linearise:
+            bitmap.set_srgb_gamma(False)
+        values = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False))
+    except InputError:
+        raise
+    except Exception as error:  # Mitsuba throws what its image libraries throw
+        raise InputError(f"cannot be read as a picture: {_one_line(error)}") from error
+    values = values.reshape(*values.shape[:2], -1)
+    return Picture(values, f"{bits}-bit sRGB, linearised" if encoded and linearise else "")
+
+
+def _colour_channels(bitmap: Any) -> np.ndarray:
+    """R, G and B of an EXR file of many channels, such as Mitsuba's own `aov` integrator writes: (H, W, 3)."""
+    names = [field.name for field in bitmap.struct_()]
+    if not {"R", "G", "B"} <= set(names):
+        raise InputError(f"has the channels {', '.join(names)[:200]}, but not R, G and B")
+    return np.array(bitmap)[..., [names.index(name) for name in "RGB"]].astype(np.float32)
+
+
+def _from_array(array: np.ndarray, linearise: bool) -> Picture:
+    if array.dtype == object or not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
+        raise InputError(f"expected an array of numbers, got {array.dtype}")
+    if np.iscomplexobj(array):
+        raise InputError("expected an array of real numbers, got complex ones")
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or 0 in array.shape:
+        raise InputError(f"expected an array of shape (H, W, 3), got {array.shape}")
+    values = array[..., :3]
+    if array.dtype in (np.uint8, np.uint16):
+        bits = 8 * array.dtype.itemsize
+        values = values.astype(np.float64) / (2**bits - 1)
+        if not linearise:
+            return Picture(values.astype(np.float32))
+        return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised")
+    with np.errstate(over="ignore"):
+        return Picture(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _check_finite(values: np.ndarray) -> None:
+    bad = ~np.isfinite(values).all(axis=-1)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise InputError(f"{int(bad.sum())} pixels are NaN or infinite, the first in row {row}, column {column}")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__

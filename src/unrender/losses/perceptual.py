@@ -1,0 +1,224 @@
+"""A loss between features that a network sees, in place of pixels: what is alike looks alike, wherever its details lie.
+
+The network is VGG-16 (Simonyan and Zisserman 2015), thirteen convolutions; the loss is the mean squared difference of what some of its
+layers answer (Johnson, Alahi and Fei-Fei 2016, Eq. 2). It needs PyTorch and the network's weights.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+
+_BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Channels of the convolutions; the resolution is halved between blocks."""
+
+LAYERS = {
+    f"relu{block}_{place}": block for block, widths in enumerate(_BLOCKS, 1) for place in range(1, len(widths) + 1)
+}
+"""The layers that may be compared, each after its rectifier, with the block that they stand in."""
+
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of the pictures that the network was trained on, in sRGB."""
+
+
+@dataclass(frozen=True)
+class Perceptual:
+    """strength · mean over `layers` of mean (φₗ(I) − φₗ(R))², for VGG-16's features φₗ of images as sRGB shows them.
+
+    The loss is of a whole image, not of a pixel: `value` spreads it evenly over the image, so that its mean is the loss, and `derivative`
+    is scaled alike. Batches of pixels cannot have it (`pixelwise`). Radiance goes through the sRGB curve, which is continued above 1; below
+    0 it counts as 0, without a derivative. The derivative is not linear in the image, so noise biases the gradient: features see noise
+    as texture. Use an image with little of it (`images.RecursiveControlVariate`, `images.Denoised`).
+
+    Args:
+        weights: file of the network's weights: a .safetensors file, or a .pth file of tensors alone, named as torchvision names them
+            (features.0.weight, ...; others are ignored). None takes those of torchvision, where that is installed.
+        layers: which features to compare, of `perceptual.LAYERS`. relu3_3 needs images of 4 x 4 at least, relu5_3 of 16 x 16.
+        strength: factor of the loss, > 0.
+
+    Raises:
+        InputError: no PyTorch, weights that are missing, damaged or of another network, no such layer; from `value`, an image that is too
+            small for a layer.
+    """
+
+    weights: str | Path | None = None
+    layers: tuple[str, ...] = ("relu1_2", "relu2_2", "relu3_3")
+    strength: float = 1.0
+
+    def __post_init__(self):
+        checks.number("Perceptual", "strength", self.strength, above=0.0)
+        if isinstance(self.layers, str) or not isinstance(self.layers, (list, tuple)) or not self.layers:
+            raise InputError(f"Perceptual: layers must be a list of names such as relu3_3, got {self.layers!r}")
+        for name in self.layers:
+            if name not in LAYERS:
+                hint = did_you_mean(str(name), LAYERS) or f"; there are {', '.join(LAYERS)}"
+                raise InputError(f"Perceptual: layers: there is no {name!r}{hint}")
+        object.__setattr__(self, "layers", tuple(self.layers))
+        if self.weights is not None and not isinstance(self.weights, (str, Path)):
+            raise InputError(f"Perceptual: weights must be a file, got {self.weights!r}")
+        self._network(np.dtype(np.float32))  # so that a wrong file is known now
+
+    @property
+    def linear(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def pixelwise(self) -> bool:
+        """False."""
+        return False
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """See `Loss.value`: of images (..., H, W, 3), the loss of each, everywhere in it."""
+        seen = arrays.numpy(image)
+        losses, _ = self._compare(seen, arrays.numpy(reference), derivative=False)
+        return arrays.like(np.broadcast_to(losses[..., None, None, None], seen.shape), image)
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """See `Loss.derivative`: of images (..., H, W, 3), H · W · 3 times the derivative of the loss."""
+        seen = arrays.numpy(image)
+        _, slope = self._compare(seen, arrays.numpy(reference), derivative=True)
+        return arrays.like(slope * float(np.prod(seen.shape[-3:])), image)
+
+    def _compare(self, image: np.ndarray, reference: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The loss of each image, (...), and its derivative, (..., H, W, 3); zeros where that is not asked for."""
+        torch = _torch()
+        height, width = image.shape[-3:-1]
+        for name in self.layers:
+            if min(height, width) < 2 ** (LAYERS[name] - 1):
+                raise InputError(f"Perceptual: an image of {width}x{height} is too small for the layer {name}")
+        network = self._network(np.dtype(np.float64 if image.dtype == np.float64 else np.float32))
+        batch = torch.from_numpy(np.array(image.reshape(-1, height, width, 3), network.dtype)).requires_grad_(
+            derivative
+        )
+        target = torch.from_numpy(np.array(reference.reshape(-1, height, width, 3), network.dtype))
+        with torch.no_grad():
+            wanted = network.features(target)
+        with torch.set_grad_enabled(derivative):
+            losses: Any = sum(
+                ((a - b) ** 2).mean(dim=(1, 2, 3)) for a, b in zip(network.features(batch), wanted, strict=True)
+            )
+            losses = losses * (self.strength / len(self.layers))
+            slope = torch.autograd.grad(losses.sum(), batch)[0] if derivative else torch.zeros_like(batch)
+        return losses.detach().numpy().reshape(image.shape[:-3]), slope.numpy().reshape(image.shape)
+
+    def _network(self, dtype: np.dtype) -> _Network:
+        path = None if self.weights is None else Path(self.weights)
+        return _load(path, _age(path), self.layers, dtype.name)
+
+
+class _Network:
+    """The part of VGG-16 that some layers need.
+
+    Args:
+        tensors: {"features.0.weight": ...}.
+        layers: names of `LAYERS`.
+        dtype: "float32" or "float64".
+    """
+
+    def __init__(self, tensors: Mapping[str, Any], layers: tuple[str, ...], dtype: str):
+        torch = _torch()
+        self.dtype, kind = np.dtype(dtype), getattr(torch, dtype)
+        self._wanted = layers
+        self._stages: list[tuple[str, Any]] = []
+        inputs, number = 3, 0
+        for block, widths in enumerate(_BLOCKS, 1):
+            for place, outputs in enumerate(widths, 1):
+                weight = _tensor(tensors, f"features.{number}.weight", (outputs, inputs, 3, 3))
+                bias = _tensor(tensors, f"features.{number}.bias", (outputs,))
+                convolution = torch.nn.Conv2d(inputs, outputs, 3, padding=1, dtype=kind)
+                convolution.load_state_dict({"weight": weight, "bias": bias})
+                name = f"relu{block}_{place}"
+                self._stages.append((name, torch.nn.Sequential(convolution, torch.nn.ReLU()).requires_grad_(False)))
+                inputs, number = outputs, number + 2
+                if {name for name, _ in self._stages} >= set(layers):
+                    return
+            self._stages.append(("", torch.nn.MaxPool2d(2)))
+            number += 1
+
+    def features(self, images: Any) -> list[Any]:
+        """What the layers answer to images (B, H, W, 3), linear: tensors (B, C, H', W')."""
+        torch = _torch()
+        x = torch.clamp(images, min=0)
+        x = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * torch.clamp(x, min=0.0031308) ** (1 / 2.4) - 0.055)
+        x = ((x - x.new_tensor(_MEAN)) / x.new_tensor(_DEVIATION)).movedim(-1, 1)
+        found = {}
+        for name, stage in self._stages:
+            x = found[name] = stage(x)
+        return [found[name] for name in self._wanted]
+
+
+def _torch() -> Any:
+    try:
+        import torch  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise InputError("Perceptual needs PyTorch: pip install 'unrender[torch]'") from error
+    return torch
+
+
+def _age(path: Path | None) -> int:
+    """Tells a file from the one that it was."""
+    try:
+        return 0 if path is None else path.stat().st_mtime_ns
+    except OSError as error:
+        raise InputError(f"Perceptual: weights {path}: {error.strerror or error}") from error
+
+
+@functools.lru_cache(maxsize=4)
+def _load(path: Path | None, age: int, layers: tuple[str, ...], dtype: str) -> _Network:
+    del age
+    _torch()
+    source = "of torchvision" if path is None else str(path)
+    try:
+        return _Network(_from_torchvision() if path is None else _read(path), layers, dtype)
+    except InputError as error:
+        raise InputError(f"Perceptual: weights {source}: {error}") from error
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    torch = _torch()
+    if not path.is_file():
+        raise InputError("not a file")
+    try:
+        if path.suffix.lower() == ".safetensors":
+            from safetensors.torch import load_file  # pyright: ignore[reportMissingImports]
+
+            return load_file(path)
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # PyTorch throws whatever its unpickler and its zip reader throw
+        raise InputError(f"cannot be read: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
+    if not isinstance(found, Mapping):
+        raise InputError(f"expected named tensors, found a {type(found).__name__}")
+    return found
+
+
+def _from_torchvision() -> Mapping[str, Any]:
+    try:
+        from torchvision.models import VGG16_Weights  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise InputError("torchvision is not installed; give a file of weights, or pip install torchvision") from error
+    try:
+        return VGG16_Weights.IMAGENET1K_V1.get_state_dict(progress=False)
+    except Exception as error:  # the network's, the disk's
+        raise InputError(f"cannot be fetched: {' '.join(str(error).split())[:200]}") from error
+
+
+def _tensor(tensors: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Any:
+    if name not in tensors:
+        raise InputError(f"has no {name}; expected those of VGG-16, as torchvision names them")
+    found = tensors[name]
+    if tuple(np.shape(found)) != shape:
+        raise InputError(f"{name} must be of shape {shape}, got {tuple(np.shape(found))}")
+    if not bool(_torch().isfinite(found).all()):
+        raise InputError(f"{name} has values that are not finite")
+    return found

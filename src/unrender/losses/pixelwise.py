@@ -1,0 +1,126 @@
+"""Losses per pixel and channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+
+
+@dataclass(frozen=True)
+class L1:
+    """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
+
+    @property
+    def linear(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """See `Loss.value`."""
+        return arrays.absolute(image - reference)
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """See `Loss.derivative`."""
+        return arrays.sign(image - reference)
+
+
+@dataclass(frozen=True)
+class L2:
+    """(I − R)²."""
+
+    @property
+    def linear(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """See `Loss.value`."""
+        difference = image - reference
+        return difference * difference
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """See `Loss.derivative`."""
+        return 2.0 * (image - reference)
+
+
+@dataclass(frozen=True)
+class RelativeL2:
+    """(I − R)² / (R² + ε): dark pixels count as much as bright ones.
+
+    The denominator holds the reference alone, never the noisy image, so the derivative stays linear. With image and adjoint from
+    independent samples, as all estimators here have them, its gradient is that of the unbiased mean relative squared error
+    (Deng et al. 2022; Pidhorskyi et al. 2022).
+
+    Args:
+        epsilon: ε in squared radiance, > 0; below √ε the loss turns absolute.
+    """
+
+    epsilon: float = 1e-2
+
+    def __post_init__(self):
+        checks.number("RelativeL2", "epsilon", self.epsilon, above=0.0)
+
+    @property
+    def linear(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """See `Loss.value`."""
+        difference = image - reference
+        return difference * difference / (reference * reference + self.epsilon)
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """See `Loss.derivative`."""
+        return 2.0 * (image - reference) / (reference * reference + self.epsilon)
+
+
+@dataclass(frozen=True)
+class Huber:
+    """(I − R)²/2 within δ of the reference, δ (|I − R| − δ/2) beyond: the derivative is I − R clamped to [−δ, δ].
+
+    Args:
+        delta: δ in radiance, > 0.
+    """
+
+    delta: float = 0.1
+
+    def __post_init__(self):
+        checks.number("Huber", "delta", self.delta, above=0.0)
+
+    @property
+    def linear(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
+    def value(self, image: Array, reference: Array) -> Array:
+        """See `Loss.value`."""
+        distance = arrays.absolute(image - reference)
+        near = arrays.minimum(distance, self.delta)
+        return near * (distance - 0.5 * near)
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """See `Loss.derivative`."""
+        return arrays.clip(image - reference, -self.delta, self.delta)

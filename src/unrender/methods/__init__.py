@@ -1,0 +1,1 @@
+"""Methods by name: an estimator and an optimizer with their options."""

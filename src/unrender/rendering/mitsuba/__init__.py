@@ -1,0 +1,1 @@
+"""The renderer port answered by Mitsuba 3."""

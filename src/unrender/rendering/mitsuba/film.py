@@ -1,0 +1,189 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
+
+"""From pixels to camera rays, from path radiance back to pixels: one box filter, independent samples.
+
+The film's own reconstruction filter is not used. Per-pixel statistics need pixels whose samples are their own, so every
+pixel is the plain mean over its square (a box filter of one pixel).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class RepeatingSampler:
+    """Independent samples that are the same in every copy of an image: lane i shares its numbers with lane i + period.
+
+    Stands for a `mitsuba.Sampler`; mutable, as that is, since it is state of the path tracer's loop.
+
+    Attributes:
+        period: lanes of one image.
+        rng: `mitsuba.PCG32`, once seeded.
+    """
+
+    period: int
+    rng: Any = None
+
+    def seed(self, seed: Any, lanes: int) -> None:
+        """Start anew with `lanes` lanes."""
+        lane = dr.arange(mi.UInt32, lanes) % self.period
+        state, sequence = mi.sample_tea_32(seed, lane)
+        self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def next_1d(self) -> Any:
+        """A uniform number per lane."""
+        return self.rng.next_float32()
+
+    def next_2d(self) -> Any:
+        """Two of them."""
+        first = self.rng.next_float32()
+        return mi.Point2f(first, self.rng.next_float32())
+
+
+def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1) -> tuple[Any, Any]:
+    """Camera rays, samples of a pixel side by side.
+
+    Args:
+        sensor: `mitsuba.Sensor`.
+        sampler: `mitsuba.Sampler` ('independent'); seeded here.
+        seed: `mi.UInt32` of width 1.
+        spp: rays per pixel.
+        pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
+        count: how many pixels.
+        copies: of the whole image, one behind the other.
+
+    Returns:
+        `mi.RayDifferential3f` and its weight per lane; copies * count * spp lanes.
+    """
+    film = sensor.film()
+    width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
+    lanes = copies * count * spp
+    sampler.seed(seed, lanes)
+    index = dr.arange(mi.UInt32, lanes) // spp
+    if copies > 1:
+        index %= count
+    if pixels is not None:
+        index = dr.gather(mi.UInt32, pixels, index)
+    y = index // width
+    position = mi.Point2f(index - y * width, y) + sampler.next_2d()
+    time = sensor.shutter_open() + (
+        sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0
+    )
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, weight = sensor.sample_ray_differential(
+        mi.Float(time), 0.5, mi.Point2f(position.x / width, position.y / height), aperture
+    )
+    ray.scale_differential(spp**-0.5)
+    return ray, weight
+
+
+def rays_of_many(
+    sensors: Any, settings: Films, which: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
+) -> tuple[Any, Any]:
+    """Camera rays of pixels that belong to different sensors, samples of a pixel side by side.
+
+    Args:
+        sensors: `mitsuba.SensorPtr`, all of the scene's.
+        settings: of all of them.
+        which: `mi.UInt32`, the index of each pixel's sensor.
+        sampler, seed, spp, pixels, count: see `rays`.
+
+    Returns:
+        `mi.RayDifferential3f` and its weight per lane; count * spp lanes.
+    """
+    lanes = count * spp
+    sampler.seed(seed, lanes)
+    index = dr.arange(mi.UInt32, lanes) // spp
+    pixel, which = dr.gather(mi.UInt32, pixels, index), dr.gather(mi.UInt32, which, index)
+    width, height = dr.gather(mi.UInt32, settings.widths, which), dr.gather(mi.UInt32, settings.heights, which)
+    # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.
+    y = pixel // dr.maximum(width, 1)
+    position = mi.Point2f(pixel - y * width, y) + sampler.next_2d()
+    time = mi.Float(0)
+    if settings.shutters is not None:
+        opening, open_time = settings.shutters
+        time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
+    aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
+    ray, weight = dr.gather(mi.SensorPtr, sensors, which).sample_ray_differential(
+        time, 0.5, mi.Point2f(position.x / width, position.y / height), aperture
+    )
+    ray.scale_differential(spp**-0.5)
+    return ray, weight
+
+
+@dataclass(frozen=True)
+class Films:
+    """What rays of several sensors need to know of them.
+
+    Attributes:
+        widths, heights: of the films in pixels, `mi.UInt32`.
+        aperture: whether any needs an aperture sample.
+        shutters: opening times and durations, `mi.Float`; None where none has one.
+    """
+
+    widths: Any
+    heights: Any
+    aperture: bool
+    shutters: tuple[Any, Any] | None
+
+    @classmethod
+    def of(cls, sensors: Any) -> Films:
+        """Of a list of `mitsuba.Sensor`."""
+        sizes = [sensor.film().crop_size() for sensor in sensors]
+        times = [float(sensor.shutter_open_time()) for sensor in sensors]
+        shutters = None
+        if any(time > 0 for time in times):
+            shutters = mi.Float([float(sensor.shutter_open()) for sensor in sensors]), mi.Float(times)
+        return cls(
+            mi.UInt32([int(size[0]) for size in sizes]),
+            mi.UInt32([int(size[1]) for size in sizes]),
+            any(sensor.needs_aperture_sample() for sensor in sensors),
+            shutters,
+        )
+
+
+def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any:
+    """The mean of each pixel's samples, per group.
+
+    Args:
+        radiance: `mi.Spectrum`, evaluated, lanes ordered as `rays` makes them.
+        spp: samples per pixel, in all groups.
+        groups: the samples of a pixel are cut into that many equal runs.
+        shape: of one image, (H, W, 3) or (N, 3).
+
+    Returns:
+        `mi.TensorXf` (groups, *shape). Sums in a fixed order: equal seeds give equal bits.
+    """
+    size = spp // groups
+    sums = [dr.block_sum(radiance[c], size) if size > 1 else radiance[c] for c in range(3)]
+    count = dr.width(sums[0])
+    pixels = count // groups
+    index = dr.arange(mi.UInt32, count)
+    group = index // pixels
+    index = (index - group * pixels) * groups + group
+    channels = mi.Color3f(*(dr.gather(mi.Float, sums[c], index) for c in range(3)))
+    return mi.TensorXf(dr.ravel(channels) / size, (groups, *shape))
+
+
+def film_adjoint(weights: Any, spp: int, count: int) -> Any:
+    """The adjoint of `develop` averaged over the groups: each lane's share of its pixel's and group's weight.
+
+    Args:
+        weights: `mi.TensorXf` (groups, H, W, 3) or (groups, N, 3).
+        spp: samples per pixel, in all groups.
+        count: how many pixels.
+
+    Returns:
+        `mi.Spectrum` per lane: weights[group, pixel] / spp.
+    """
+    lane = dr.arange(mi.UInt32, count * spp)
+    pixel = lane // spp
+    group = (lane - pixel * spp) // (spp // weights.shape[0])
+    index = (group * count + pixel) * 3
+    return mi.Spectrum(*(dr.gather(mi.Float, weights.array, index + c) for c in range(3))) / spp

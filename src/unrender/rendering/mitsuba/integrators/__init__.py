@@ -1,0 +1,1 @@
+"""Path tracers that return two states of a scene, and their adjoints by path replay."""

@@ -1,0 +1,282 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false, reportOperatorIssue=false
+
+"""Rigid poses of shapes and sensors as parameters, a pose per lane.
+
+For every shape that is no emitter and for every sensor, the renderer offers parameters that Mitsuba does not have:
+
+    <id>.translation    (3,)  in units of the world; 0 as loaded
+    <id>.rotation       (3,)  rotation vector, axis times angle in radians; 0 as loaded
+    <id>.scale          ()    factor, shapes only; 1 as loaded
+
+and each coordinate of the first two alone, `<id>.translation.x` and so on, (). A point x of the shape goes to
+c + translation + scale R (x - c), where c is the centre of the shape's bounding box, or where the sensor stands.
+
+Geometry is never moved, and no acceleration structure rebuilt: a posed shape lives in a scene of its own, and rays are transformed into it.
+Since each ray may have its own transform, one launch renders any number of poses.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from unrender.core.errors import InputError
+from unrender.rendering.renderer import ParameterInfo
+
+_AXES = ("x", "y", "z")
+_NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+")
+
+
+@dataclass(frozen=True)
+class PoseKey:
+    """What a key of this module stands for.
+
+    Attributes:
+        target: id of the shape or sensor.
+        part: "translation", "rotation" or "scale".
+        axis: 0 to 2, or None for all.
+    """
+
+    target: str
+    part: str
+    axis: int | None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the parameter."""
+        return (3,) if self.axis is None and self.part != "scale" else ()
+
+    def loaded(self) -> np.ndarray:
+        """The value at which nothing moves."""
+        return np.full(self.shape, 1.0 if self.part == "scale" else 0.0, np.float32)
+
+
+def keys(scene: Any) -> dict[str, PoseKey]:
+    """The pose parameters that a scene has, by key."""
+    shapes = [shape.id() for shape in scene.shapes() if not shape.is_emitter()]
+    sensors = [sensor.id() for sensor in scene.sensors()]
+    found: dict[str, PoseKey] = {}
+    for target in shapes + sensors:
+        if _NAMELESS.fullmatch(target) or (shapes + sensors).count(target) > 1:
+            continue
+        for part in ("translation", "rotation"):
+            for axis in (None, 0, 1, 2):
+                key = f"{target}.{part}" + ("" if axis is None else f".{_AXES[axis]}")
+                found[key] = PoseKey(target, part, axis)
+        if target in shapes:
+            found[f"{target}.scale"] = PoseKey(target, "scale", None)
+    return found
+
+
+def info(key: PoseKey) -> ParameterInfo:
+    """What the renderer says of a pose parameter."""
+    why = "it moves a shape or sensor as a whole, which path replay has no derivative of; SmoothedDerivatives has"
+    low = 1e-3 if key.part == "scale" else None
+    return ParameterInfo(key.shape, differentiable=False, shares_paths=False, reason=why, lowest=low)
+
+
+class Pose:
+    """A rigid motion and a uniform scale per lane: x to c + t + s R (x - c)."""
+
+    # No dataclass: Dr.Jit would take it for state of a loop.
+    def __init__(self, centre: Any, translation: Any, rotation: Any, scale: Any):
+        self.centre, self.translation, self.scale = mi.Point3f(centre), mi.Vector3f(translation), mi.Float(scale)
+        self.matrix = _rotation(mi.Vector3f(rotation))
+        self.inverse = self.matrix.T
+
+    def ray_inside(self, ray: Any) -> Any:
+        """The ray in the space of what is posed. Distances along it stay those of the world."""
+        local = mi.Ray3f(ray)
+        local.o = self.centre + self.inverse @ (ray.o - self.centre - self.translation) / self.scale
+        local.d = self.inverse @ ray.d / self.scale
+        return local
+
+    def ray_outside(self, ray: Any) -> Any:
+        """A posed sensor's ray in the world."""
+        moved = type(ray)(ray)
+        moved.o = self.point(ray.o)
+        moved.d = self.matrix @ ray.d
+        return moved
+
+    def point(self, p: Any) -> Any:
+        """Where a point goes."""
+        return self.centre + self.translation + self.scale * (self.matrix @ (p - self.centre))
+
+
+def _rotation(vector: Any) -> Any:
+    """The matrix of a rotation vector (Rodrigues)."""
+    square = dr.squared_norm(vector)
+    angle = dr.sqrt(square)
+    small = square < 1e-8
+    a = dr.select(small, 1 - square / 6, dr.sin(angle) / dr.select(small, 1, angle))
+    b = dr.select(small, 0.5 - square / 24, (1 - dr.cos(angle)) / dr.select(small, 1, square))
+    x, y, z = vector
+    cross = mi.Matrix3f(0, -z, y, z, 0, -x, -y, x, 0)
+    return dr.identity(mi.Matrix3f) + a * cross + b * (cross @ cross)
+
+
+class PosedScene:
+    """A scene of which some shapes and sensors are posed: built once, then any poses.
+
+    Args:
+        scene: as loaded.
+        chosen: {key: what it stands for} of the parameters in use.
+
+    Attributes:
+        static: what does not move, with all emitters and sensors.
+        parts: {id: a scene of that shape alone}.
+
+    Raises `InputError` where a coordinate is asked for twice.
+    """
+
+    def __init__(self, scene: Any, chosen: Mapping[str, PoseKey]):
+        self._slots = _slots(chosen)
+        targets = {key.target for key in chosen.values()}
+        shapes = scene.shapes()
+        posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
+        rest = [shape for shape in shapes if shape.id() not in posed]
+        rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+        self.static = _scene([*rest, *scene.sensors()])
+        self.parts = {name: _scene([shape]) for name, shape in posed.items()}
+        self._centres = _centres(scene, targets)
+
+    def scenes(self) -> list[Any]:
+        """All scenes, to hand to frozen kernels."""
+        return [self.static, *self.parts.values()]
+
+    def numbers(self, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
+        count = len(next(iter(parameters.values())))
+        rows = np.zeros((len(self._centres), 7, count), np.float32)
+        rows[:, 6] = 1.0
+        names = list(self._centres)
+        for key, (target, first, size) in self._slots.items():
+            rows[names.index(target), first : first + size] = np.reshape(parameters[key], (count, size)).T
+        return rows.reshape(-1, count)
+
+    def at(self, scenes: list[Any], numbers: Any, batch: Any) -> Assembly:
+        """The scene with each lane's poses.
+
+        Args:
+            scenes: of `scenes()`, as the frozen kernel was handed them.
+            numbers: of `numbers()`, raveled, on the device.
+            batch: which of the B poses, per lane.
+        """
+        count = dr.width(numbers) // (7 * len(self._centres))
+        poses = {}
+        for index, (name, centre) in enumerate(self._centres.items()):
+            v = [dr.gather(mi.Float, numbers, (7 * index + row) * count + batch) for row in range(7)]
+            poses[name] = Pose(centre, v[0:3], v[3:6], v[6])
+        static, *parts = scenes
+        return Assembly(static, [(part, poses[name]) for name, part in zip(self.parts, parts, strict=True)], poses)
+
+
+class Assembly:
+    """The static scene and the posed ones, intersected as one. Stands for a `mitsuba.Scene` where rays are traced."""
+
+    # No dataclass: Dr.Jit would take it for state of a loop.
+    def __init__(self, static: Any, parts: list[tuple[Any, Pose]], poses: Mapping[str, Pose]):
+        self.static, self.parts, self.poses = static, parts, poses
+
+    def ray_intersect(self, ray: Any, ray_flags: Any, coherent: Any, active: Any) -> Any:
+        """See `mitsuba.Scene.ray_intersect`."""
+        nearest = self.static.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        nearest = dr.select(active, nearest, dr.zeros(mi.PreliminaryIntersection3f))
+        nearest.t = dr.select(nearest.is_valid(), nearest.t, dr.inf)
+        inside = mi.Ray3f(ray)
+        matrix, scale = mi.Matrix3f(dr.identity(mi.Matrix3f)), mi.Float(1)
+        for part, pose in self.parts:
+            local = pose.ray_inside(ray)
+            local.maxt = dr.minimum(ray.maxt, nearest.t)
+            found = part.ray_intersect_preliminary(local, coherent=coherent, active=active)
+            hit = active & found.is_valid() & (found.t < nearest.t)
+            nearest = dr.select(hit, found, nearest)
+            inside = dr.select(hit, local, inside)
+            matrix = dr.select(hit, pose.matrix, matrix)
+            scale = dr.select(hit, pose.scale, scale)
+        valid = active & nearest.is_valid()
+        inside.maxt = dr.inf
+        si = nearest.compute_surface_interaction(inside, ray_flags, valid)
+        si.p = dr.select(valid, ray(si.t), si.p)
+        si.n = mi.Normal3f(matrix @ si.n)
+        frame = si.sh_frame
+        si.sh_frame = mi.Frame3f(matrix @ frame.s, matrix @ frame.t, matrix @ frame.n)
+        si.dp_du, si.dp_dv = scale * (matrix @ si.dp_du), scale * (matrix @ si.dp_dv)
+        si.dn_du, si.dn_dv = matrix @ si.dn_du, matrix @ si.dn_dv
+        si.wi = dr.select(valid, si.to_local(-ray.d), -ray.d)
+        return si
+
+    def ray_test(self, ray: Any, active: Any) -> Any:
+        """See `mitsuba.Scene.ray_test`."""
+        blocked = self.static.ray_test(ray, active)
+        for part, pose in self.parts:
+            blocked |= part.ray_test(pose.ray_inside(ray), active & ~blocked)
+        return blocked
+
+
+def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """{id of a shape or sensor: (4, 4)}: what stands before its `to_world` in these poses.
+
+    Args:
+        scene: as loaded.
+        parameters: {key: value} of poses.
+    """
+    known = keys(scene)
+    found = {}
+    chosen = {key: known[key] for key in parameters}
+    for target, centre in _centres(scene, {key.target for key in chosen.values()}).items():
+        numbers = np.array([0, 0, 0, 0, 0, 0, 1.0])
+        for key, (owner, first, size) in _slots(chosen).items():
+            if owner == target:
+                numbers[first : first + size] = np.reshape(parameters[key], -1)
+        linear = numbers[6] * Rotation.from_rotvec(numbers[3:6]).as_matrix()
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = linear, centre + numbers[:3] - linear @ centre
+        found[target] = matrix
+    return found
+
+
+def _centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
+    """What each of the targets turns about, shapes before sensors."""
+    found = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
+    for sensor in scene.sensors():
+        if sensor.id() in targets:
+            matrix = np.array(sensor.world_transform().matrix.numpy(), float).reshape(4, 4)
+            found[sensor.id()] = matrix[:3, 3].tolist()
+    return found
+
+
+def _slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
+    """{key: (target, first of the 7 numbers, how many)}."""
+    taken: dict[tuple[str, int], str] = {}
+    slots: dict[str, tuple[str, int, int]] = {}
+    for name, key in chosen.items():
+        first = {"translation": 0, "rotation": 3, "scale": 6}[key.part] + (key.axis or 0)
+        size = int(np.prod(key.shape))
+        for slot in range(first, first + size):
+            if other := taken.get((key.target, slot)):
+                raise InputError(f"parameter {name}: {other} stands for the same coordinate")
+            taken[key.target, slot] = name
+        slots[name] = (key.target, first, size)
+    return slots
+
+
+def _scene(objects: list[Any]) -> Any:
+    """A scene of ready objects. Each keeps its id, which Mitsuba would take from the dictionary."""
+    named = {"type": "scene"}
+    for index, item in enumerate(objects):
+        name = item.id()
+        named[name if name and name not in named else f"object_{index}"] = item
+    return mi.load_dict(named, parallel=False, optimize=False)
+
+
+def _centre(box: Any) -> list[float]:
+    return [float(x) for x in np.array(box.center()).reshape(-1)]

@@ -1,0 +1,1 @@
+"""Renderers in NumPy with known integrals and derivatives."""

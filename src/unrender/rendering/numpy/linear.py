@@ -1,0 +1,170 @@
+"""A renderer with known integrals and known gradients, in NumPy: what proves the methods without a path tracer.
+
+Pixel p, channel c of sensor s is the integral over u in [0, 1)² of
+
+    f(u; θ) = b_pc + a_pc · θ̄ + g(θ)_pc (2 u₁ - 1) + h_pc (2 u₂ - 1),        g(θ) = noise · (a_pc · θ̄),
+
+with θ̄ all parameters flattened in key order. Its exact value is I = b + A θ̄, its gradient A; noise that grows with θ (g) and noise that
+does not (h) are shared or not between two states exactly as a path tracer's are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
+
+
+@dataclass(frozen=True)
+class AnalyticPaths:
+    """The random numbers of a rendering, (pixels, channels, spp, 2), and how they are grouped."""
+
+    numbers: np.ndarray
+    groups: int
+    pixels: np.ndarray | None
+
+
+class AnalyticRenderer:
+    """Images linear in the parameters, with multiplicative and additive noise.
+
+    Args:
+        values: {key: array}, the scene's own values.
+        matrix: A, (height * width * 3, n) for n parameters in all, in the order of `values`.
+        offset: b, (height, width, 3), or a number.
+        noise: share of A θ̄ that varies uniformly between -noise and noise, per sample.
+        grain: h, half-width of the noise that does not depend on θ, per sample.
+        shape: (height, width) of the film.
+        sensors: how many sensors, all alike.
+        carried: what `ParameterInfo.shares_paths` says of every parameter.
+    """
+
+    def __init__(
+        self,
+        values: Mapping[str, np.ndarray],
+        matrix: np.ndarray,
+        offset: np.ndarray | float = 0.0,
+        noise: float = 0.5,
+        grain: float = 0.0,
+        shape: tuple[int, int] = (4, 4),
+        sensors: int = 1,
+        shares_paths: bool = True,
+    ):
+        self._values = {key: np.asarray(value, np.float64) for key, value in values.items()}
+        self.matrix = np.asarray(matrix, np.float64)
+        self.shape = shape
+        self.offset = np.broadcast_to(np.asarray(offset, np.float64), (*shape, 3)).reshape(-1)
+        self.noise, self.grain, self.sensors, self.shares_paths = noise, grain, sensors, shares_paths
+        size = sum(value.size for value in self._values.values())
+        if self.matrix.shape != (shape[0] * shape[1] * 3, size):
+            raise InputError(f"matrix: expected shape {(shape[0] * shape[1] * 3, size)}, got {self.matrix.shape}")
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """See `Renderer.parameters`."""
+        return {key: ParameterInfo(value.shape, shares_paths=self.shares_paths) for key, value in self._values.items()}
+
+    def values(self, keys: list[str]) -> Tree:
+        """See `Renderer.values`."""
+        return {key: self._values[key].copy() for key in keys}
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """See `Renderer.resolutions`."""
+        return [self.shape] * self.sensors
+
+    def array(self, values: np.ndarray) -> np.ndarray:
+        """A NumPy array in double precision."""
+        return np.array(values, np.float64)
+
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
+        """See `Renderer.select`."""
+        del derivatives
+        for key in keys:
+            if key not in self._values:
+                raise InputError(f"parameter {key}: the scene has none of that name")
+            if space == "path" and not self.shares_paths:
+                raise InputError(f'parameter {key}: space="path" cannot carry it; use space="primary"')
+
+    def exact(self, parameters: Tree) -> np.ndarray:
+        """The exact image (H, W, 3)."""
+        return (self.offset + self.matrix @ self._flat(parameters)).reshape(*self.shape, 3)
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `Renderer.image`."""
+        paths = self._paths(request)
+        return Rendering(self._images(parameters, paths), None, paths)
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        """See `Renderer.image_batch`."""
+        paths = replace(self._paths(request), groups=1)
+        count = len(next(iter(parameters.values())))
+        states = [{key: value[index] for key, value in parameters.items()} for index in range(count)]
+        return np.concatenate([self._images(state, paths) for state in states])
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `Renderer.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        del space
+        paths = self._paths(request)
+        return Rendering(self._images(current, paths), self._images(previous, paths), paths)
+
+    def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
+        """See `Renderer.adjoint`."""
+        rows = self._rows(paths.pixels)
+        flat = np.zeros(self.matrix.shape[1])
+        for group, weight in zip(self._grouped(paths), weights, strict=True):
+            factor = 1 + self.noise * (2 * group[..., 0] - 1).mean(axis=-1)
+            flat += (weight.reshape(-1) * factor.reshape(-1)) @ self.matrix[rows] / paths.groups
+        gradient, start = {}, 0
+        for key, value in self._values.items():
+            part = flat[start : start + value.size].reshape(value.shape)
+            start += value.size
+            if key in parameters:
+                gradient[key] = part
+        return gradient
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: AnalyticPaths, weights: np.ndarray, weights_previous: np.ndarray
+    ) -> tuple[Tree, Tree]:
+        """See `Renderer.adjoint_pair`."""
+        return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
+
+    def tangent_moment(self, parameters: Tree, paths: AnalyticPaths, tangents: Tree) -> np.ndarray:
+        """See `Renderer.tangent_moment`."""
+        del parameters
+        along = {key: tangents.get(key, np.zeros_like(value)) for key, value in self._values.items()}
+        slopes = (self.matrix @ self._flat(along))[self._rows(paths.pixels)].reshape(-1, 3, 1)
+        samples = slopes * (1 + self.noise * (2 * paths.numbers[..., 0] - 1))
+        shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
+        return np.mean(samples**2, axis=-1).reshape(shape)
+
+    def _flat(self, parameters: Tree) -> np.ndarray:
+        return np.concatenate([np.ravel(parameters.get(key, value)) for key, value in self._values.items()])
+
+    def _rows(self, pixels: np.ndarray | None) -> Any:
+        if pixels is None:
+            return slice(None)
+        return (np.asarray(pixels)[:, None] * 3 + np.arange(3)).reshape(-1)
+
+    def _paths(self, request: SampleRequest) -> AnalyticPaths:
+        count = self.shape[0] * self.shape[1] if request.pixels is None else len(request.pixels)
+        numbers = np.random.default_rng(request.seed).random((count, 3, request.spp, 2))
+        return AnalyticPaths(numbers, request.groups, request.pixels)
+
+    def _grouped(self, paths: AnalyticPaths) -> list[np.ndarray]:
+        return np.split(paths.numbers, paths.groups, axis=2)
+
+    def _images(self, parameters: Tree, paths: AnalyticPaths) -> np.ndarray:
+        rows = self._rows(paths.pixels)
+        linear = (self.matrix @ self._flat(parameters))[rows]
+        shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
+        images = []
+        for group in self._grouped(paths):
+            u = (2 * group - 1).mean(axis=2).reshape(-1, 2)
+            images.append(
+                (self.offset[rows] + linear * (1 + self.noise * u[:, 0]) + self.grain * u[:, 1]).reshape(shape)
+            )
+        return np.stack(images)

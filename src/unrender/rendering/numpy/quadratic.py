@@ -1,0 +1,102 @@
+"""A quadratic form as a picture of one pixel, in NumPy: with L2 against black, the loss is xᵀ A x, to the last digit.
+
+The picture is linear, its channels J x with Jᵀ J = 3 A, since the loss is the mean over three channels. No noise: derivatives of
+the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A, and smoothing by a Gaussian only adds a constant, Σᵢ Aᵢᵢ σᵢ².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
+
+POINT = "x"
+"""The key of its one parameter."""
+
+
+class QuadraticRenderer:
+    """One pixel whose squared channels add up to a quadratic form of x.
+
+    Args:
+        matrix: A, (n, n) for n from 1 to 3, symmetric, no eigenvalue below 0.
+        point: its own x, (n,).
+
+    Raises `InputError` where no picture has this form.
+    """
+
+    def __init__(self, matrix: np.ndarray, point: np.ndarray):
+        self.matrix, self._point = np.array(matrix, np.float64), np.array(point, np.float64)
+        n = self._point.size
+        if self._point.shape != (n,) or not 1 <= n <= 3 or self.matrix.shape != (n, n):
+            raise InputError(
+                f"matrix: expected (n, n) and a point (n,), n from 1 to 3, got {self.matrix.shape}, {self._point.shape}"
+            )
+        values, vectors = np.linalg.eigh(self.matrix)
+        if not np.array_equal(self.matrix, self.matrix.T) or values[0] < -1e-9 * abs(values[-1]):
+            raise InputError("matrix: must be symmetric and have no eigenvalue below 0")
+        # The symmetric root of 3 A; channels that x does not reach stay black.
+        root = vectors * np.sqrt(3 * np.maximum(values, 0)) @ vectors.T
+        self._jacobian = np.concatenate([root, np.zeros((3 - n, n))])
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """See `Renderer.parameters`."""
+        return {POINT: ParameterInfo(self._point.shape)}
+
+    def values(self, keys: list[str]) -> Tree:
+        """See `Renderer.values`."""
+        return {key: self._point.copy() for key in keys}
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """See `Renderer.resolutions`."""
+        return [(1, 1)]
+
+    def array(self, values: np.ndarray) -> np.ndarray:
+        """A NumPy array in double precision."""
+        return np.array(values, np.float64)
+
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
+        """See `Renderer.select`."""
+        del space, derivatives
+        for key in keys:
+            if key != POINT:
+                raise InputError(f"parameter {key}: the scene has none of that name; it has {POINT}")
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `Renderer.image`. Exact."""
+        return Rendering(self._images(parameters, request), None, request)
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        """See `Renderer.image_batch`. Exact."""
+        del request
+        return (np.asarray(parameters[POINT]) @ self._jacobian.T)[:, None, None, :]
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `Renderer.image_pair`. Exact in both spaces."""
+        del space
+        return Rendering(self._images(current, request), self._images(previous, request), request)
+
+    def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
+        """See `Renderer.adjoint`. Exact."""
+        del parameters, paths
+        return {POINT: weights.reshape(len(weights), -1, 3).sum(axis=1).mean(axis=0) @ self._jacobian}
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Any, weights: np.ndarray, weights_previous: np.ndarray
+    ) -> tuple[Tree, Tree]:
+        """See `Renderer.adjoint_pair`. Exact."""
+        return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
+
+    def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
+        """See `Renderer.tangent_moment`. Exact."""
+        del parameters
+        return self._images(tangents, paths)[0] ** 2
+
+    def _images(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        shape = (1, 1) if request.pixels is None else (len(request.pixels),)
+        pixel = self._jacobian @ np.asarray(parameters[POINT])
+        return np.broadcast_to(pixel, (request.groups, *shape, 3)).copy()

@@ -1,0 +1,149 @@
+"""What the methods may ask of a renderer. They see nothing else of it.
+
+Mitsuba answers in `rendering/mitsuba_renderer.py`; `rendering/analytic.py` answers in NumPy with known integrals and known
+gradients. Arrays are the renderer's own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and are
+never changed in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from unrender.core.arrays import Array
+from unrender.core.trees import Tree
+
+Space = Literal["path", "primary"]
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """What a renderer says of one of its parameters.
+
+    Attributes:
+        shape: of the array that stands for it.
+        differentiable: whether `adjoint` can return its gradient.
+        carried: whether one set of paths serves two values of it (path space).
+        reason: one line; why it is not differentiable or not carried, else "".
+        lowest: the smallest value that makes physical sense, or None.
+        highest: the largest, or None.
+        perturbable: whether it can be rendered at other values, all that `image_batch` needs.
+        compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
+        resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
+    """
+
+    shape: tuple[int, ...]
+    differentiable: bool = True
+    shares_paths: bool = True
+    reason: str = ""
+    lowest: float | None = None
+    highest: float | None = None
+    perturbable: bool = True
+    compiled: bool = False
+    resizable: bool = False
+
+
+@dataclass(frozen=True)
+class SampleRequest:
+    """Which samples to take.
+
+    Attributes:
+        sensor: index of the sensor.
+        spp: samples per pixel, in all groups together; a multiple of `groups`.
+        seed: an integer in [0, 2**32), from `Key.uint32()`.
+        groups: how many independent images the samples are split into.
+        pixels: flat pixel indices (row-major), or None for the whole film.
+        sensors: of each chosen pixel, in place of `sensor`; None where all are of that one.
+    """
+
+    sensor: int
+    spp: int
+    seed: int
+    groups: int = 1
+    pixels: Array | None = None
+    sensors: Array | None = None
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The answer to a `SampleRequest`.
+
+    Attributes:
+        images: the mean of each group's samples: (groups, H, W, 3), or (groups, N, 3) for N chosen pixels.
+        previous: likewise for the previous parameters on the same samples; None unless a pair was asked for.
+        paths: the renderer's own; hand it to `adjoint` to walk the same paths again.
+    """
+
+    images: Array
+    previous: Array | None
+    paths: Any
+
+
+class Renderer(Protocol):
+    """A scene with parameters that can be rendered and differentiated."""
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Every parameter of the scene by key."""
+        ...
+
+    def values(self, keys: list[str]) -> Tree:
+        """The scene's own values."""
+        ...
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """(height, width) of each sensor's film."""
+        ...
+
+    def array(self, values: np.ndarray) -> Array:
+        """This renderer's array with these values."""
+        ...
+
+    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
+        """Announce which parameters will change, before the first render, and whether `adjoint` will be called.
+
+        Raises `InputError` for one that is unknown, not differentiable where `derivatives` are asked for, or not perturbable; with
+        `space="path"` for one that is not carried.
+        """
+        ...
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """Render. Unbiased."""
+        ...
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        """Render many states with the same random numbers: {key: (B, *shape)}, NumPy, to images (B, H, W, 3), all pixels
+        in one group. Unbiased each."""
+        ...
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """Render two states with the same samples: one set of paths (`"path"`) or one set of random numbers
+        (`"primary"`). Both images are unbiased."""
+        ...
+
+    def adjoint(self, parameters: Tree, paths: Any, weights: Array) -> Tree:
+        """The gradient of the mean over groups g of sum(weights[g] * images[g]), on the paths of a rendering; `weights` has the
+        shape of its images.
+
+        Unbiased where `weights[g]` is independent of group g.
+        """
+        ...
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Any, weights: Array, weights_previous: Array
+    ) -> tuple[Tree, Tree]:
+        """`adjoint` of both states of an `image_pair`, on its paths and in its space: the gradient of sum(weights[g] * images[g])
+        with respect to `current`, and of sum(weights_previous[g] * previous[g]) with respect to `previous`.
+        """
+        ...
+
+    def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> Array:
+        """The mean over a pixel's samples of (Σ_k v_k ∂f/∂θ_k)², for the tangents v, on the paths of a rendering in one group: of the
+        shape of one of its images.
+
+        Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
+        derivatives of a path.
+        """
+        ...

@@ -1,0 +1,146 @@
+"""Who holds a run folder: one process at a time, and one that died holds nothing.
+
+The file `lock` names the process and is locked (`flock`) while it lives: the kernel lets go when it ends, however it ends, so neither a
+crash nor a process id that was given to another can leave a folder locked. Where the file system does not lock, or another machine wrote
+the file, the name decides: process id and time of its start, counted from the machine's own start and so untouched by clocks set back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import platform
+import subprocess
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from unrender.io import files
+from unrender.core.errors import InputError
+
+NAME = "lock"
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A process.
+
+    Attributes:
+        pid: its number.
+        host: the machine.
+        started: what tells it from another process of the same number: the machine's start and the process's since then.
+    """
+
+    pid: int
+    host: str
+    started: str
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {self.host}"
+
+    def is_gone(self) -> bool:
+        """Whether the process is known to have ended. One of another machine never is."""
+        return self.host == platform.node() and _started(self.pid) != self.started
+
+
+class Lock:
+    """Holds a run folder from `take` on until `release`. The folder must be there."""
+
+    def __init__(self, folder: Path):
+        self.path = folder / NAME
+        self._file: int | None = None
+
+    def take(self) -> None:
+        """Raises `InputError` where another process holds the folder, or none can: one line that says who, or why."""
+        try:
+            while self._file is None:
+                self._file = self._try()
+        except OSError as error:
+            raise InputError(f"run folder {self.path.parent}: cannot be locked: {error.strerror or error}") from error
+
+    def is_ours(self) -> bool:
+        """Whether the folder still has our lock: it may have been deleted, or deleted and taken by another."""
+        if self._file is None:
+            return False
+        with contextlib.suppress(OSError):
+            return os.path.samestat(os.stat(self.path), os.fstat(self._file))
+        return False
+
+    def release(self) -> None:
+        """Let the folder go. Harmless where it is not held."""
+        if self._file is None:
+            return
+        with contextlib.suppress(OSError):
+            if self.is_ours():
+                self.path.unlink()
+        os.close(self._file)
+        self._file = None
+
+    def _try(self) -> int | None:
+        """The locked file; None where it was taken away in between, and all begins anew."""
+        file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        locked = False
+        try:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                locked = True
+            except BlockingIOError:
+                raise InputError(self._taken(_read(self.path))) from None
+            except OSError:
+                pass  # a file system without locks: the name decides
+            if not os.path.exists(self.path) or not os.path.samestat(os.stat(self.path), os.fstat(file)):
+                os.close(file)
+                return None
+            known = _read(self.path)
+            if known is not None and not known.is_gone() and not (locked and known.host == platform.node()):
+                raise InputError(self._taken(known))
+            me = Holder(os.getpid(), platform.node(), _started(os.getpid()))
+            os.ftruncate(file, 0)
+            os.pwrite(file, (json.dumps(asdict(me)) + "\n").encode(), 0)
+            return file
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.close(file)
+            raise
+
+    def _taken(self, holder: Holder | None) -> str:
+        who = "another process" if holder is None else str(holder)
+        elsewhere = holder is not None and holder.host != platform.node()
+        hint = f"; if that is no more, delete {self.path}" if elsewhere else ""
+        return f"run folder {self.path.parent}: in use by {who}{hint}"
+
+
+def holder(folder: Path) -> Holder | None:
+    """The process that holds a run folder, as far as can be told without asking for it; None where none does, or it has ended."""
+    found = _read(folder / NAME)
+    return None if found is None or found.is_gone() else found
+
+
+def _read(path: Path) -> Holder | None:
+    try:
+        given = files.parse_json(files.read_bytes(path, 1 << 12), str(path))
+        match given:
+            case {"pid": int(pid), "host": str(host), "started": str(started)} if 0 < pid < 1 << 31:
+                return Holder(pid, host[:200], started)
+    except InputError:
+        pass  # nothing there, or written by no run: nobody is named
+    return None
+
+
+def _started(pid: int) -> str:
+    """When a process of this machine started; "" where there is none of that number."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        # The name, in parentheses, may hold anything; the 22nd field is the start in ticks since the machine's.
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return "" if fields[0] == "Z" else f"{boot}/{fields[19]}"
+    except (OSError, IndexError):
+        if Path("/proc/self/stat").exists():
+            return ""
+    with contextlib.suppress(OSError):
+        told = subprocess.run(
+            ["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False, env={"LC_ALL": "C"}
+        )
+        return told.stdout.strip()
+    return ""

@@ -1,0 +1,268 @@
+"""States as flat tensors and a skeleton of JSON, and back: what lets a checkpoint write any state without knowing it.
+
+A state is a frozen dataclass of this package, or a dictionary, tuple, list, number, text or array, nested as it likes. An array that
+occurs twice is stored once, and is one object again when it is read: components may tell the present from the past by identity.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.errors import InputError
+
+_PACKAGE = __name__.partition(".")[0]
+_DEEPEST = 64
+_HOST, _SCALAR = "numpy", "scalar"
+_DEVICE = (
+    *(f"TensorX{kind}" for kind in ("f", "f16", "f64", "i", "i64", "u", "u64", "b")),
+    *("Float", "Float16", "Float64", "Int", "Int64", "UInt", "UInt64", "Bool"),
+)
+_FLOATS = (float, np.floating)
+_NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A state taken apart.
+
+    Attributes:
+        skeleton: JSON that says how it is put together; arrays are named by number.
+        tensors: {number as text: array}, on the host.
+    """
+
+    skeleton: Any
+    tensors: dict[str, np.ndarray]
+
+
+def pack(state: Any) -> Packed:
+    """Take a state apart. Waits for the device. Raises `TypeError` for one that holds what no state should."""
+    packer = _Packer()
+    return Packed(packer.node(state), packer.tensors)
+
+
+def unpack(packed: Packed) -> Any:
+    """Put a state together again.
+
+    Classes are looked up among the frozen dataclasses of this package that are loaded already, and in no other place.
+
+    Raises:
+        InputError: the skeleton is none, or does not fit the tensors.
+    """
+    unpacker = _Unpacker(packed.tensors)
+    try:
+        state = unpacker.node(packed.skeleton, 0)
+    except (ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"state: cannot be put together: {str(error)[:200]}") from error
+    if unused := sorted(set(packed.tensors) - set(unpacker.used)):
+        raise InputError(f"state: tensor {unused[0][:60]!r} belongs to nothing")
+    return state
+
+
+def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> None:
+    """Raise `InputError` unless each part of `state` has the form of that part of one of `patterns`, states of the same components.
+
+    Same classes, keys, lengths and kinds of arrays, and same shapes; but the first axis of an array on the host may differ, since some
+    states grow with the steps, and where all patterns have nothing yet there may be anything that a state is made of.
+    """
+    if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
+        return
+    # A number may be NumPy's or Python's: where arrays are NumPy's, one that was not yet summed to is still Python's.
+    if isinstance(state, _FLOATS) and any(isinstance(pattern, _FLOATS) for pattern in patterns):
+        return
+    fitting = [pattern for pattern in patterns if type(pattern) is type(state)]
+    if not fitting:
+        expected = " or ".join(sorted({type(pattern).__name__ for pattern in patterns}))
+        raise InputError(f"{where}: expected {expected}, got {type(state).__name__}")
+    if dataclasses.is_dataclass(state):
+        for each in dataclasses.fields(state):
+            parts = [getattr(pattern, each.name) for pattern in fitting]
+            check_alike(getattr(state, each.name), parts, f"{where}.{each.name}")
+    elif isinstance(state, Mapping):
+        fitting = [pattern for pattern in fitting if list(pattern) == list(state)]
+        if not fitting:
+            raise InputError(f"{where}: other names than expected, {str(list(state))[:80]}")
+        for key, value in state.items():
+            check_alike(value, [pattern[key] for pattern in fitting], f"{where}[{key!r}]"[:120])
+    elif isinstance(state, (tuple, list)):
+        fitting = [pattern for pattern in fitting if len(pattern) == len(state)]
+        if not fitting:
+            raise InputError(f"{where}: expected another length, got {len(state)}")
+        for index, value in enumerate(state):
+            check_alike(value, [pattern[index] for pattern in fitting], f"{where}[{index}]")
+    elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
+        _check_array(state, fitting, where)
+
+
+def _check_array(array: Any, patterns: list[Any], where: str) -> None:
+    grows = isinstance(array, np.ndarray) and array.ndim > 0
+    form = (array.dtype if grows else None, arrays.shape(array)[1 if grows else 0 :], len(array.shape))
+    for pattern in patterns:
+        shape = arrays.shape(pattern)
+        if form == (pattern.dtype if grows else None, shape[1 if grows else 0 :], len(shape)):
+            return
+    raise InputError(f"{where}: expected shape {arrays.shape(patterns[0])}, got {arrays.shape(array)}")
+
+
+@dataclass
+class _Packer:
+    tensors: dict[str, np.ndarray] = field(default_factory=dict)
+    _seen: dict[int, tuple[Any, int]] = field(default_factory=dict)
+
+    def node(self, value: Any) -> Any:
+        if value is None or isinstance(value, (bool, str)):
+            return value
+        if isinstance(value, np.generic):
+            return self._array(value, np.asarray(value), _SCALAR)
+        if isinstance(value, int):
+            return value
+        if isinstance(value, float):
+            return value if math.isfinite(value) else {"float": str(value)}
+        if isinstance(value, np.ndarray):
+            return self._array(value, value, _HOST)
+        if arrays.is_drjit(value):
+            return self._array(value, None, _device_name(type(value)))
+        if isinstance(value, (list, tuple)) and type(value) in (list, tuple):
+            return {type(value).__name__: [self.node(part) for part in value]}
+        if isinstance(value, Mapping):
+            for key in value:
+                if type(key) not in (str, int):
+                    raise TypeError(f"a state's dictionary has names or whole numbers as keys, got {key!r}")
+            return {"dict": [[key, self.node(part)] for key, part in value.items()]}
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            kind = type(value)
+            fields = {each.name: self.node(getattr(value, each.name)) for each in dataclasses.fields(value)}
+            return {"class": f"{kind.__module__}.{kind.__qualname__}", "fields": fields}
+        raise TypeError(f"a state is made of dataclasses, arrays and numbers, got {type(value).__name__}")
+
+    def _array(self, original: Any, host: np.ndarray | None, kind: str) -> Any:
+        if id(original) not in self._seen:
+            array = arrays.numpy(original) if host is None else host
+            if array.dtype.kind not in "fiub":
+                raise TypeError(f"a state's arrays are of real numbers, got {array.dtype}")
+            number = len(self.tensors)
+            # `ascontiguousarray` alone would turn a number into an array of one.
+            self.tensors[str(number)] = np.ascontiguousarray(array).reshape(array.shape)
+            self._seen[id(original)] = original, number  # held, so that its id is not given to another
+        return {"array": self._seen[id(original)][1], "kind": kind}
+
+
+@dataclass
+class _Unpacker:
+    tensors: dict[str, np.ndarray]
+    used: dict[str, tuple[str, Any]] = field(default_factory=dict)
+
+    def node(self, node: Any, depth: int) -> Any:
+        if depth > _DEEPEST:
+            raise InputError("state: nested too deeply")
+        if node is None or isinstance(node, (bool, int, float, str)):
+            if isinstance(node, float) and not math.isfinite(node):
+                raise InputError("state: a number that is not finite")
+            return node
+        match node:
+            case {"float": str(word), **rest} if not rest and word in _NOT_FINITE:
+                return _NOT_FINITE[word]
+            case {"array": int(number), "kind": str(kind), **rest} if not rest:
+                return self._array(str(number), kind)
+            case {"list": list(parts), **rest} if not rest:
+                return [self.node(part, depth + 1) for part in parts]
+            case {"tuple": list(parts), **rest} if not rest:
+                return tuple(self.node(part, depth + 1) for part in parts)
+            case {"dict": list(pairs), **rest} if not rest:
+                return self._dictionary(pairs, depth)
+            case {"class": str(name), "fields": dict(fields), **rest} if not rest:
+                kind = _class(name)
+                if set(fields) != {each.name for each in dataclasses.fields(kind)}:
+                    raise InputError(f"state: {name}: other fields than it has, {', '.join(fields)[:100]}")
+                return kind(**{key: self.node(part, depth + 1) for key, part in fields.items()})
+        raise InputError(f"state: expected a part of a state, got {repr(node)[:80]}")
+
+    def _dictionary(self, pairs: list[Any], depth: int) -> dict[Any, Any]:
+        found: dict[Any, Any] = {}
+        for pair in pairs:
+            match pair:
+                case [str() | int() as key, part] if key not in found and not isinstance(key, bool):
+                    found[key] = self.node(part, depth + 1)
+                case _:
+                    raise InputError(f"state: expected [name, part], every name once, got {repr(pair)[:80]}")
+        return found
+
+    def _array(self, number: str, kind: str) -> Any:
+        if number not in self.tensors:
+            raise InputError(f"state: there is no tensor {number[:20]}")
+        if number in self.used:
+            known, array = self.used[number]
+            if known != kind:
+                raise InputError(f"state: tensor {number} is of two kinds, {known} and {kind[:40]}")
+            return array
+        host = self.tensors[number]
+        if kind == _HOST:
+            array = host
+        elif kind == _SCALAR and host.ndim == 0:
+            array = host[()]
+        elif kind in _DEVICE:
+            array = _on_device(host, kind)
+        else:
+            raise InputError(f"state: unknown kind of array {kind[:40]!r}")
+        self.used[number] = kind, array
+        return array
+
+
+def _class(name: str) -> type:
+    """The frozen dataclass of that name, if it is one of this package's that is loaded and only holds what it is given."""
+    module, _, word = name.rpartition(".")
+    home = sys.modules.get(module) if module.startswith(f"{_PACKAGE}.") else None
+    kind = vars(home).get(word) if home is not None else None
+    state = (
+        isinstance(kind, type)
+        and kind.__module__ == module
+        and dataclasses.is_dataclass(kind)
+        and "__post_init__" not in vars(kind)
+        and kind.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+    )
+    if not state or not isinstance(kind, type):
+        raise InputError(f"state: {name[:80]!r} is no state of this version of {_PACKAGE}")
+    return kind
+
+
+def _device_name(kind: type) -> str:
+    if kind.__name__ not in _DEVICE:
+        raise TypeError(f"a state's arrays are tensors or flat arrays, got {kind.__name__}")
+    return kind.__name__
+
+
+def _on_device(host: np.ndarray, name: str) -> Any:
+    """A Dr.Jit array of the variant in use, in memory of its own (see `MitsubaRenderer.array`)."""
+    import mitsuba as mi
+
+    kind = getattr(sys.modules[mi.Float.__module__], name)
+    flat = kind if dr.depth_v(kind) == 1 else dr.array_t(kind)
+    if not dr.is_tensor_v(kind) and host.ndim != 1:
+        raise InputError(f"state: an array of shape {host.shape}, expected a flat one for {name}")
+    expected = np.dtype(_dtype(flat))
+    if host.dtype != expected:
+        raise InputError(f"state: an array of {host.dtype}, expected {expected} for {name}")
+    borrowed = flat(np.ascontiguousarray(host).reshape(-1))
+    if host.size == 0:
+        return kind(borrowed, host.shape) if dr.is_tensor_v(kind) else borrowed
+    owned = borrowed & dr.opaque(flat, True) if dr.is_mask_v(flat) else borrowed * dr.opaque(flat, 1)
+    made = kind(owned, host.shape) if dr.is_tensor_v(kind) else owned
+    dr.eval(made)
+    return made
+
+
+def _dtype(flat: Any) -> str:
+    if dr.is_mask_v(flat):
+        return "bool"
+    letter = "f" if dr.is_float_v(flat) else "i" if dr.is_signed_v(flat) else "u"
+    return f"{letter}{dr.itemsize_v(flat)}"

@@ -1,0 +1,78 @@
+"""Run folders opened again: the problem that a run was of, and the run itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from unrender.io import files
+from unrender import gallery
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimator
+from unrender.optimizers.base import Optimizer
+from unrender.io import toml_lines
+from unrender.problem import serialization
+from unrender.problem.problem import Problem
+from unrender.runs.folder import record
+from unrender.runs.callbacks import Callback
+from unrender.runs.result import Result
+from unrender.runs.resume import resume_run, load_run
+
+_LONGEST = 1 << 24
+
+
+def resume(
+    directory: str | Path,
+    problem: Problem | None = None,
+    steps: int | None = None,
+    seconds: float | None = None,
+    force: bool = False,
+    callbacks: Sequence[Callback] = (),
+    estimator: Estimator | None = None,
+    optimizer: Optimizer | None = None,
+) -> Result:
+    """Take up a run where its last checkpoint left it: interrupted, killed, or finished and to be given more.
+
+    The resumed run is the one that would have been without the interruption, its clock included: bit for bit on LLVM with one thread
+    (see `optimize` for more threads). What was done after the checkpoint is done again, the same.
+
+    Args:
+        directory: the run folder.
+        problem: what it was a run of; None makes it again from the folder, which goes for problem files, XML scenes and the gallery's.
+        steps, seconds: a budget in place of the run's, counted from its start.
+        force: go on though problem, versions or scene files are not as they were.
+        callbacks: listeners.
+        estimator, optimizer: those that method.toml cannot say, such as ones of your own.
+
+    Raises:
+        InputError: no run folder, a malformed one, one in use; finished and no larger budget; something changed since, which the message
+            says; or no checkpoint can be read.
+    """
+    found = load_run(directory, steps, seconds)
+    return resume_run(found, problem or problem_of(directory), force, callbacks, estimator, optimizer)
+
+
+def problem_of(directory: str | Path) -> Problem:
+    """The problem that a run folder is of, made again.
+
+    From the problem file that it came from, where that is still there (so what changed in it is noticed), else from the folder's own copy.
+
+    Raises:
+        InputError: it was made in Python, or problem.toml is malformed.
+    """
+    folder = Path(directory)
+    origin = record.read(folder).problem.origin
+    path = folder / serialization.FILE
+    serialize = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
+    if "gallery" in serialize:
+        name, options = serialize["gallery"], serialize.get("options", {})
+        if not isinstance(name, str) or not isinstance(options, dict) or set(serialize) - {"gallery", "options"}:
+            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(serialize)[:80]}')
+        return gallery.problem(name, **options)
+    if "scene" not in serialize:
+        raise InputError(
+            f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
+            "unrender.export((problem, result.parameters), out)"
+        )
+    file = origin.get("file")
+    return Problem.from_file(file if isinstance(file, str) and Path(file).is_file() else path)

@@ -1,0 +1,170 @@
+"""What a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.io import files
+from unrender.core.errors import InputError
+from unrender.runs.folder.history import lines
+from unrender.backend.variant import LLVM, current, llvm_version
+
+
+@dataclass(frozen=True)
+class Result:
+    """The outcome of `optimize`.
+
+    Attributes:
+        parameters: {key: array}, float32, the recovered values.
+        initial: {key: array}, where the descent began.
+        history: one dictionary per step: "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
+            "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
+            "parameter_error" ({key: root mean square error}) now and then and at the last step; of parameters that are coarse at
+            first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
+        seconds: of optimization.
+        warmup_seconds: of tracing and compiling kernels before the first step.
+        stopped: "steps", "seconds", "interrupted", "callback" or "non-finite".
+        skipped: steps whose gradient or loss was not finite, and which were not applied.
+        warnings: one line each.
+        info: of the last estimate, as NumPy arrays.
+        name, method, settings, seed, command, problem: what was run.
+        resumed: the steps at which it was taken up again.
+        truth: {key: array} where it is known.
+        pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
+    """
+
+    parameters: dict[str, np.ndarray]
+    initial: dict[str, np.ndarray]
+    history: list[dict[str, Any]]
+    seconds: float
+    warmup_seconds: float
+    stopped: str
+    skipped: int = 0
+    warnings: list[str] = field(default_factory=list)
+    info: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "problem"
+    method: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    command: str = ""
+    problem: Mapping[str, Any] = field(default_factory=dict)
+    resumed: Sequence[int] = ()
+    truth: Mapping[str, np.ndarray] = field(default_factory=dict)
+    pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        """How many steps were taken, skipped ones among them."""
+        return len(self.history)
+
+    @property
+    def status(self) -> str:
+        """ "interrupted", or "finished"."""
+        return "interrupted" if self.stopped == "interrupted" else "finished"
+
+    def save(self, directory: str | Path, status: str | None = None) -> Path:
+        """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz.
+
+        Each file is written beside its place and renamed; run.json, with `status` (None for the result's own), comes last. Raises
+        `InputError` where the folder cannot be written.
+        """
+        folder = Path(directory)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            files.write_arrays(folder / "parameters.npz", self.parameters)
+            files.write_arrays(folder / "initial.npz", self.initial)
+            if self.truth:
+                files.write_arrays(folder / "truth.npz", self.truth)
+            if self.pictures:
+                files.write_arrays(folder / "pictures.npz", self.pictures)
+            files.write(folder / "history.jsonl", lines(self.history))
+            record = json.dumps(self.record(status or self.status), indent=2) + "\n"
+            files.write(folder / "run.json", record.encode(), durable=True)
+        except OSError as error:
+            raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
+        return folder
+
+    def record(self, status: str) -> dict[str, Any]:
+        """What run.json says of it; `status` is "running", "finished", "interrupted" or "failed"."""
+        return {
+            "status": status,
+            "name": self.name,
+            "method": self.method,
+            "settings": dict(self.settings),
+            "seed": self.seed,
+            "command": self.command,
+            "versions": versions(),
+            "hardware": hardware(),
+            "variant": current() or "",
+            "stopped": self.stopped,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "warmup_seconds": self.warmup_seconds,
+            "skipped": self.skipped,
+            "warnings": list(self.warnings),
+            "problem": dict(self.problem),
+            "resumed": list(self.resumed),
+        }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide the numbers."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("unrender", "mitsuba", "drjit", "numpy"):
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def deciding_versions() -> dict[str, str]:
+    """What decides the bits of a run's numbers, as far as versions can: packages, LLVM, the variant."""
+    return dict(_deciding_versions(current() or "none"))
+
+
+@cache
+def _deciding_versions(name: str) -> dict[str, str]:
+    found = {name: version for name, version in versions().items() if name != "python"}
+    for package in ("scipy", "cholespy", "cma"):
+        found[package] = metadata.version(package)
+    llvm = llvm_version() if name == LLVM else None
+    return {**found, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
+
+
+def hardware() -> dict[str, Any]:
+    """The processor and how many cores this process may use."""
+    return dict(_hardware())
+
+
+@cache
+def _hardware() -> dict[str, Any]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": _processor(), "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+
+
+def _processor() -> str:
+    if sys.platform == "linux":
+        try:
+            for line in Path("/proc/cpuinfo").read_text().splitlines():
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+        except OSError:
+            pass
+    return platform.processor() or platform.machine()

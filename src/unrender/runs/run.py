@@ -1,0 +1,136 @@
+"""A run: what callbacks see of it, and what it carries from step to step."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.estimators.base import Estimate, Estimator
+from unrender.optimizers.base import Optimizer
+from unrender.problem.problem import Problem
+from unrender.runs.noise import GradientNoise
+from unrender.core.trees import Tree
+
+
+@dataclass
+class Run:
+    """A run as callbacks see it.
+
+    Attributes:
+        problem, estimator, optimizer, seed: what runs.
+        steps, seconds: the budget; None where there is none.
+        folder: the run folder; None where the run keeps none.
+        step: how many steps are done.
+        clock: seconds of optimization so far.
+        parameters: the current ones (the renderer's arrays), at the present resolution where they are coarse at first.
+        estimate: the last one.
+        skipped: steps not applied so far.
+        warnings: one line each.
+        stopped: why it ends after the present step; "" while it goes on.
+    """
+
+    problem: Problem
+    estimator: Estimator
+    optimizer: Optimizer
+    seed: int
+    steps: int | None
+    seconds: float | None
+    parameters: Tree
+    folder: Path | None = None
+    step: int = 0
+    clock: float = 0.0
+    estimate: Estimate | None = None
+    skipped: int = 0
+    warnings: list[str] = field(default_factory=list)
+    stopped: str = ""
+
+    def stop(self, reason: str = "callback") -> None:
+        """End the run after the present step."""
+        self.stopped = self.stopped or reason
+
+    def full(self) -> dict[str, np.ndarray]:
+        """The parameters as NumPy arrays at the scene's own resolution."""
+        return self.problem.full(self.parameters)
+
+    def progress(self) -> float:
+        """The share of the budget used, in [0, 1]."""
+        shares = [self.step / self.steps if self.steps else 0.0, self.clock / self.seconds if self.seconds else 0.0]
+        return min(max(shares), 1.0)
+
+
+@dataclass
+class Memory:
+    """What a run carries from step to step beside what `Run` shows.
+
+    Attributes:
+        estimator, optimizer: their states.
+        noise: of the gradient so far.
+        silent: {key: whether its gradient has been zero so far}.
+        samples: paths traced so far.
+        in_a_row: steps that were not applied since the last that was.
+        next_error: when the parameters' error is due again, on the run's clock.
+    """
+
+    estimator: Any
+    optimizer: Any
+    noise: GradientNoise
+    silent: dict[str, bool]
+    samples: int = 0
+    in_a_row: int = 0
+    next_error: float = 0.0
+
+
+def snapshot(run: Run, memory: Memory) -> dict[str, Any]:
+    """All that decides what the next steps do: what a checkpoint holds, for `state.pack`."""
+    noise = memory.noise
+    return {
+        "parameters": run.parameters,
+        "step": run.step,
+        "clock": run.clock,
+        "skipped": run.skipped,
+        "warnings": list(run.warnings),
+        "estimator": memory.estimator,
+        "optimizer": memory.optimizer,
+        "noise": {"mean": noise.mean, "energy": noise.energy, "weight": noise.weight},
+        "silent": dict(memory.silent),
+        "samples": memory.samples,
+        "in_a_row": memory.in_a_row,
+        "next_error": memory.next_error,
+    }
+
+
+def restore(run: Run, memory: Memory, kept: dict[str, Any]) -> None:
+    """Bring a run to where `snapshot` was taken. The snapshot has been checked to be one of this run's."""
+    run.parameters, run.step, run.clock = kept["parameters"], kept["step"], kept["clock"]
+    run.skipped, run.warnings = kept["skipped"], list(kept["warnings"])
+    memory.estimator, memory.optimizer = kept["estimator"], kept["optimizer"]
+    memory.noise = GradientNoise(**kept["noise"])
+    memory.silent, memory.samples = kept["silent"], kept["samples"]
+    memory.in_a_row, memory.next_error = kept["in_a_row"], kept["next_error"]
+
+
+@contextmanager
+def interruptible(run: Run) -> Iterator[None]:
+    """Let the first Ctrl-C end the run after the present step; the second one interrupts at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: Any) -> None:
+        del number, frame
+        run.stop("interrupted")
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

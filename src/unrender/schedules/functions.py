@@ -1,0 +1,124 @@
+"""Factors of the learning rate, or of a smoothing's width, as functions of the step.
+
+A schedule is a callable that takes the number of steps already made (>= 0) and returns a factor >= 0. The number need not be whole: who
+measures progress otherwise than in steps (`SmoothedDerivatives(arrival=True)`) asks by that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from unrender.core import checks
+from unrender.core.errors import InputError
+
+
+class Schedule(Protocol):
+    """A pure function of the step."""
+
+    def __call__(self, step: float) -> float:
+        """The factor of the learning rate at `step`, which counts from 0."""
+        ...
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same factor at every step.
+
+    Args:
+        factor: >= 0.
+    """
+
+    factor: float = 1.0
+
+    def __post_init__(self):
+        checks.number("Constant", "factor", self.factor, above=0.0, inclusive=True)
+
+    def __call__(self, step: float) -> float:
+        return self.factor
+
+
+@dataclass(frozen=True)
+class Exponential:
+    """2^(−step / half_life), and never below `floor`.
+
+    Args:
+        half_life: steps after which the rate has halved, > 0.
+        floor: the least factor, >= 0.
+    """
+
+    half_life: float
+    floor: float = 0.0
+
+    def __post_init__(self):
+        checks.number("Exponential", "half_life", self.half_life, above=0.0)
+        checks.number("Exponential", "floor", self.floor, above=0.0, inclusive=True)
+
+    def __call__(self, step: float) -> float:
+        return max(self.floor, 0.5 ** (step / self.half_life))
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """Half a cosine from 1 at step 0 down to `floor` at step `steps`, and `floor` ever after.
+
+    Args:
+        steps: length of the descent, >= 1.
+        floor: the last factor, >= 0.
+    """
+
+    steps: int
+    floor: float = 0.0
+
+    def __post_init__(self):
+        checks.integer("Cosine", "steps", self.steps, at_least=1)
+        checks.number("Cosine", "floor", self.floor, above=0.0, inclusive=True)
+
+    def __call__(self, step: float) -> float:
+        done = min(step / self.steps, 1.0)
+        return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Multiplied by `factor` once every `every` steps.
+
+    Args:
+        every: >= 1.
+        factor: > 0, usually below 1.
+    """
+
+    every: int
+    factor: float = 0.5
+
+    def __post_init__(self):
+        checks.integer("Steps", "every", self.every, at_least=1)
+        checks.number("Steps", "factor", self.factor, above=0.0)
+
+    def __call__(self, step: float) -> float:
+        return float(self.factor) ** (step // self.every)
+
+
+@dataclass(frozen=True)
+class Warmup:
+    """A linear rise over the first `steps` steps, 1/steps, 2/steps … 1, then another schedule, which starts at its
+    own step 0.
+
+    Args:
+        steps: length of the rise, >= 1.
+        then: what follows; None stays at 1.
+    """
+
+    steps: int
+    then: Schedule | None = None
+
+    def __post_init__(self):
+        checks.integer("Warmup", "steps", self.steps, at_least=1)
+        if self.then is not None and not callable(self.then):
+            raise InputError(f"Warmup: then must be a schedule or None, got {self.then!r}")
+
+    def __call__(self, step: float) -> float:
+        if step < self.steps:
+            return (step + 1) / self.steps
+        return 1.0 if self.then is None else self.then(step - self.steps)

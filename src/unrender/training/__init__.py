@@ -1,1 +1,0 @@
-"""The loop, what listens to it, and what it leaves behind."""
