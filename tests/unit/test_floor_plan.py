@@ -1,0 +1,106 @@
+"""The floor plan of CONTRIBUTING.md: imports run downwards, no circles, files and functions stay small."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[2] / "src" / "unrender"
+FLOORS = (
+    *("core", "backend", "io", "statistics", "evaluation", "rendering", "losses", "schedules", "preconditioners"),
+    *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "report"),
+    *("exporting", "watch", "cli"),
+)
+"""From low to high: a floor imports itself and what is below it."""
+
+LONGEST_FILE, LONGEST_FUNCTION = 400, 60
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the package by its dotted name below `unrender`; the package's own `__init__` and `__main__` are the roof."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        if name not in ("", "__main__"):
+            found[name] = path
+    return found
+
+
+def imports(tree: ast.Module, known: dict[str, Path]) -> Iterator[tuple[str, int, bool]]:
+    """(module, line, whether it is imported when the file is: neither in a function nor for type checkers alone)."""
+    lazy = {id(x) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) for x in ast.walk(node)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            lazy |= {id(x) for x in ast.walk(node)}
+    for node in ast.walk(tree):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            if name.startswith("unrender."):
+                inner = name.removeprefix("unrender.")
+                module = inner if inner in known else inner.rpartition(".")[0]
+                yield module, node.lineno, id(node) not in lazy
+
+
+def upward(module: str, source: str, known: dict[str, Path]) -> list[str]:
+    """Imports of `source` that do not keep to the floor plan, one line each."""
+    floor = module.split(".")[0]
+    if floor not in FLOORS:
+        return [f"{module}: stands on no floor"]
+    found = []
+    for target, line, _ in imports(ast.parse(source), known):
+        there = target.split(".")[0] if target else "the roof"
+        if there not in FLOORS or FLOORS.index(there) > FLOORS.index(floor):
+            found.append(f"{module}:{line} imports {target or 'unrender'}, of {there}")
+    return found
+
+
+def test_imports_run_downwards() -> None:
+    known = modules()
+    assert [line for name, path in known.items() for line in upward(name, path.read_text(), known)] == []
+
+
+def test_an_upward_import_is_found() -> None:
+    known = modules()
+    assert upward("core.trees", "from unrender.runs.loop import optimize\n", known)
+    assert upward("losses.base", "def f():\n    from unrender import problem\n", known)
+    assert upward("runs.loop", "from unrender.core import trees\n", known) == []
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    known = modules()
+    graph = {
+        name: {target for target, _, now in imports(ast.parse(path.read_text()), known) if now and target in known}
+        for name, path in known.items()
+    }
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        if name in trail:
+            pytest.fail("imports in a circle: " + " -> ".join([*trail[trail.index(name) :], name]))
+        if name not in done:
+            for target in graph[name] - {name}:
+                # A package's `__init__` gathers its own modules, which is no circle.
+                if not target.startswith(f"{name}.") and not name.startswith(f"{target}."):
+                    visit(target, (*trail, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+@pytest.mark.parametrize("module", modules())
+def test_files_and_functions_stay_small(module: str) -> None:
+    text = modules()[module].read_text()
+    assert len(text.splitlines()) <= LONGEST_FILE
+    assert not any(line.startswith("# pyright:") for line in text.splitlines()), "pyright is silenced for a whole file"
+    functions = [x for x in ast.walk(ast.parse(text)) if isinstance(x, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    long = {x.name: x.end_lineno - x.lineno + 1 for x in functions if x.end_lineno is not None}
+    assert {name: lines for name, lines in long.items() if lines > LONGEST_FUNCTION} == {}
