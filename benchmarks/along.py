@@ -98,11 +98,11 @@ class Moments:
 
 def converged(problem: ur.Problem, parameters: Tree, spp: int, seed: int = 987_654) -> Moments:
     """View 0 at `spp` samples per pixel or a little more, in chunks of seeds of its own, so that its error is known."""
-    problem.renderer.select(list(parameters), None)
+    session = problem.renderer.prepare(list(parameters), None)
     found = Moments()
     for number in range(max(2, -(-spp // CHUNK))):
         request = SampleRequest(problem.views[0].sensor, min(CHUNK, spp), Key(seed, number).uint32())
-        found.add(arrays.numpy(problem.renderer.image(parameters, request).images[0]))
+        found.add(arrays.numpy(session.image(parameters, request).images[0]))
     return found
 
 
@@ -110,7 +110,6 @@ def follow(
     problem: ur.Problem, image: ImageEstimator, path: Sequence[Tree], spp: int, seed: int
 ) -> Iterator[ImageEstimate]:
     """One run of an image estimator on view 0 along a path of parameters: its estimate at every step."""
-    problem.renderer.select(list(path[0]), image.space)
     state = image.init(problem, path[0])
     for step, parameters in enumerate(path):
         estimate, kept = image.estimate(problem, parameters, state, WholeView(problem, 0), spp, 1, Key(seed, step))

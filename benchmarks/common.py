@@ -20,7 +20,7 @@ import numpy as np
 import unrender as ur
 from unrender.problem.bounds import project
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.scene_pair import from_tensor
+from unrender.rendering.mitsuba.tensors import from_tensor
 from unrender.runs.result import hardware, versions
 
 matplotlib.use("Agg")

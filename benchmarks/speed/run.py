@@ -58,16 +58,16 @@ def stock_time(problem: ur.Problem, spp: int, steps: int = 20) -> float:
 def primal_costs(problem: ur.Problem, spp: int) -> dict[str, Any]:
     """A pair against plain renders, in milliseconds."""
     renderer = mitsuba_renderer(problem)
-    renderer.select([p.key for p in problem.parameters], "path")
+    session = renderer.prepare([p.key for p in problem.parameters], "path")
     now = problem.initial()
     before = {k: x * 0.99 for k, x in now.items()}
     dr.eval(before)
     prb = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
     scene = renderer.pair.current
-    plain = median_time(lambda n: dr.eval(renderer.image(now, SampleRequest(0, spp, n, 2)).images))
+    plain = median_time(lambda n: dr.eval(session.image(now, SampleRequest(0, spp, n, 2)).images))
 
     def pair(n: int) -> None:
-        found = renderer.image_pair(now, before, SampleRequest(0, spp, n, 2), "path")
+        found = session.image_pair(now, before, SampleRequest(0, spp, n, 2), "path")
         dr.eval(found.images, found.previous)
 
     both = median_time(pair)

@@ -30,9 +30,9 @@ def derivative_on_the_same_paths(
     renderer: MitsubaRenderer, current: dict[str, Any], key: str, request: SampleRequest, weight: np.ndarray
 ) -> float:
     """d/ds of sum(weight * image) for the parameter `key` at (1 + s) times its value, at s = 0."""
-    values = []
+    session, values = renderer.prepare(list(current), "path"), []
     for side in (1 + STEP, 1 - STEP):
-        pair = renderer.image_pair(current, {**current, key: current[key] * side}, request, "path")
+        pair = session.image_pair(current, {**current, key: current[key] * side}, request, "path")
         assert pair.previous is not None
         values.append(total(pair.previous[0], weight))
     return (values[0] - values[1]) / (2 * STEP)
@@ -43,11 +43,11 @@ def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths(name: str) -> N
     material, changes = MATERIALS[name]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, _ = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     request = SampleRequest(0, 64, 7)
     weight = np.random.default_rng(2).uniform(0.5, 1.5, (SIZE, SIZE, 3))
-    paths = renderer.image(current, request).paths
-    gradient = renderer.adjoint(current, paths, renderer.array(weight[None]))
+    paths = session.image(current, request).paths
+    gradient = session.adjoint(current, paths, renderer.array(weight[None]))
     for key in current:
         expected = derivative_on_the_same_paths(renderer, current, key, request, weight)
         found = float((np.array(gradient[key]).astype(np.float64) * np.array(current[key])).sum())
@@ -59,14 +59,14 @@ def test_halves_are_weighted_each_by_its_own() -> None:
     """Weights of the one group must reach the paths of that group alone."""
     renderer = MitsubaRenderer(scene({"type": "diffuse"}), DEPTH)
     key = "floor.bsdf.reflectance.data"
-    renderer.select([key], None)
+    session = renderer.prepare([key], None)
     current = renderer.values([key])
     one, none = np.ones((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))
-    paths = renderer.image(current, SampleRequest(0, 8, 3, 2)).paths
+    paths = session.image(current, SampleRequest(0, 8, 3, 2)).paths
     halves = [
-        np.array(renderer.adjoint(current, paths, renderer.array(np.stack(w)))[key]) for w in ((one, none), (none, one))
+        np.array(session.adjoint(current, paths, renderer.array(np.stack(w)))[key]) for w in ((one, none), (none, one))
     ]
-    both = np.array(renderer.adjoint(current, paths, renderer.array(np.stack((one, one))))[key])
+    both = np.array(session.adjoint(current, paths, renderer.array(np.stack((one, one))))[key])
     assert not np.allclose(halves[0], halves[1], rtol=1e-3)
     np.testing.assert_allclose(halves[0] + halves[1], both, rtol=1e-3, atol=1e-3 * np.abs(both).max())
 
@@ -75,12 +75,12 @@ def test_repeating_repeats_the_image_to_the_bit_and_the_gradient_to_rounding() -
     """Threads add to the gradient in the order they finish: its bits repeat with one thread only."""
     renderer = MitsubaRenderer(scene({"type": "diffuse"}), DEPTH)
     key = "floor.bsdf.reflectance.data"
-    renderer.select([key], None)
+    session = renderer.prepare([key], None)
     current = renderer.values([key])
     weight = renderer.array(np.ones((1, SIZE, SIZE, 3)))
-    requests = [renderer.image(current, SampleRequest(0, 4, 9)) for _ in range(3)]
+    requests = [session.image(current, SampleRequest(0, 4, 9)) for _ in range(3)]
     images = [np.array(request.images[0]) for request in requests]
-    gradients = [np.array(renderer.adjoint(current, request.paths, weight)[key]) for request in requests]
+    gradients = [np.array(session.adjoint(current, request.paths, weight)[key]) for request in requests]
     for image, gradient in zip(images[1:], gradients[1:], strict=True):
         assert np.array_equal(images[0], image)
         np.testing.assert_allclose(gradient, gradients[0], rtol=1e-4, atol=1e-5 * np.abs(gradients[0]).max())
@@ -92,12 +92,12 @@ def test_gradients_agree_with_mitsuba_prb() -> None:
         scene({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.4, 0.3]}}), DEPTH
     )
     key = next(k for k in renderer.parameters() if k.startswith("ball") and k.endswith("reflectance.value"))
-    renderer.select([key], None)
+    session = renderer.prepare([key], None)
     current = renderer.values([key])
     weight = renderer.array(np.full((1, SIZE, SIZE, 3), 1 / SIZE**2))
     ours = np.stack(
         [
-            np.array(renderer.adjoint(current, renderer.image(current, SampleRequest(0, 64, s)).paths, weight)[key])
+            np.array(session.adjoint(current, session.image(current, SampleRequest(0, 64, s)).paths, weight)[key])
             for s in range(12)
         ]
     )

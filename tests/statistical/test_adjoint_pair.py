@@ -27,20 +27,20 @@ def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shar
     material, changes = MATERIALS[name]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     request = SampleRequest(0, 64, 7)
     rng = np.random.default_rng(2)
     weight, weight_previous = rng.uniform(0.5, 1.5, (2, SIZE, SIZE, 3))
-    pair = renderer.image_pair(current, previous, request, "path")
+    pair = session.image_pair(current, previous, request, "path")
     arrays = renderer.array(weight[None]), renderer.array(weight_previous[None])
-    gradient, gradient_previous = renderer.adjoint_pair(current, previous, pair.paths, *arrays)
-    alone = renderer.adjoint(current, renderer.image(current, request).paths, arrays[0])
+    gradient, gradient_previous = session.adjoint_pair(current, previous, pair.paths, *arrays)
+    alone = session.adjoint(current, session.image(current, request).paths, arrays[0])
     for key in current:
         assert close(gradient[key], alone[key], 1e-3), key
         sides = []
         for side in (1 + STEP, 1 - STEP):
             moved = {**previous, key: previous[key] * side}
-            image = renderer.image_pair(current, moved, request, "path").previous
+            image = session.image_pair(current, moved, request, "path").previous
             assert image is not None
             sides.append(total(image[0], weight_previous))
         expected = (sides[0] - sides[1]) / (2 * STEP)
@@ -53,11 +53,11 @@ def test_equal_states_have_equal_gradients() -> None:
     material, changes = MATERIALS[next(iter(MATERIALS))]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, _ = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     weight = renderer.array(np.random.default_rng(3).uniform(0.5, 1.5, (2, SIZE, SIZE, 3)))
     for space in ("path", "primary"):
-        pair = renderer.image_pair(current, current, SampleRequest(0, 4, 7, groups=2), space)
-        a, b = renderer.adjoint_pair(current, current, pair.paths, weight, weight)
+        pair = session.image_pair(current, current, SampleRequest(0, 4, 7, groups=2), space)
+        a, b = session.adjoint_pair(current, current, pair.paths, weight, weight)
         assert all(close(a[key], b[key], 1e-4) for key in current), space
 
 
@@ -67,12 +67,12 @@ def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
     material, changes = MATERIALS[name]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "primary")
+    session = renderer.prepare(list(current), "primary")
     weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, SIZE, SIZE, 3)))
     request = SampleRequest(0, 8, 5, groups=2)
-    pair = renderer.image_pair(current, previous, request, "primary")
-    _, found = renderer.adjoint_pair(current, previous, pair.paths, weight, weight)
-    alone = renderer.adjoint(previous, renderer.image(previous, request).paths, weight)
+    pair = session.image_pair(current, previous, request, "primary")
+    _, found = session.adjoint_pair(current, previous, pair.paths, weight, weight)
+    alone = session.adjoint(previous, session.image(previous, request).paths, weight)
     for key in current:
         assert np.abs(np.array(alone[key])).max() > 0
         assert close(found[key], alone[key], 2e-3), key
@@ -83,7 +83,7 @@ def test_in_path_space_the_mean_is_the_previous_scene_s_own() -> None:
     material, changes = MATERIALS["rough conductor"]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (1, SIZE, SIZE, 3)))
 
     def means(tree: dict[str, Any]) -> np.ndarray:
@@ -91,10 +91,10 @@ def test_in_path_space_the_mean_is_the_previous_scene_s_own() -> None:
 
     shared, own = [], []
     for seed in range(64):
-        pair = renderer.image_pair(current, previous, SampleRequest(0, 16, 2 * seed), "path")
-        shared.append(means(renderer.adjoint_pair(current, previous, pair.paths, weight, weight)[1]))
-        paths = renderer.image(previous, SampleRequest(0, 16, 2 * seed + 1)).paths
-        own.append(means(renderer.adjoint(previous, paths, weight)))
+        pair = session.image_pair(current, previous, SampleRequest(0, 16, 2 * seed), "path")
+        shared.append(means(session.adjoint_pair(current, previous, pair.paths, weight, weight)[1]))
+        paths = session.image(previous, SampleRequest(0, 16, 2 * seed + 1)).paths
+        own.append(means(session.adjoint(previous, paths, weight)))
     a, b = np.array(shared), np.array(own)
     error = np.sqrt(a.var(0, ddof=1) / len(a) + b.var(0, ddof=1) / len(b))
     assert (np.abs(a.mean(0) - b.mean(0)) < 4 * error).all()

@@ -21,7 +21,7 @@ def slope(problem: ur.Problem, space: Any, runs: int = 24) -> float:
     """Of log Var ΔF against log step, the variance summed over all elements, from the start towards the truth."""
     start = problem.initial()
     truth = {key: problem.renderer.array(value) for key, value in problem.truth.items()}
-    problem.renderer.select(list(start), "path")
+    problem.renderer.prepare(list(start), "path")
     variances = []
     for step in STEPS:
         previous = {key: x + (truth[key] - x) * arrays.scalar(step, x) for key, x in start.items()}

@@ -90,7 +90,7 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
     """In one launch: the same pixels as renders of each sensor alone."""
     renderer = MitsubaRenderer(two_cameras(), 3)
     key = "floor.bsdf.reflectance.data"
-    renderer.select([key], None)
+    session = renderer.prepare([key], None)
     at = renderer.values([key])
     sizes = renderer.resolutions()
     assert sizes == [(10, 12), (14, 7)]
@@ -102,12 +102,12 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
     like = renderer.array(np.zeros(1))
     chosen = arrays.like_integers(pixels, like), arrays.like_integers(sensors, like)
     drawn = np.array(
-        [np.array(renderer.image(at, SampleRequest(0, 64, seed, 1, *chosen)).images)[0] for seed in range(30)]
+        [np.array(session.image(at, SampleRequest(0, 64, seed, 1, *chosen)).images)[0] for seed in range(30)]
     )
     apart = np.zeros_like(drawn)
     for sensor in (0, 1):
         film = np.array(
-            [np.array(renderer.image(at, SampleRequest(sensor, 64, 100 + seed)).images)[0] for seed in range(30)]
+            [np.array(session.image(at, SampleRequest(sensor, 64, 100 + seed)).images)[0] for seed in range(30)]
         )
         here = sensors == sensor
         apart[:, here] = film.reshape(30, -1, 3)[:, pixels[here]]

@@ -42,7 +42,8 @@ def test_a_constant_glow_is_what_its_closed_form_says(depth: int) -> None:
     extinction, emission = 0.6, np.array([1.5, 0.3, 0.0])
     medium = glow(np.full((4, 4, 4, 1), extinction), np.broadcast_to(emission, (4, 4, 4, 3)))
     renderer = MitsubaRenderer(before_the_sky(medium), depth)
-    images = np.array(renderer.image({}, SampleRequest(0, 32 * 64, 1, 32)).images).astype(np.float64).mean(axis=(1, 2))
+    rendering = renderer.prepare([], None).image({}, SampleRequest(0, 32 * 64, 1, 32))
+    images = np.array(rendering.images).astype(np.float64).mean(axis=(1, 2))
     passed = np.exp(-2 * extinction)
     expected = emission * (1 - passed) + SKY * passed
     error = images.std(axis=0, ddof=1) / np.sqrt(len(images))
@@ -79,12 +80,12 @@ def test_slabs_that_glow_are_what_their_closed_form_says(voxels: int) -> None:
     extinction, emission = slabs(voxels)
     renderer = MitsubaRenderer(before_the_sky(glow(extinction, emission, "nearest")), 2)
     keys = ["body.interior_medium.sigma_t.data", "body.interior_medium.emission.data"]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     assert bool(renderer.pair.majorants(previous=False, both=True)) == (voxels == 20)
     current = renderer.values(keys)
     previous = {keys[0]: current[keys[0]] * 0.7, keys[1]: current[keys[1]]}
-    alone = renderer.image(current, SampleRequest(0, 32 * 64, 1, 32))
-    pair = renderer.image_pair(current, previous, SampleRequest(0, 32 * 64, 2, 32), "path")
+    alone = session.image(current, SampleRequest(0, 32 * 64, 1, 32))
+    pair = session.image_pair(current, previous, SampleRequest(0, 32 * 64, 2, 32), "path")
     for rendered, factor in ((alone.images, 1.0), (pair.images, 1.0), (pair.previous, 0.7)):
         images = np.array(rendered).astype(np.float64).mean(axis=(1, 2))
         error = images.std(axis=0, ddof=1) / np.sqrt(len(images))
@@ -117,12 +118,12 @@ def test_both_states_of_a_glow_agree_with_separate_renders() -> None:
     }
     renderer = MitsubaRenderer(found, 4)
     keys = ["body.interior_medium.sigma_t.data", "body.interior_medium.emission.data"]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current = renderer.values(keys)
     previous = {key: value * 0.8 for key, value in current.items()}
-    pair = renderer.image_pair(current, previous, SampleRequest(0, 24 * 64, 1, 24), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, 24 * 64, 1, 24), "path")
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, SampleRequest(0, 24 * 64, seed, 24))
+        alone = session.image(state, SampleRequest(0, 24 * 64, seed, 24))
         a, b = (np.array(x).astype(np.float64).mean(axis=(1, 2)) for x in (images, alone.images))
         error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 24)
         assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4 * error).all()

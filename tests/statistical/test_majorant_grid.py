@@ -51,7 +51,9 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
     renderer = MitsubaRenderer(several(), DEPTH)
     assert renderer.pair.majorants(previous=False, both=False)
     expected = volpath(renderer)
-    verdict, figures = agree(runs(renderer.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
+    verdict, figures = agree(
+        runs(renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected
+    )
     assert verdict, figures
     monkeypatch.setattr(majorant_grid, "_MARGIN", 0.5)
     wrong = MitsubaRenderer(several(), DEPTH)
@@ -62,11 +64,11 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
 def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
     renderer = MitsubaRenderer(several(), DEPTH)
     keys = media_keys(renderer)
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current, previous = changed(renderer, keys)
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
+        alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
         verdict, figures = agree(runs(images), runs(alone.images))
         assert verdict, figures
         verdict, figures = agree(1.03 * runs(images), runs(alone.images))
@@ -76,15 +78,15 @@ def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
 def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
     renderer = MitsubaRenderer(scene(sparse()), DEPTH)
     key = next(key for key in renderer.parameters() if key.endswith("sigma_t.data"))
-    renderer.select([key], "path")
+    session = renderer.prepare([key], "path")
     full = np.array(renderer.values([key])[key])
     half = np.arange(VOXELS) < VOXELS // 2
     states = [{key: renderer.array(full * half[:, None, None, None])}, {key: renderer.array(full)}]
     for current, previous in (states, states[::-1]):
-        pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+        pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
         for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
             verdict, figures = agree(
-                runs(images), runs(renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS)).images)
+                runs(images), runs(session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS)).images)
             )
             assert verdict, figures
 
@@ -107,15 +109,15 @@ def test_gradients_are_those_of_one_majorant(monkeypatch: pytest.MonkeyPatch) ->
         renderer = MitsubaRenderer(scene(sparse(), lights="sky"), 3)
         assert bool(renderer.pair.majorants(previous=False, both=False)) == (fine < VOXELS)
         keys = [key for key in media_keys(renderer) if key.endswith("sigma_t.data")]
-        renderer.select(keys, "path")
+        session = renderer.prepare(keys, "path")
         current = renderer.values(keys)
         previous = {keys[0]: current[keys[0]] * 0.9}
         values = np.array(current[keys[0]]).sum(axis=-1)
         parts = [values == 0, (values > 0) & (values < 3), values >= 3]
         rows = []
         for seed in range(24):
-            paths = renderer.image_pair(current, previous, SampleRequest(0, 32, seed + fine), "path").paths
-            both = renderer.adjoint_pair(current, previous, paths, renderer.array(weight), renderer.array(weight))
+            paths = session.image_pair(current, previous, SampleRequest(0, 32, seed + fine), "path").paths
+            both = session.adjoint_pair(current, previous, paths, renderer.array(weight), renderer.array(weight))
             gradients = [np.array(gradient[keys[0]]).astype(np.float64).sum(axis=-1) for gradient in both]
             rows.append([float(gradient[part].sum()) for gradient in gradients for part in parts])
         return np.array(rows)

@@ -28,11 +28,11 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     material, changes = MATERIALS[name]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, previous = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    session = renderer.prepare(list(current), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
+        alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
         verdict, figures = agree(runs(images), runs(alone.images))
         assert verdict, figures
 
@@ -40,8 +40,8 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
 @pytest.mark.parametrize("name", MATERIALS)
 def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
     renderer = MitsubaRenderer(scene(MATERIALS[name][0]()), DEPTH)
-    renderer.select(["floor.bsdf.reflectance.data"], None)
-    ours = renderer.image(renderer.values(["floor.bsdf.reflectance.data"]), SampleRequest(0, RUNS * SPP, 1, RUNS))
+    session = renderer.prepare(["floor.bsdf.reflectance.data"], None)
+    ours = session.image(renderer.values(["floor.bsdf.reflectance.data"]), SampleRequest(0, RUNS * SPP, 1, RUNS))
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
     theirs = [
         np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)
@@ -54,12 +54,12 @@ def test_a_planted_bias_of_one_percent_is_seen() -> None:
     renderer = MitsubaRenderer(everything(), DEPTH)
     changes = {"specular_transmittance.value": 0.9, "alpha.data": 1.2, "floor.bsdf.reflectance.data": 0.9, **LIGHTS}
     current, previous = two_states(renderer, changes)
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     count, spp = 64, 64
-    pair = renderer.image_pair(current, previous, SampleRequest(0, count * spp, 1, count), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, count * spp, 1, count), "path")
     assert pair.previous is not None
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = runs(renderer.image(state, SampleRequest(0, count * spp, seed, count)).images)
+        alone = runs(session.image(state, SampleRequest(0, count * spp, seed, count)).images)
         verdict, figures = agree(runs(images), alone)
         assert verdict, figures
         verdict, figures = agree(runs(images) * 1.01, alone)
@@ -78,10 +78,10 @@ def test_mesh_attributes_are_read_from_the_shape_of_their_state() -> None:
 
     renderer = MitsubaRenderer(description, DEPTH)
     current, previous = two_states(renderer, {"vertex_color": 0.8, **LIGHTS})
-    renderer.select(list(current), "path")
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    session = renderer.prepare(list(current), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
-    alone = renderer.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
+    alone = session.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
     verdict, figures = agree(runs(pair.previous), runs(alone.images))
     assert verdict, figures
 
@@ -90,12 +90,12 @@ def test_light_that_is_black_now_but_was_not_before_is_not_lost() -> None:
     """Termination and visibility must look at both states."""
     renderer = MitsubaRenderer(scene({"type": "diffuse", "reflectance": texture(2)}, environment=False), DEPTH)
     keys = ["lamp.emitter.radiance.value", "floor.bsdf.reflectance.data"]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     previous = renderer.values(keys)
     current = {key: value * 0.0 for key, value in previous.items()}
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
     assert all(float(np.abs(image).max()) == 0 for image in runs(pair.images))
-    alone = renderer.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
+    alone = session.image(previous, SampleRequest(0, RUNS * SPP, 3, RUNS))
     verdict, figures = agree(runs(pair.previous), runs(alone.images))
     assert verdict, figures

@@ -55,9 +55,9 @@ def theirs(described: dict) -> np.ndarray:
 
 def ours(parameters: dict[str, Any], keys: list[str] | None = None) -> np.ndarray:
     renderer = MitsubaRenderer(scene, DEPTH)
-    renderer.select(keys or list(parameters), None, derivatives=False)
+    session = renderer.prepare(keys or list(parameters), None, derivatives=False)
     stacked = {key: np.asarray(value, np.float64)[None] for key, value in parameters.items()}
-    return np.stack([renderer.image_batch(stacked, SampleRequest(0, SPP, run)).numpy()[0] for run in range(RUNS)])
+    return np.stack([session.image_batch(stacked, SampleRequest(0, SPP, run)).numpy()[0] for run in range(RUNS)])
 
 
 def test_posed_shapes_look_as_if_they_had_been_moved() -> None:
@@ -92,9 +92,9 @@ def test_a_pose_beside_other_parameters() -> None:
     """Those are the scene's: one launch for each state."""
     key = "block.bsdf.alpha_u.value"
     renderer = MitsubaRenderer(scene, DEPTH)
-    renderer.select(["ball.translation", key], None, derivatives=False)
+    session = renderer.prepare(["ball.translation", key], None, derivatives=False)
     states = {"ball.translation": np.array([[0, 0, 0], [0, -0.5, 0.0]]), key: np.array([0.1, 0.5])}
-    both = [renderer.image_batch(states, SampleRequest(0, SPP, run)).numpy() for run in range(RUNS)]
+    both = [session.image_batch(states, SampleRequest(0, SPP, run)).numpy() for run in range(RUNS)]
     for index, (place, alpha) in enumerate((((-0.45, 0.3, 0.2), 0.1), ((-0.45, -0.2, 0.2), 0.5))):
         described = scene(ball=place)
         described["block"]["bsdf"]["alpha_u"] = alpha
@@ -104,18 +104,18 @@ def test_a_pose_beside_other_parameters() -> None:
 
 def test_all_states_of_a_batch_share_their_random_numbers() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
-    renderer.select(["block.rotation.y"], None, derivatives=False)
+    session = renderer.prepare(["block.rotation.y"], None, derivatives=False)
     turns = np.array([0.0, 0.7, 0.0, 0.7, 0.0])
-    batch = renderer.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 5)).numpy()
+    batch = session.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 5)).numpy()
     assert np.array_equal(batch[0], batch[2])
     assert np.array_equal(batch[1], batch[3])
     assert not np.array_equal(batch[0], batch[1])
-    alone = renderer.image_batch({"block.rotation.y": turns[1:2]}, SampleRequest(0, 2, 5)).numpy()
+    alone = session.image_batch({"block.rotation.y": turns[1:2]}, SampleRequest(0, 2, 5)).numpy()
     assert np.array_equal(batch[1], alone[0])
     assert np.array_equal(
-        batch[1], renderer.image({"block.rotation.y": mi.TensorXf(0.7)}, SampleRequest(0, 2, 5)).images[0]
+        batch[1], session.image({"block.rotation.y": mi.TensorXf(0.7)}, SampleRequest(0, 2, 5)).images[0]
     )
-    assert not np.array_equal(batch, renderer.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 6)).numpy())
+    assert not np.array_equal(batch, session.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 6)).numpy())
 
 
 def test_what_poses_refuse() -> None:
@@ -125,8 +125,8 @@ def test_what_poses_refuse() -> None:
     assert known["block.translation"].shape == (3,)
     assert known["block.scale"].shape == ()
     with pytest.raises(ur.InputError, match=r"block\.rotation stands for the same coordinate"):
-        renderer.select(["block.rotation", "block.rotation.y"], None, derivatives=False)
+        renderer.prepare(["block.rotation", "block.rotation.y"], None, derivatives=False)
     with pytest.raises(ur.InputError, match=r"cannot be recovered by path gradients.*SmoothedDerivatives"):
-        renderer.select(["block.rotation"], None)
+        renderer.prepare(["block.rotation"], None)
     with pytest.raises(ur.InputError, match="cannot go with the pose"):
-        renderer.select(["block.rotation", "sensor.x_fov"], None, derivatives=False)
+        renderer.prepare(["block.rotation", "sensor.x_fov"], None, derivatives=False)

@@ -25,15 +25,15 @@ def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
     material, changes = MATERIALS[name]
     renderer = MitsubaRenderer(scene(material()), DEPTH)
     current, _ = two_states(renderer, {**changes, **LIGHTS})
-    renderer.select(list(current), "path")
+    session = renderer.prepare(list(current), "path")
     request = SampleRequest(0, 1, 11)
     sides = []
     for scale in (1 + STEP, 1 - STEP):
-        pair = renderer.image_pair(current, {key: x * scale for key, x in current.items()}, request, "path")
+        pair = session.image_pair(current, {key: x * scale for key, x in current.items()}, request, "path")
         assert pair.previous is not None
         sides.append(np.array(pair.previous[0]).astype(np.float64))
     expected = ((sides[0] - sides[1]) / (2 * STEP)) ** 2
-    found = np.array(renderer.tangent_moment(current, renderer.image(current, request).paths, current))
+    found = np.array(session.tangent_moment(current, session.image(current, request).paths, current))
     assert found.shape == (SIZE, SIZE, 3)
     assert expected.sum() > 0
     close = np.abs(found - expected) < 0.05 * expected + 1e-3 * expected.mean()
@@ -54,7 +54,6 @@ def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
         for key, info in renderer.parameters().items()
         if info.differentiable and info.shape == (3,) and key.endswith(".value")
     ]
-    renderer.select(keys, None)
     values = renderer.values(keys)
     assert sum(np.array(x).size for x in values.values()) == 12
     return renderer, values
@@ -63,7 +62,8 @@ def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
 def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     """On the same paths: the mean over sign patterns against one pass per parameter, per block of pixels and channel."""
     renderer, values = twelve()
-    paths = renderer.image(values, SampleRequest(0, 16, 3)).paths
+    session = renderer.prepare(list(values), None)
+    paths = session.image(values, SampleRequest(0, 16, 3)).paths
 
     def blocks(moment: Any) -> np.ndarray:
         return np.array(moment).astype(np.float64).reshape(6, SIZE // 6, 6, SIZE // 6, 3).mean(axis=(1, 3))
@@ -73,12 +73,12 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
         for channel in range(3):
             unit = {k: np.zeros(3) for k in values}
             unit[key][channel] = 1.0
-            single += blocks(renderer.tangent_moment(values, paths, {k: renderer.array(v) for k, v in unit.items()}))
+            single += blocks(session.tangent_moment(values, paths, {k: renderer.array(v) for k, v in unit.items()}))
     rng = np.random.default_rng(0)
     signed = []
     for _ in range(200):
         signs = {k: renderer.array(rng.choice([-1.0, 1.0], 3)) for k in values}
-        signed.append(blocks(renderer.tangent_moment(values, paths, signs)))
+        signed.append(blocks(session.tangent_moment(values, paths, signs)))
     signed = np.array(signed)
     error = signed.std(axis=0, ddof=1) / np.sqrt(len(signed))
     known = error > 1e-6 * single
@@ -88,7 +88,7 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     assert np.abs(z).max() < limit
     # What forgets the cross terms' averaging out, one pattern for all, is seen.
     same = {k: renderer.array(np.ones(3)) for k in values}
-    wrong = blocks(renderer.tangent_moment(values, paths, same))
+    wrong = blocks(session.tangent_moment(values, paths, same))
     assert np.abs((wrong - single)[known] / error[known]).max() > limit
 
 
@@ -97,16 +97,16 @@ def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str)
     """Collisions are chosen by chance apart from what they bring, so no finite difference sees a path's derivative; its adjoint does."""
     problem = ur.gallery.problem(name, resolution=5, reference_spp=1)
     renderer, values = problem.renderer, problem.initial()
-    renderer.select(list(values), None)
+    session = renderer.prepare(list(values), None)
     rng = np.random.default_rng(0)
     tangents = {key: rng.normal(size=x.shape) * np.array(x) for key, x in values.items()}
-    paths = renderer.image(values, SampleRequest(0, 1, 7)).paths
-    found = np.array(renderer.tangent_moment(values, paths, {k: renderer.array(x) for k, x in tangents.items()}))
+    paths = session.image(values, SampleRequest(0, 1, 7)).paths
+    found = np.array(session.tangent_moment(values, paths, {k: renderer.array(x) for k, x in tangents.items()}))
     expected = np.zeros_like(found)
     for place in np.ndindex(found.shape):
         weights = np.zeros((1, *found.shape))
         weights[0][place] = 1.0
-        gradient = renderer.adjoint(values, paths, renderer.array(weights))
+        gradient = session.adjoint(values, paths, renderer.array(weights))
         expected[place] = sum(np.sum(np.array(gradient[key]) * x) for key, x in tangents.items()) ** 2
     assert (expected > 0).sum() > 10
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-4 * expected.max())
@@ -118,12 +118,14 @@ def test_gradients_after_a_tangent_pass_are_what_they_were() -> None:
     other, others = twelve()
 
     def gradients(asked: MitsubaRenderer, at: dict[str, Any]) -> np.ndarray:
-        rendering = asked.image_pair(at, at, SampleRequest(0, 4, 5), "path")
-        found = asked.adjoint_pair(at, at, rendering.paths, rendering.images, rendering.images)
+        session = asked.prepare(list(at), "path")
+        rendering = session.image_pair(at, at, SampleRequest(0, 4, 5), "path")
+        found = session.adjoint_pair(at, at, rendering.paths, rendering.images, rendering.images)
         return np.stack([np.concatenate([np.array(g) for g in tree.values()]) for tree in found])
 
     before = gradients(renderer, values), gradients(other, others)
-    renderer.tangent_moment(values, renderer.image(values, SampleRequest(0, 4, 6)).paths, values)
+    session = renderer.prepare(list(values), None)
+    session.tangent_moment(values, session.image(values, SampleRequest(0, 4, 6)).paths, values)
     after = gradients(renderer, values), gradients(other, others)
     assert np.abs(np.array(before)).min() > 0
     np.testing.assert_allclose(np.array(after), np.array(before), rtol=1e-5)

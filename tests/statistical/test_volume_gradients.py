@@ -60,10 +60,11 @@ def directions(key: str, value: np.ndarray) -> list[Direction]:
 def derivative(renderer: MitsubaRenderer, current: dict[str, Any], way: Direction, seed: int) -> float:
     """One noisy finite difference, without bias to second order in the step."""
     value = np.array(current[way.key]).astype(np.float64)
+    session = renderer.prepare(list(current), "path")
 
     def difference(high: float, low: float, seed: int) -> float:
         above, below = ({**current, way.key: renderer.array(value + s * way.step * way.along)} for s in (high, low))
-        pair = renderer.image_pair(above, below, SampleRequest(0, 4 * SPP, seed), "path")
+        pair = session.image_pair(above, below, SampleRequest(0, 4 * SPP, seed), "path")
         change = np.array(pair.images).astype(np.float64) - np.array(pair.previous)
         return float((change * WEIGHT).sum()) / (way.step * (high - low))
 
@@ -104,10 +105,10 @@ def limit(count: int, level: float = 2.7e-3) -> float:
 def own(renderer: MitsubaRenderer) -> Callable[[int], dict[str, Any]]:
     """Gradients by path replay, differential ratio tracking included."""
     keys = media_keys(renderer)
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current = renderer.values(keys)
     weight = renderer.array(WEIGHT)
-    return lambda seed: renderer.adjoint(current, renderer.image(current, SampleRequest(0, SPP, seed)).paths, weight)
+    return lambda seed: session.adjoint(current, session.image(current, SampleRequest(0, SPP, seed)).paths, weight)
 
 
 SCENES: dict[str, Callable[[], dict[str, Any]]] = {
@@ -147,15 +148,15 @@ def test_the_variance_of_a_difference_of_gradients_falls_with_the_square_of_the_
     """Both states share a path, collisions and all, and the point that differential ratio tracking keeps."""
     renderer = MitsubaRenderer(scene(cloud(), lights="sky"), 4)
     keys = media_keys(renderer)[:2]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current, weight = renderer.values(keys), renderer.array(WEIGHT)
     steps, variances = (0.1, 0.03, 0.01), []
     for step in steps:
         previous = {key: renderer.array(np.array(value) * (1 - step)) for key, value in current.items()}
         rows = []
         for seed in range(16):
-            paths = renderer.image_pair(current, previous, SampleRequest(0, 16, seed), "path").paths
-            a, b = renderer.adjoint_pair(current, previous, paths, weight, weight)
+            paths = session.image_pair(current, previous, SampleRequest(0, 16, seed), "path").paths
+            a, b = session.adjoint_pair(current, previous, paths, weight, weight)
             rows.append(np.concatenate([(np.array(a[key]) - np.array(b[key])).ravel() for key in keys]))
         variances.append(np.var(rows, axis=0, ddof=1).sum())
     assert float(np.polyfit(np.log(steps), np.log(variances), 1)[0]) == pytest.approx(2, abs=0.25)
@@ -165,7 +166,7 @@ def test_the_previous_state_s_gradient_is_its_own() -> None:
     """In the mean over seeds, against the ordinary adjoint there; a planted tenth is seen."""
     renderer = MitsubaRenderer(scene(cloud(), lights="sky"), 4)
     keys = media_keys(renderer)[:2]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current, weight = renderer.values(keys), renderer.array(WEIGHT)
     previous = {key: renderer.array(np.array(value) * 0.7) for key, value in current.items()}
 
@@ -174,10 +175,10 @@ def test_the_previous_state_s_gradient_is_its_own() -> None:
 
     shared, own = [], []
     for seed in range(32):
-        paths = renderer.image_pair(current, previous, SampleRequest(0, 32, 2 * seed), "path").paths
-        shared.append(sums(renderer.adjoint_pair(current, previous, paths, weight, weight)[1]))
+        paths = session.image_pair(current, previous, SampleRequest(0, 32, 2 * seed), "path").paths
+        shared.append(sums(session.adjoint_pair(current, previous, paths, weight, weight)[1]))
         own.append(
-            sums(renderer.adjoint(previous, renderer.image(previous, SampleRequest(0, 32, 2 * seed + 1)).paths, weight))
+            sums(session.adjoint(previous, session.image(previous, SampleRequest(0, 32, 2 * seed + 1)).paths, weight))
         )
     a, b = np.array(shared), np.array(own)
     error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 32)

@@ -42,7 +42,7 @@ def changed(renderer: MitsubaRenderer, keys: list[str]) -> tuple[dict[str, Any],
 @pytest.mark.parametrize("name", SCENES)
 def test_the_kernel_agrees_with_volpath(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
-    ours = renderer.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
+    ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
     verdict, figures = agree(runs(ours.images), volpath(renderer))
     assert verdict, figures
 
@@ -51,7 +51,7 @@ def test_the_kernel_agrees_with_volpath(name: str) -> None:
 def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
     """Roulette included: at 12 it has ended most paths."""
     renderer = MitsubaRenderer(two_media(), depth)
-    ours = renderer.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
+    ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
     verdict, figures = agree(runs(ours.images), volpath(renderer, depth))
     assert verdict, figures
 
@@ -60,11 +60,11 @@ def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
 def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     keys = [*media_keys(renderer), "floor.bsdf.reflectance.value"]
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current, previous = changed(renderer, keys)
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
+        alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
         verdict, figures = agree(runs(images), runs(alone.images))
         assert verdict, figures
         verdict, figures = agree(1.03 * runs(images), runs(alone.images))
@@ -76,13 +76,13 @@ def test_what_is_empty_or_black_now_but_was_not_before_is_not_lost(ending: str) 
     """The majorant bounds both states, and a path goes on while either is alive; the reverse as well."""
     renderer = MitsubaRenderer(scene(cloud()), DEPTH)
     key = next(key for key in renderer.parameters() if key.endswith(ending))
-    renderer.select([key], "path")
+    session = renderer.prepare([key], "path")
     full = renderer.values([key])
     none = {key: full[key] * 0.0}
     for current, previous in ((none, full), (full, none)):
-        pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+        pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
         for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-            alone = renderer.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
+            alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
             verdict, figures = agree(runs(images), runs(alone.images))
             assert verdict, figures
 
@@ -90,9 +90,9 @@ def test_what_is_empty_or_black_now_but_was_not_before_is_not_lost(ending: str) 
 def test_the_difference_of_a_pair_is_far_less_noisy_than_that_of_two_renders() -> None:
     renderer = MitsubaRenderer(scene(cloud()), DEPTH)
     keys = media_keys(renderer)
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     current = renderer.values(keys)
     previous = {key: value * 0.98 for key, value in current.items()}
-    pair = renderer.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
+    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     together = (runs(pair.images) - runs(pair.previous)).var(axis=0, ddof=1).sum()
     assert together < 0.02 * runs(pair.images).var(axis=0, ddof=1).sum()

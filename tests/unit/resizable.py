@@ -83,8 +83,9 @@ class FieldRenderer:
     def array(self, values: np.ndarray) -> np.ndarray:
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
-        self.at(self.field.shape).select(keys, space, derivatives)
+    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> FieldRenderer:
+        self.at(self.field.shape).prepare(keys, space, derivatives)
+        return self
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
         return self.at(parameters[KEY].shape).image(parameters, request)

@@ -11,8 +11,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
-from unrender.gallery import specification
-from unrender.gallery import boxes, mesh_files, meshes, textures
+from unrender.gallery import boxes, mesh_files, meshes, specification, textures
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.numpy.quadratic import QuadraticRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -304,16 +303,16 @@ def test_the_spiral_is_five_numbers_by_default():
 
 def test_the_exponential_has_the_mean_that_it_shows():
     problem = ur.gallery.problem("exponential")
-    renderer = problem.renderer
-    many = [renderer.image(problem.truth, SampleRequest(0, 1000, seed)).images.mean() for seed in range(200)]
+    session = problem.renderer.prepare(["rate"], "path")
+    many = [session.image(problem.truth, SampleRequest(0, 1000, seed)).images.mean() for seed in range(200)]
     assert abs(np.mean(many) - 2) < 4 * np.std(many) / np.sqrt(200)
     step = 1e-5
     sides = [
-        renderer.image({"rate": np.array(0.8 + side)}, SampleRequest(0, 64, 3, groups=4)).images.mean()
+        session.image({"rate": np.array(0.8 + side)}, SampleRequest(0, 64, 3, groups=4)).images.mean()
         for side in (step, -step)
     ]
-    paths = renderer.image({"rate": np.array(0.8)}, SampleRequest(0, 64, 3, groups=4)).paths
-    slope = renderer.adjoint({"rate": np.array(0.8)}, paths, np.full((4, 1, 1, 3), 1 / 3))["rate"]
+    paths = session.image({"rate": np.array(0.8)}, SampleRequest(0, 64, 3, groups=4)).paths
+    slope = session.adjoint({"rate": np.array(0.8)}, paths, np.full((4, 1, 1, 3), 1 / 3))["rate"]
     assert slope == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-6)
 
 
@@ -323,8 +322,8 @@ def test_the_room_of_ajar_is_lit_through_the_gap_alone():
     assert isinstance(problem.renderer, MitsubaRenderer)
     renderer = MitsubaRenderer(problem.renderer.pair.description, max_depth=2)  # direct light alone
     truth = {key: renderer.array(value) for key, value in problem.truth.items()}
-    renderer.select(list(truth), None)
-    direct = np.array(renderer.image(truth, SampleRequest(0, 256, 1)).images)[0]
+    session = renderer.prepare(list(truth), None)
+    direct = np.array(session.image(truth, SampleRequest(0, 256, 1)).images)[0]
     reference = np.asarray(problem.views[0].reference)
     assert np.mean(direct.max(-1) == 0) > 0.6
     assert np.mean(reference.max(-1) > 0.01) > 0.9
@@ -362,9 +361,9 @@ def losses(problem: ur.Problem, points: np.ndarray, spp: int = 256, seed: int = 
 
 def pictures(problem: ur.Problem, points: np.ndarray, spp: int = 256, seed: int = 7):
     keys = [parameter.key for parameter in problem.parameters]
-    problem.renderer.select(keys, None, derivatives=False)
+    session = problem.renderer.prepare(keys, None, derivatives=False)
     columns = np.asarray(points, np.float32).T
-    return problem.renderer.image_batch(dict(zip(keys, columns, strict=True)), SampleRequest(0, spp, seed))
+    return session.image_batch(dict(zip(keys, columns, strict=True)), SampleRequest(0, spp, seed))
 
 
 def start_of(problem: ur.Problem) -> np.ndarray:
@@ -569,13 +568,12 @@ def test_the_loss_of_the_quadratic_is_the_polynomial():
     problem = ur.gallery.problem("quad")
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20, 2))
-    batch = problem.renderer.image_batch({"x": points}, SampleRequest(0, 1, 0))
+    session = problem.renderer.prepare(["x"], None)
+    batch = session.image_batch({"x": points}, SampleRequest(0, 1, 0))
     polynomial = 5 * points[:, 0] ** 2 + 5 * points[:, 1] ** 2 + 7.5 * points[:, 0] * points[:, 1]
     np.testing.assert_allclose(problem.loss_values(0, batch), polynomial, rtol=1e-12)
     for point, image in zip(points, batch, strict=True):
-        np.testing.assert_allclose(
-            problem.renderer.image({"x": point}, SampleRequest(0, 4, 1, groups=2)).images, [image] * 2
-        )
+        np.testing.assert_allclose(session.image({"x": point}, SampleRequest(0, 4, 1, groups=2)).images, [image] * 2)
     assert np.asarray(problem.initial()["x"]).tolist() == [1.5, 1.0]
     assert problem.loss_value(0, np.zeros((1, 1, 3))) == 0
 
@@ -583,12 +581,12 @@ def test_the_loss_of_the_quadratic_is_the_polynomial():
 def test_the_gradient_of_the_quadratic_is_exact():
     problem = ur.gallery.problem("quad")
     point = np.array([0.3, -1.1])
-    renderer = problem.renderer
+    session = problem.renderer.prepare(["x"], "path")
     for request in (SampleRequest(0, 2, 1, groups=2), SampleRequest(0, 2, 1, groups=2, pixels=np.array([0]))):
-        rendering = renderer.image_pair({"x": point}, {"x": 2 * point}, request, "path")
+        rendering = session.image_pair({"x": point}, {"x": 2 * point}, request, "path")
         assert rendering.images.shape == ((2, 1, 1, 3) if request.pixels is None else (2, 1, 3))
         weights, weights_before = (np.asarray(images) * 2 / 3 for images in (rendering.images, rendering.previous))
-        now, before = renderer.adjoint_pair({"x": point}, {"x": 2 * point}, rendering.paths, weights, weights_before)
+        now, before = session.adjoint_pair({"x": point}, {"x": 2 * point}, rendering.paths, weights, weights_before)
         np.testing.assert_allclose(now["x"], [10 * 0.3 - 7.5 * 1.1, -10 * 1.1 + 7.5 * 0.3], rtol=1e-12)
         np.testing.assert_allclose(before["x"], 2 * now["x"], rtol=1e-12)
 
@@ -618,10 +616,10 @@ def test_a_form_that_no_picture_has_is_refused(matrix, point, message):
 
 def test_the_quadratic_knows_its_one_parameter():
     renderer = QuadraticRenderer(np.eye(3), np.ones(3))
-    renderer.select(["x"], "path")
+    renderer.prepare(["x"], "path")
     np.testing.assert_array_equal(renderer.values(["x"])["x"], 1)
     with pytest.raises(ur.InputError, match="parameter y: the scene has none of that name; it has x"):
-        renderer.select(["y"], None)
+        renderer.prepare(["y"], None)
 
 
 # ---------------------------------------------------------------------------------------------------- pieces

@@ -87,8 +87,8 @@ def at_depth(problem: ur.Problem, depth: int, spp: int = 256, sensor: int = 0) -
     assert isinstance(problem.renderer, MitsubaRenderer)
     renderer = MitsubaRenderer(problem.renderer.pair.description, max_depth=depth)
     truth = {key: renderer.array(value) for key, value in problem.truth.items()}
-    renderer.select(list(truth), None)
-    return np.array(renderer.image(truth, SampleRequest(sensor, spp, 1)).images)[0]
+    session = renderer.prepare(list(truth), None)
+    return np.array(session.image(truth, SampleRequest(sensor, spp, 1)).images)[0]
 
 
 # ---------------------------------------------------------------------------------------------------- each problem

@@ -222,11 +222,11 @@ def test_a_grid_that_changes_its_resolution_has_new_cells() -> None:
     )
     truth = {key: fine.renderer.array(value) for key, value in fine.truth.items()}
     request = SampleRequest(0, 4, 1)
-    fine.renderer.select(list(truth), None)
-    expected = np.array(fine.renderer.image(truth, request).images[0])
+    session = fine.renderer.prepare(list(truth), None)
+    expected = np.array(session.image(truth, request).images[0])
     for problem in (coarse, small):
         before = problem.initial()
-        problem.renderer.select(list(before), None)
-        first = np.array(problem.renderer.image(before, request).images[0])
-        np.testing.assert_allclose(np.array(problem.renderer.image(truth, request).images[0]), expected, rtol=1e-4)
-        np.testing.assert_allclose(np.array(problem.renderer.image(before, request).images[0]), first, rtol=1e-4)
+        session = problem.renderer.prepare(list(before), None)
+        first = np.array(session.image(before, request).images[0])
+        np.testing.assert_allclose(np.array(session.image(truth, request).images[0]), expected, rtol=1e-4)
+        np.testing.assert_allclose(np.array(session.image(before, request).images[0]), first, rtol=1e-4)

@@ -13,7 +13,7 @@ from kernels import recorded
 
 import unrender as ur
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.scene_pair import from_tensor, to_tensor
+from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.renderer import SampleRequest
 
 
@@ -66,7 +66,7 @@ def test_values_survive_the_way_to_a_tensor_and_back() -> None:
 def test_what_a_pair_cannot_carry_is_refused_in_one_line(more: dict[str, Any], key: str, message: str) -> None:
     renderer = MitsubaRenderer(box(**more))
     with pytest.raises(ur.InputError, match=message) as caught:
-        renderer.select([key], "path")
+        renderer.prepare([key], "path")
     assert "\n" not in str(caught.value)
 
 
@@ -77,7 +77,7 @@ def test_a_shape_without_a_name_is_refused_with_the_cure(tmp_path: Path) -> None
     renderer = MitsubaRenderer(file)
     key = next(k for k in renderer.parameters() if k.endswith("reflectance.value"))
     with pytest.raises(ur.InputError, match="no id in the XML"):
-        renderer.select([key], None)
+        renderer.prepare([key], None)
 
 
 def test_a_ready_made_object_cannot_be_in_two_states() -> None:
@@ -150,16 +150,16 @@ def test_a_kernel_that_is_compiled_each_step_is_noticed() -> None:
 def test_moving_geometry_runs_in_primary_space() -> None:
     key = "small-box.vertex_positions"
     renderer = MitsubaRenderer(box(), 3)
-    renderer.select([key], "primary")
+    session = renderer.prepare([key], "primary")
     current = renderer.values([key])
     previous = {key: current[key] + 0.02}
-    pair = renderer.image_pair(current, previous, SampleRequest(0, 64, 1), "primary")
-    alone = renderer.image(previous, SampleRequest(0, 64, 1))
+    pair = session.image_pair(current, previous, SampleRequest(0, 64, 1), "primary")
+    alone = session.image(previous, SampleRequest(0, 64, 1))
     assert pair.previous is not None
     assert np.array_equal(np.array(pair.previous[0]), np.array(alone.images[0]))
     assert not np.array_equal(np.array(pair.previous[0]), np.array(pair.images[0]))
-    gradient = renderer.adjoint(
-        current, renderer.image(current, SampleRequest(0, 64, 1)).paths, renderer.array(np.ones((1, 16, 16, 3)))
+    gradient = session.adjoint(
+        current, session.image(current, SampleRequest(0, 64, 1)).paths, renderer.array(np.ones((1, 16, 16, 3)))
     )
     assert np.isfinite(np.array(gradient[key])).all()
     assert np.abs(np.array(gradient[key])).max() > 0
@@ -169,14 +169,14 @@ def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
     """In primary space: the previous scene's adjoint on the same random numbers, to the rounding of sums."""
     key = "small-box.vertex_positions"
     renderer = MitsubaRenderer(box(), 3)
-    renderer.select([key], "primary")
+    session = renderer.prepare([key], "primary")
     current = renderer.values([key])
     previous = {key: current[key] + 0.02}
     weights = renderer.array(np.random.default_rng(0).random((2, 16, 16, 3)))
-    pair = renderer.image_pair(current, previous, SampleRequest(0, 64, 1, groups=2), "primary")
-    both = renderer.adjoint_pair(current, previous, pair.paths, weights, weights)
+    pair = session.image_pair(current, previous, SampleRequest(0, 64, 1, groups=2), "primary")
+    both = session.adjoint_pair(current, previous, pair.paths, weights, weights)
     for state, found in zip((current, previous), both, strict=True):
-        alone = renderer.adjoint(state, renderer.image(state, SampleRequest(0, 64, 1, groups=2)).paths, weights)
+        alone = session.adjoint(state, session.image(state, SampleRequest(0, 64, 1, groups=2)).paths, weights)
         a, b = np.array(found[key]), np.array(alone[key])
         assert np.abs(a - b).max() < 1e-4 * np.abs(b).max()
     assert np.abs(np.array(both[0][key]) - np.array(both[1][key])).max() > 0
@@ -193,11 +193,11 @@ def test_meta_estimation_of_moving_geometry_says_that_it_is_in_primary_space() -
 
 def test_chosen_pixels_are_the_pixels_of_the_film() -> None:
     renderer = MitsubaRenderer(box(), 3)
-    renderer.select([WALL], None)
+    session = renderer.prepare([WALL], None)
     now = renderer.values([WALL])
-    whole = np.array(renderer.image(now, SampleRequest(0, 4096, 1)).images[0]).reshape(-1, 3)
+    whole = np.array(session.image(now, SampleRequest(0, 4096, 1)).images[0]).reshape(-1, 3)
     chosen = np.array([3, 100, 17, 255])
-    some = np.array(renderer.image(now, SampleRequest(0, 4096, 2, pixels=mi.UInt32(chosen))).images[0])
+    some = np.array(session.image(now, SampleRequest(0, 4096, 2, pixels=mi.UInt32(chosen))).images[0])
     assert some.shape == (4, 3)
     np.testing.assert_allclose(some, whole[chosen], rtol=0.15, atol=0.01)
 
@@ -240,12 +240,12 @@ def test_replayed_kernels_follow_every_value_that_numpy_hands_over(channels: int
         }
 
     renderer = MitsubaRenderer(description, 3)
-    renderer.select([key], None)
+    session = renderer.prepare([key], None)
     values = [rng.uniform(0.1, 0.9, (8, 8, channels)).astype(np.float32) for _ in range(12)]
-    replayed = [np.array(renderer.image({key: renderer.array(v)}, SampleRequest(0, 4, 5)).images) for v in values]
+    replayed = [np.array(session.image({key: renderer.array(v)}, SampleRequest(0, 4, 5)).images) for v in values]
     for value, image in zip(values, replayed, strict=True):
-        renderer._frozen.clear()
-        fresh = np.array(renderer.image({key: renderer.array(value)}, SampleRequest(0, 4, 5)).images)
+        session._functions.clear()
+        fresh = np.array(session.image({key: renderer.array(value)}, SampleRequest(0, 4, 5)).images)
         np.testing.assert_array_equal(image, fresh)
 
 

@@ -84,27 +84,27 @@ def test_what_moves_among_media_is_refused() -> None:
     renderer = MitsubaRenderer(scene(cloud()))
     assert "cloud.translation" not in renderer.parameters()
     with pytest.raises(ur.InputError, match="it moves a shape, in a scene with media"):
-        renderer.select(["cloud.vertex_positions"], None)
+        renderer.prepare(["cloud.vertex_positions"], None)
 
 
 def test_masks_among_media_are_refused() -> None:
     leaf = {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}
     description = {**scene(cloud()), "leaf": {"type": "sphere", "radius": 0.3, "bsdf": leaf}}
     with pytest.raises(ur.InputError, match="opacity of a mask in a scene with media"):
-        MitsubaRenderer(description).select(["leaf.bsdf.opacity.value"], None)
+        MitsubaRenderer(description).prepare(["leaf.bsdf.opacity.value"], None)
 
 
 @pytest.mark.parametrize("space", ["path", "primary"])
 def test_equal_states_give_equal_images_and_gradients_and_seeds_repeat(space: Any) -> None:
     renderer = MitsubaRenderer(scene(cloud()), 4)
-    renderer.select([KEY], space)
+    session = renderer.prepare([KEY], space)
     current = renderer.values([KEY])
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1, (2, 8, 8, 3)))
     rows = []
     for _ in range(3):
-        pair = renderer.image_pair(current, current, SampleRequest(0, 8, 5, groups=2), space)
+        pair = session.image_pair(current, current, SampleRequest(0, 8, 5, groups=2), space)
         np.testing.assert_array_equal(np.array(pair.images), np.array(pair.previous))
-        both = renderer.adjoint_pair(current, current, pair.paths, weight, weight)
+        both = session.adjoint_pair(current, current, pair.paths, weight, weight)
         a, b = (np.array(gradient[KEY]) for gradient in both)
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(a).max())
         rows.append((np.array(pair.images), a))
@@ -116,24 +116,24 @@ def test_equal_states_give_equal_images_and_gradients_and_seeds_repeat(space: An
 def test_the_adjoint_of_a_pair_s_current_state_needs_no_weights_of_the_previous() -> None:
     """Its collisions depended on both states, and so must the replay."""
     renderer = MitsubaRenderer(scene(cloud()), 4)
-    renderer.select([KEY], "path")
+    session = renderer.prepare([KEY], "path")
     current = renderer.values([KEY])
     previous = {KEY: current[KEY] * 1.5}
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1, (1, 8, 8, 3)))
-    pair = renderer.image_pair(current, previous, SampleRequest(0, 16, 5), "path")
-    alone = renderer.adjoint(current, pair.paths, weight)[KEY]
-    both = renderer.adjoint_pair(current, previous, pair.paths, weight, weight * 0.5)[0][KEY]
+    pair = session.image_pair(current, previous, SampleRequest(0, 16, 5), "path")
+    alone = session.adjoint(current, pair.paths, weight)[KEY]
+    both = session.adjoint_pair(current, previous, pair.paths, weight, weight * 0.5)[0][KEY]
     np.testing.assert_allclose(np.array(alone), np.array(both), rtol=1e-3, atol=1e-4 * np.abs(np.array(both)).max())
 
 
 def test_density_that_was_zero_everywhere_is_found() -> None:
     """A medium without majorant: no ray collides, and yet each voxel's derivative is there."""
     renderer = MitsubaRenderer(scene(cloud()), 4)
-    renderer.select([KEY], "path")
+    session = renderer.prepare([KEY], "path")
     current = {KEY: renderer.values([KEY])[KEY] * 0.0}
     weight = renderer.array(np.ones((1, 8, 8, 3)))
-    paths = renderer.image(current, SampleRequest(0, 256, 5)).paths
-    gradient = np.array(renderer.adjoint(current, paths, weight)[KEY])
+    paths = session.image(current, SampleRequest(0, 256, 5)).paths
+    gradient = np.array(session.adjoint(current, paths, weight)[KEY])
     assert np.isfinite(gradient).all()
     # Under a sky of one colour, what scatters gives a share of it back, and extinction takes all: a share 1 - albedo is lost.
     assert (gradient < 0).mean() > 0.9
@@ -143,10 +143,10 @@ def test_a_grid_made_by_others_is_rendered_and_differentiated(assets: Path) -> N
     """Mitsuba's tutorial volume: against `volpath`, and with a gradient that is finite and not zero."""
     smoke = {"type": "gridvolume", "filename": str(assets / "tutorials" / "volume.vol"), "to_world": _onto_the_cube()}
     renderer = MitsubaRenderer(scene({"type": "heterogeneous", "scale": 4.0, "sigma_t": smoke, "albedo": 0.8}), 4)
-    renderer.select([KEY], "path")
+    session = renderer.prepare([KEY], "path")
     current = renderer.values([KEY])
-    rendering = renderer.image(current, SampleRequest(0, 16 * 64, 5, groups=16))
-    gradient = np.array(renderer.adjoint(current, rendering.paths, renderer.array(np.ones((16, 8, 8, 3))))[KEY])
+    rendering = session.image(current, SampleRequest(0, 16 * 64, 5, groups=16))
+    gradient = np.array(session.adjoint(current, rendering.paths, renderer.array(np.ones((16, 8, 8, 3))))[KEY])
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0
     volpath = mi.load_dict({"type": "volpath", "max_depth": 4})

@@ -39,7 +39,6 @@ def maps(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     height, width = problem.renderer.resolutions()[problem.views[0].sensor]
     scheme = ur.pixels.Adaptive(256, samples=spp * height * width * len(problem.views), denoiser="none", uniform=0.01)
     at = problem.initial()
-    problem.renderer.select(list(at), None)
     pick, _ = scheme.draw(problem, at, scheme.init(problem, at), Key(seed))
     return pick.probability[0]
 

@@ -37,7 +37,6 @@ BATCHES = (1, 2, 4, 8, 16, 32, 64)
 def batches(problem: ur.Problem, spp: int) -> list[dict[str, float]]:
     """Per size of the batch: milliseconds per perturbation, wall and kernels, and kernels that were new after warm-up."""
     parameters = problem.initial()
-    problem.renderer.select(list(parameters), None, derivatives=False)
     rng = np.random.default_rng(0)
     rows = []
     for size in BATCHES:

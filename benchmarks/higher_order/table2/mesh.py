@@ -82,7 +82,6 @@ def one(problem: ur.Problem, method: str, seconds: float, seed: int) -> dict[str
     estimator, optimizer = METHODS[method](start.size)
     ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[track])
     chosen = np.unique(np.linspace(0, len(track.points) - 1, _POINTS).round().astype(int))
-    problem.renderer.select(list(problem.initial()), None, derivatives=False)
     losses = BlackBox(problem, problem.initial(), _EXACT_SPP, Key(99)).losses(
         np.stack([track.points[index] for index in chosen])
     )

@@ -103,7 +103,6 @@ def measured(
 ) -> Descent:
     """A descent with its errors in the picture at some steps, evenly spread over the logarithm of their number."""
     parameters = problem.initial()
-    problem.renderer.select(list(parameters), None, derivatives=False)
     chosen = np.unique(np.round(np.geomspace(1, len(points), _IMAGES)).astype(int) - 1)
     box = BlackBox(problem, parameters, _IMAGE_SPP, Key(99))
     stack = _stack(problem, points, chosen)

@@ -49,7 +49,6 @@ def efficiency(
 ) -> float:
     """Variance times evaluations. With `aggregate`, `samples` evaluations serve all elements; else they are divided among them."""
     parameters = problem.initial()
-    problem.renderer.select(list(parameters), None, derivatives=False)
     box = BlackBox(problem, parameters, 1, Key(0))
     theta = vectors.ravel(parameters)
     counted = [0]

@@ -47,7 +47,6 @@ def difference(problem: ur.Problem, current: Tree, previous: Tree, space: Any, s
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
     """Summed over elements, per space: of the gradient, and of its difference for each step length; and the slope."""
     start, truth = problem.initial(), {k: problem.renderer.array(v) for k, v in problem.truth.items()}
-    problem.renderer.select(list(start), "path")
     found: dict[str, Any] = {"steps": STEPS}
     for space in ("path", "primary"):
         rows: list[float] = []
@@ -94,19 +93,19 @@ def costs(problem: ur.Problem) -> dict[str, float]:
 
         found[name] = median_time(step)[0]
     request = SampleRequest(problem.views[0].sensor, 1, 5)
-    renderer = problem.renderer
-    pair = renderer.image_pair(parameters, previous, request, "path")
+    session = problem.renderer.prepare(list(parameters), "path")
+    pair = session.image_pair(parameters, previous, request, "path")
     weights = problem.loss_derivative(0, pair.images)
     found["one pair of images, 1 spp"] = median_time(
-        lambda seed: renderer.image_pair(parameters, previous, SampleRequest(request.sensor, 1, seed), "path")
+        lambda seed: session.image_pair(parameters, previous, SampleRequest(request.sensor, 1, seed), "path")
     )[0]
     found["one pair of adjoints, 1 spp"] = median_time(
-        lambda seed: renderer.adjoint_pair(parameters, previous, pair.paths, weights, weights)
+        lambda seed: session.adjoint_pair(parameters, previous, pair.paths, weights, weights)
     )[0]
     found["one image, 1 spp"] = median_time(
-        lambda seed: renderer.image(parameters, SampleRequest(request.sensor, 1, seed))
+        lambda seed: session.image(parameters, SampleRequest(request.sensor, 1, seed))
     )[0]
-    found["one adjoint, 1 spp"] = median_time(lambda seed: renderer.adjoint(parameters, pair.paths, weights))[0]
+    found["one adjoint, 1 spp"] = median_time(lambda seed: session.adjoint(parameters, pair.paths, weights))[0]
     found["meta / plain 4 spp"] = found["meta 2 + 1"] / found["plain 4 spp"]
     print(problem.name, {k: round(v, 2) for k, v in found.items()}, flush=True)
     return found

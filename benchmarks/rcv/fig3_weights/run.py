@@ -79,10 +79,10 @@ def one_run(
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Renders (steps, H, W, 3), and per rule the images and the weights (0 at the first step) of the same shape."""
     start = problem.initial()
-    problem.renderer.select(list(start), "path")
+    session = problem.renderer.prepare(list(start), "path")
     sensor = problem.views[0].sensor
     renders = [
-        arrays.numpy(problem.renderer.image(start, SampleRequest(sensor, spp, Key(seed, step).uint32())).images[0])
+        arrays.numpy(session.image(start, SampleRequest(sensor, spp, Key(seed, step).uint32())).images[0])
         for step in range(steps)
     ]
     renders = np.stack(renders).astype(np.float64)

@@ -60,11 +60,11 @@ def pilot_weights(problem: ur.Problem, path: list[Tree], spp: int) -> list[Any]:
 
 def fixed(problem: ur.Problem, path: list[Tree], weights: list[Any], spp: int, seed: int) -> Iterator[np.ndarray]:
     """The recursion (6) with given weights, on the samples that `follow` takes: unbiased."""
-    problem.renderer.select(list(path[0]), "path")
+    session = problem.renderer.prepare(list(path[0]), "path")
     memory: Any = None
     for step, (now, before) in enumerate(zip(path, [path[0], *path], strict=False)):
         request = SampleRequest(problem.views[0].sensor, spp, Key(seed, step).uint32())
-        rendering = problem.renderer.image_pair(now, before, request, "path")
+        rendering = session.image_pair(now, before, request, "path")
         assert rendering.previous is not None
         F, H = (arrays.numpy(images[0]).astype(np.float64) for images in (rendering.images, rendering.previous))
         memory = F if memory is None else advance(memory, F, H, weights[step])

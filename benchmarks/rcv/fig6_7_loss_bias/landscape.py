@@ -28,10 +28,10 @@ Values = dict[str, dict[str, np.ndarray]]
 def slopes(problem: ur.Problem, at: State, factor: float, spp: int, change: float = 0.02) -> np.ndarray:
     """dI/dfactor, (H, W, 3), on paths that both sides share."""
     higher, lower, found = at(factor + change), at(factor - change), Moments()
-    problem.renderer.select(list(higher), "path")
+    session = problem.renderer.prepare(list(higher), "path")
     for number in range(max(1, spp // 64)):
         request = SampleRequest(problem.views[0].sensor, 64, Key(31_337, number).uint32())
-        pair = problem.renderer.image_pair(higher, lower, request, "path")
+        pair = session.image_pair(higher, lower, request, "path")
         assert pair.previous is not None
         found.add((arrays.numpy(pair.images[0]) - arrays.numpy(pair.previous[0])) / (2 * change))
     return found.mean
@@ -53,11 +53,11 @@ def sample(
     found: Values = {name: {str(spp): np.zeros((len(factors), runs, 2)) for spp in SPP} for name in LOSSES}
     for index, factor in enumerate(factors):
         parameters, slope = at(factor), slopes(problem, at, factor, slope_spp)
-        problem.renderer.select(list(parameters), None)
+        session = problem.renderer.prepare(list(parameters), None)
         for spp in SPP:
             for run in range(runs):
                 request = SampleRequest(problem.views[0].sensor, spp, Key(run, 0 if common else index, spp).uint32())
-                image = arrays.numpy(problem.renderer.image(parameters, request).images[0]).astype(np.float64)
+                image = arrays.numpy(session.image(parameters, request).images[0]).astype(np.float64)
                 for name, loss in LOSSES.items():
                     value, derivative = loss.value(image, reference), loss.derivative(image, reference) * slope
                     found[name][str(spp)][index, run] = value.mean(), derivative.mean()

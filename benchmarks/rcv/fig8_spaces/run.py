@@ -82,7 +82,6 @@ def costs(problem: ur.Problem, path: list[Tree], spp: int) -> dict[str, dict[str
     """Median milliseconds of an image (view 0) and of a gradient (all views), parameters changing at every call."""
     found: dict[str, dict[str, float]] = {}
     for name, (_, _, image) in METHODS.items():
-        problem.renderer.select(list(path[0]), image.space)
         box: dict[str, Any] = {"image": image.init(problem, path[0])}
 
         def one_image(n: int, image: ImageEstimator = image, box: dict[str, Any] = box) -> None:

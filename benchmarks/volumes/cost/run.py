@@ -58,7 +58,7 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
     """What is compared, each a function of a seed."""
     renderer = mitsuba_renderer(problem)
     keys = list(problem.truth)
-    renderer.select(keys, "path")
+    session = renderer.prepare(keys, "path")
     values = {
         key: core(len(value)) if sparse and key.endswith("sigma_t.data") else value
         for key, value in problem.truth.items()
@@ -67,8 +67,8 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
     previous = {key: value * 0.98 for key, value in current.items()}
     size = np.asarray(problem.views[0].reference).shape
     weight = renderer.array(np.ones((1, *size)))
-    image = renderer.image(current, SampleRequest(0, spp, 1)).paths
-    pair = renderer.image_pair(current, previous, SampleRequest(0, spp, 1), "path").paths
+    image = session.image(current, SampleRequest(0, spp, 1)).paths
+    pair = session.image_pair(current, previous, SampleRequest(0, spp, 1), "path").paths
 
     description = renderer.pair.description
     assert callable(description)
@@ -92,12 +92,12 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
 
     return {
         "volpath": lambda n: dr.eval(mi.render(stock, integrator=volpath, spp=spp, seed=mi.UInt32(n))),
-        "primal": lambda n: renderer.image(current, SampleRequest(0, spp, n)),
-        "pair": lambda n: renderer.image_pair(current, previous, SampleRequest(0, spp, n), "path"),
-        "adjoint": lambda n: renderer.adjoint(current, image, weight),
-        "adjoint of a pair": lambda n: renderer.adjoint_pair(current, previous, pair, weight, weight),
-        "primal and adjoint": lambda n: renderer.adjoint(
-            current, renderer.image(current, SampleRequest(0, spp, n)).paths, weight
+        "primal": lambda n: session.image(current, SampleRequest(0, spp, n)),
+        "pair": lambda n: session.image_pair(current, previous, SampleRequest(0, spp, n), "path"),
+        "adjoint": lambda n: session.adjoint(current, image, weight),
+        "adjoint of a pair": lambda n: session.adjoint_pair(current, previous, pair, weight, weight),
+        "primal and adjoint": lambda n: session.adjoint(
+            current, session.image(current, SampleRequest(0, spp, n)).paths, weight
         ),
         "prbvolpath, primal and adjoint": prbvolpath_step,
     }

@@ -72,8 +72,8 @@ class Pictures:
     """How far pictures of all views are from their references, relative to the start; by a renderer of its own."""
 
     def __init__(self, made: ur.Problem, options: dict[str, Any], spp: int = 16):
-        self.renderer = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1}).renderer
-        self.renderer.select(list(made.initial()), None)
+        renderer = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1}).renderer
+        self.session = renderer.prepare(list(made.initial()), None)
         self.references = [np.asarray(view.reference, np.float64) for view in made.views]
         self.sensors, self.spp = [view.sensor for view in made.views], spp
         self.start = self.errors(made.initial())
@@ -86,7 +86,7 @@ class Pictures:
         squares: dict[str, list[float]] = {"seen": [], "unseen": []}
         for number, (sensor, reference) in enumerate(zip(self.sensors, self.references, strict=True)):
             request = SampleRequest(sensor, self.spp, Key(424_242, number).uint32(), 2)
-            a, b = arrays.numpy(self.renderer.image(parameters, request).images).astype(np.float64) - reference
+            a, b = arrays.numpy(self.session.image(parameters, request).images).astype(np.float64) - reference
             squares["unseen" if number in UNSEEN else "seen"].append(float(np.mean(a * b)))
         return {name: max(float(np.mean(x)), 0.0) ** 0.5 for name, x in squares.items()}
 

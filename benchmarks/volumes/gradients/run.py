@@ -93,11 +93,11 @@ def main() -> None:
     asked = parser.parse_args()
     print(ur.use())
     renderer = MitsubaRenderer(scene, DEPTH)
-    renderer.select([EXTINCTION, ALBEDO], "path")
+    session = renderer.prepare([EXTINCTION, ALBEDO], "path")
     current, weight = renderer.values([EXTINCTION, ALBEDO]), renderer.array(WEIGHT)
     methods = {
-        "differential ratio tracking": lambda seed: renderer.adjoint(
-            current, renderer.image(current, SampleRequest(0, SPP, seed)).paths, weight
+        "differential ratio tracking": lambda seed: session.adjoint(
+            current, session.image(current, SampleRequest(0, SPP, seed)).paths, weight
         ),
         "prbvolpath": stock(current),
     }
@@ -105,7 +105,7 @@ def main() -> None:
 
     def difference(key: str, high: np.ndarray, low: np.ndarray, seed: int) -> float:
         states = [{**current, key: renderer.array(value)} for value in (high, low)]
-        pair = renderer.image_pair(states[0], states[1], SampleRequest(0, 4 * SPP, seed), "path")
+        pair = session.image_pair(states[0], states[1], SampleRequest(0, 4 * SPP, seed), "path")
         return float(((np.array(pair.images).astype(np.float64) - np.array(pair.previous)) * WEIGHT).sum())
 
     table = {}

@@ -43,7 +43,7 @@ class LossValues:
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
         """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
-        problem.renderer.select(list(parameters), None, derivatives=False)
+        problem.renderer.prepare(list(parameters), None, derivatives=False)
         return LossState()
 
     def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
@@ -60,7 +60,7 @@ class BlackBox:
     as much as what is in them.
 
     Args:
-        problem: whose renderer has selected the parameters (`Renderer.select`, `derivatives=False`).
+        problem: whose scene.
         parameters: the current ones; they give keys and shapes.
         spp: samples per pixel.
         key: of the renders' random numbers.
@@ -101,11 +101,12 @@ class BlackBox:
 
     def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
         renderer, bounds = self.problem.renderer, self.problem.bounds
+        session = renderer.prepare(list(self.parameters), None, derivatives=False)
         stacked = {key: project(x, *bounds[key]) for key, x in vectors.parts(points, self.parameters).items()}
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             request = SampleRequest(view.sensor, self.spp, self.key.fold(index).uint32())
-            images[index] = renderer.image_batch(stacked, request)
+            images[index] = session.image_batch(stacked, request)
             parts.append(self.problem.loss_values(index, images[index]))
             height, width = renderer.resolutions()[view.sensor]
             self.info["samples"] += len(points) * self.spp * height * width

@@ -142,7 +142,7 @@ class MetaEstimator:
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
-        problem.renderer.select(list(parameters), self._space(problem, parameters))
+        problem.renderer.prepare(list(parameters), self._space(problem, parameters))
         return MetaState(None, {}, self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:

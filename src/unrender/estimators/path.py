@@ -79,7 +79,7 @@ class PathGradient:
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
-        problem.renderer.select(list(parameters), self.image.space)
+        problem.renderer.prepare(list(parameters), self.image.space)
         return PathGradientState(self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(

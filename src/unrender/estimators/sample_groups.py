@@ -16,7 +16,7 @@ from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.batches import PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.renderer import RenderSession, SampleRequest
 
 PIXELS = 1 << 32
 """The stream of a step's key that draws its pixels; those below are its frames'."""
@@ -87,6 +87,7 @@ def gather(
     if batch is not None and batch.draw is not None:
         frames = [PixelBatch(problem, batch.draw)]
     groups = leave_one_out_groups(spp, adjoint_spp)
+    session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
     gradient: Tree = {}
     previous: Tree | None = None
     losses: list[Array] = []
@@ -103,16 +104,14 @@ def gather(
         paths, traced = found.paths, spp
         if groups == 1:
             request = frame.request(adjoint_spp or spp, key_frame.fold(1).uint32())
-            paths = _paths(problem, parameters, request, pair_request)
+            paths = _paths(session, parameters, request, pair_request)
             traced += request.spp
         weights = frame.loss_derivative(found.others())
         if pair_request is None:
-            part = problem.renderer.adjoint(parameters, paths, weights)
+            part = session.adjoint(parameters, paths, weights)
         else:
             weights_previous = frame.loss_derivative(found.previous_others())
-            part, other = problem.renderer.adjoint_pair(
-                parameters, pair_request.previous, paths, weights, weights_previous
-            )
+            part, other = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
             previous = other if previous is None else trees.add(previous, other)
         gradient = trees.add(gradient, part) if gradient else part
         samples += traced * frame.pixels
@@ -124,7 +123,7 @@ def gather(
     return GradientSample(gradient, previous, losses, images, samples, info, after)
 
 
-def _paths(problem: Problem, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:
+def _paths(session: RenderSession, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:
     if pair_request is None:
-        return problem.renderer.image(parameters, request).paths
-    return problem.renderer.image_pair(parameters, pair_request.previous, request, pair_request.space).paths
+        return session.image(parameters, request).paths
+    return session.image_pair(parameters, pair_request.previous, request, pair_request.space).paths

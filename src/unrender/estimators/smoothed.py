@@ -104,7 +104,7 @@ class SmoothedDerivatives:
             raise InputError(
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
-        problem.renderer.select(list(parameters), None, derivatives=False)
+        problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._widths(parameters)
         return SmoothedState()
 

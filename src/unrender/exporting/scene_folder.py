@@ -22,7 +22,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.scene_pair import from_tensor, to_tensor
+from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 

@@ -13,7 +13,7 @@ from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.mitsuba.scene_pair import load
+from unrender.rendering.mitsuba.scene_loading import load
 
 
 @dataclass(frozen=True)

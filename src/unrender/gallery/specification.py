@@ -14,7 +14,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.scene_pair import media
+from unrender.rendering.mitsuba.scene_loading import media
 
 _LANES = 1 << 21
 """Paths per pass of a reference: what fits a small machine's memory."""

@@ -17,7 +17,7 @@ from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.mitsuba.scene_pair import load
+from unrender.rendering.mitsuba.scene_loading import load
 
 _RADIUS = 0.7
 """Of the sphere; the body fits into a ball of radius 1 or so."""

@@ -52,9 +52,10 @@ class Plain:
         del state
         request = frame.request(spp, key.uint32(), groups)
         if pair_request is None:
-            rendering = problem.renderer.image(parameters, request)
+            rendering = problem.renderer.prepare(list(parameters), None).image(parameters, request)
         else:
-            rendering = problem.renderer.image_pair(parameters, pair_request.previous, request, pair_request.space)
+            session = problem.renderer.prepare(list(parameters), pair_request.space)
+            rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
         return ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous), None
 
     def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:

@@ -154,7 +154,8 @@ class RecursiveControlVariate:
         previous = parameters if fresh or state.parameters is None else state.parameters
         # Two memories that are carried together must be of the same step.
         assert pair_request is None or all(previous[key] is value for key, value in pair_request.previous.items())
-        rendering = problem.renderer.image_pair(parameters, previous, request, self.space)
+        session = problem.renderer.prepare(list(parameters), self.space)
+        rendering = session.image_pair(parameters, previous, request, self.space)
         assert rendering.previous is not None
         if isinstance(frame, PixelBatch):
             assert state.snapshot is not None

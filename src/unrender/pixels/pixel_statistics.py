@@ -108,7 +108,8 @@ def _round(
 ) -> list[np.ndarray]:
     """Per path (cells * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents."""
     batch = PixelBatch(problem, uniform_table.one_of_each(spp, key.fold(0)))
-    rendering = problem.renderer.image(parameters, batch.request(1, key.fold(1).uint32()))
+    session = problem.renderer.prepare(list(parameters), None)
+    rendering = session.image(parameters, batch.request(1, key.fold(1).uint32()))
     image = rendering.images[0]
     _, factor = batch.targets
     found = [batch.loss_derivative(image)]
@@ -120,7 +121,7 @@ def _round(
         tangents = problem.precondition(
             {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
         )
-        found.append(problem.renderer.tangent_moment(parameters, rendering.paths, tangents))
+        found.append(session.tangent_moment(parameters, rendering.paths, tangents))
     arrays.evaluate(found)
     return [arrays.numpy(x) for x in found]
 

@@ -42,7 +42,7 @@ def render(
     if not 0 <= view < len(problem.views):
         raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
     point = as_tree(problem, parameters)
-    problem.renderer.select(list(point), None, derivatives=False)
+    session = problem.renderer.prepare(list(point), None, derivatives=False)
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
     per_pass = max(1, min(spp, _LANES // (height * width)))
@@ -50,7 +50,7 @@ def render(
     while done < spp:
         take = min(per_pass, spp - done)
         request = SampleRequest(sensor, take, key.fold(done).uint32())
-        total += take * arrays.numpy(problem.renderer.image(point, request).images[0])
+        total += take * arrays.numpy(session.image(point, request).images[0])
         done += take
     return (total / spp).astype(np.float32)
 
@@ -74,9 +74,9 @@ def render_pair(
         float32 (H, W, 3) of the current state, and of the previous one.
     """
     points = as_tree(problem, current), as_tree(problem, previous)
-    problem.renderer.select(list(points[0]), "path")
+    session = problem.renderer.prepare(list(points[0]), "path")
     request = SampleRequest(problem.views[0].sensor, spp, Key(seed).uint32())
-    rendering = problem.renderer.image_pair(*points, request, "path")
+    rendering = session.image_pair(*points, request, "path")
     assert rendering.previous is not None
     return arrays.numpy(rendering.images[0]), arrays.numpy(rendering.previous[0])
 

@@ -1,8 +1,7 @@
 """What the methods may ask of a renderer. They see nothing else of it.
 
-Mitsuba answers in `rendering/mitsuba_renderer.py`; `rendering/analytic.py` answers in NumPy with known integrals and known
-gradients. Arrays are the renderer's own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and are
-never changed in place.
+Mitsuba answers in `rendering/mitsuba/`; `rendering/numpy/` answers with known integrals and known gradients. Arrays are the renderer's
+own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and are never changed in place.
 """
 
 from __future__ import annotations
@@ -16,7 +15,10 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
+__all__ = ["ParameterInfo", "RenderSession", "Renderer", "Rendering", "SampleRequest", "Space"]
+
 Space = Literal["path", "primary"]
+"""Where two states share samples: one set of paths, or one set of random numbers."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +28,8 @@ class ParameterInfo:
     Attributes:
         shape: of the array that stands for it.
         differentiable: whether `adjoint` can return its gradient.
-        carried: whether one set of paths serves two values of it (path space).
-        reason: one line; why it is not differentiable or not carried, else "".
+        shares_paths: whether one set of paths serves two values of it (path space).
+        reason: one line; why it is not differentiable or cannot share paths, else "".
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
@@ -82,32 +84,13 @@ class Rendering:
     paths: Any
 
 
-class Renderer(Protocol):
-    """A scene with parameters that can be rendered and differentiated."""
+class RenderSession(Protocol):
+    """Images and derivatives with respect to the parameters that it was prepared for, from `Renderer.prepare`.
 
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Every parameter of the scene by key."""
-        ...
-
-    def values(self, keys: list[str]) -> Tree:
-        """The scene's own values."""
-        ...
-
-    def resolutions(self) -> list[tuple[int, int]]:
-        """(height, width) of each sensor's film."""
-        ...
-
-    def array(self, values: np.ndarray) -> Array:
-        """This renderer's array with these values."""
-        ...
-
-    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
-        """Announce which parameters will change, before the first render, and whether `adjoint` will be called.
-
-        Raises `InputError` for one that is unknown, not differentiable where `derivatives` are asked for, or not perturbable; with
-        `space="path"` for one that is not carried.
-        """
-        ...
+    Its methods are pure: equal arguments give equal results, to the bit, whatever was rendered in between by this session or another of
+    the same renderer; arguments do not change. Where float atomics make the order of a sum free, so are its last bits. A parameter that
+    is left out has the scene's own value, and no derivative.
+    """
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
         """Render. Unbiased."""
@@ -145,5 +128,40 @@ class Renderer(Protocol):
 
         Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
         derivatives of a path.
+        """
+        ...
+
+
+class Renderer(Protocol):
+    """A scene with parameters that can be rendered and differentiated. A description: rendering changes nothing in it."""
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Every parameter of the scene by key."""
+        ...
+
+    def values(self, keys: list[str]) -> Tree:
+        """The scene's own values, as loaded."""
+        ...
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """(height, width) of each sensor's film."""
+        ...
+
+    def array(self, values: np.ndarray) -> Array:
+        """This renderer's array with these values."""
+        ...
+
+    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> RenderSession:
+        """What renders the scene at other values of these parameters. Cheap when asked again with the same arguments.
+
+        `space` is only checked: the paths of a rendering may be replayed by any session for the same parameters with derivatives.
+
+        Args:
+            keys: the parameters that will change.
+            space: where two states will share samples; None if they will not.
+            derivatives: whether derivatives will be asked for.
+
+        Raises `InputError` for a parameter that is unknown, not differentiable where `derivatives` are asked for, or not perturbable;
+        with `space="path"` for one whose values cannot share paths.
         """
         ...

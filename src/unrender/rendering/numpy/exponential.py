@@ -53,45 +53,46 @@ class ExponentialRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
-        """See `Renderer.select`."""
+    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> ExponentialRenderer:
+        """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del space, derivatives
         for key in keys:
             if key != RATE:
                 raise InputError(f"parameter {key}: the scene has none of that name; it has {RATE}")
+        return self
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `Renderer.image`."""
+        """See `RenderSession.image`."""
         shape = (1, 1) if request.pixels is None else (len(request.pixels),)
         numbers = np.random.default_rng(request.seed).random((request.groups, *shape, request.spp // request.groups))
         paths = ExponentialPaths(-np.log1p(-numbers))
         return Rendering(self._images(parameters, paths), None, paths)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `Renderer.image_batch`."""
+        """See `RenderSession.image_batch`."""
         rendering = self.image(parameters={RATE: 1.0}, request=replace(request, groups=1))
         means = rendering.images[0, 0, 0] / np.reshape(parameters[RATE], (-1, 1))
         return means[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `Renderer.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        """See `RenderSession.image_pair`. Both spaces share the random numbers, which is all there is to share."""
         del space
         rendering = self.image(current, request)
         return Rendering(rendering.images, self._images(previous, rendering.paths), rendering.paths)
 
     def adjoint(self, parameters: Tree, paths: ExponentialPaths, weights: np.ndarray) -> Tree:
-        """See `Renderer.adjoint`."""
+        """See `RenderSession.adjoint`."""
         slopes = -self._images(parameters, paths) / float(parameters[RATE])
         return {RATE: np.array((weights * slopes).sum() / len(slopes))}
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: ExponentialPaths, weights: np.ndarray, weights_previous: np.ndarray
     ) -> tuple[Tree, Tree]:
-        """See `Renderer.adjoint_pair`."""
+        """See `RenderSession.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
     def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
-        """See `Renderer.tangent_moment`."""
+        """See `RenderSession.tangent_moment`."""
         slopes = paths.unit[0] * float(tangents[RATE]) / float(parameters[RATE]) ** 2
         return np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
 

@@ -41,7 +41,7 @@ class AnalyticRenderer:
         grain: h, half-width of the noise that does not depend on θ, per sample.
         shape: (height, width) of the film.
         sensors: how many sensors, all alike.
-        carried: what `ParameterInfo.shares_paths` says of every parameter.
+        shares_paths: what `ParameterInfo.shares_paths` says of every parameter.
     """
 
     def __init__(
@@ -80,39 +80,40 @@ class AnalyticRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
-        """See `Renderer.select`."""
+    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> AnalyticRenderer:
+        """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del derivatives
         for key in keys:
             if key not in self._values:
                 raise InputError(f"parameter {key}: the scene has none of that name")
             if space == "path" and not self.shares_paths:
                 raise InputError(f'parameter {key}: space="path" cannot carry it; use space="primary"')
+        return self
 
     def exact(self, parameters: Tree) -> np.ndarray:
         """The exact image (H, W, 3)."""
         return (self.offset + self.matrix @ self._flat(parameters)).reshape(*self.shape, 3)
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `Renderer.image`."""
+        """See `RenderSession.image`."""
         paths = self._paths(request)
         return Rendering(self._images(parameters, paths), None, paths)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `Renderer.image_batch`."""
+        """See `RenderSession.image_batch`."""
         paths = replace(self._paths(request), groups=1)
         count = len(next(iter(parameters.values())))
         states = [{key: value[index] for key, value in parameters.items()} for index in range(count)]
         return np.concatenate([self._images(state, paths) for state in states])
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `Renderer.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        """See `RenderSession.image_pair`. Both spaces share the random numbers, which is all there is to share."""
         del space
         paths = self._paths(request)
         return Rendering(self._images(current, paths), self._images(previous, paths), paths)
 
     def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
-        """See `Renderer.adjoint`."""
+        """See `RenderSession.adjoint`."""
         rows = self._rows(paths.pixels)
         flat = np.zeros(self.matrix.shape[1])
         for group, weight in zip(self._grouped(paths), weights, strict=True):
@@ -129,11 +130,11 @@ class AnalyticRenderer:
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: AnalyticPaths, weights: np.ndarray, weights_previous: np.ndarray
     ) -> tuple[Tree, Tree]:
-        """See `Renderer.adjoint_pair`."""
+        """See `RenderSession.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
     def tangent_moment(self, parameters: Tree, paths: AnalyticPaths, tangents: Tree) -> np.ndarray:
-        """See `Renderer.tangent_moment`."""
+        """See `RenderSession.tangent_moment`."""
         del parameters
         along = {key: tangents.get(key, np.zeros_like(value)) for key, value in self._values.items()}
         slopes = (self.matrix @ self._flat(along))[self._rows(paths.pixels)].reshape(-1, 3, 1)

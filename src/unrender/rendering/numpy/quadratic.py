@@ -59,40 +59,41 @@ class QuadraticRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def select(self, keys: list[str], space: Space | None, derivatives: bool = True) -> None:
-        """See `Renderer.select`."""
+    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> QuadraticRenderer:
+        """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del space, derivatives
         for key in keys:
             if key != POINT:
                 raise InputError(f"parameter {key}: the scene has none of that name; it has {POINT}")
+        return self
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `Renderer.image`. Exact."""
+        """See `RenderSession.image`. Exact."""
         return Rendering(self._images(parameters, request), None, request)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `Renderer.image_batch`. Exact."""
+        """See `RenderSession.image_batch`. Exact."""
         del request
         return (np.asarray(parameters[POINT]) @ self._jacobian.T)[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `Renderer.image_pair`. Exact in both spaces."""
+        """See `RenderSession.image_pair`. Exact in both spaces."""
         del space
         return Rendering(self._images(current, request), self._images(previous, request), request)
 
     def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
-        """See `Renderer.adjoint`. Exact."""
+        """See `RenderSession.adjoint`. Exact."""
         del parameters, paths
         return {POINT: weights.reshape(len(weights), -1, 3).sum(axis=1).mean(axis=0) @ self._jacobian}
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Any, weights: np.ndarray, weights_previous: np.ndarray
     ) -> tuple[Tree, Tree]:
-        """See `Renderer.adjoint_pair`. Exact."""
+        """See `RenderSession.adjoint_pair`. Exact."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
     def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
-        """See `Renderer.tangent_moment`. Exact."""
+        """See `RenderSession.tangent_moment`. Exact."""
         del parameters
         return self._images(tangents, paths)[0] ** 2
 

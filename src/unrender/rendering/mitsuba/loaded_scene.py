@@ -1,0 +1,168 @@
+"""A scene in memory, which of its parameters were set, and the leaves of the derivative graph that they are.
+
+A call through a pointer sees all objects of its kind in the process, whichever scene they belong to. So recorded kernels must be handed
+every loaded scene, and forward differentiation must find no other one attached: the registry of this module knows them all.
+"""
+
+from __future__ import annotations
+
+import itertools
+import weakref
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.scene_loading import SceneDescription, load
+from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
+
+__all__ = ["LoadedScene", "loaded_scenes"]
+
+_registry: weakref.WeakValueDictionary[int, LoadedScene] = weakref.WeakValueDictionary()
+_serial = itertools.count()
+
+
+def loaded_scenes() -> list[LoadedScene]:
+    """All of this process, in the order of loading."""
+    found = [_registry.get(number) for number in sorted(_registry.keys())]
+    return [scene for scene in found if scene is not None]
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What a parameter was set to: a reference of its own to the value's memory, whether as a leaf, and whether a new leaf must
+    replace it at the next setting, since its tangents were carried on."""
+
+    value: mi.TensorXf
+    attached: bool
+    spent: bool = False
+
+    def is_of(self, value: mi.TensorXf, attached: bool) -> bool:
+        """Whether nothing would change: the same memory, which nobody can have written to since it is referenced here."""
+        same = self.value.array.index == value.array.index and self.value.shape == value.shape
+        return same and self.attached == attached and not self.spent
+
+
+class LoadedScene:
+    """One load of a scene description. Owns what changes in it.
+
+    Args:
+        description: what to load.
+
+    Attributes:
+        scene: as Mitsuba has it.
+        parameters: of that scene. Write to them through `set_parameters` alone.
+        leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
+    """
+
+    def __init__(self, description: SceneDescription):
+        self.scene: mi.Scene = load(description)
+        self.parameters: mi.SceneParameters = mi.traverse(self.scene)
+        self.leaves: dict[str, Any] = {}
+        self._own: dict[str, Any] = {}
+        for key in self.parameters.keys():  # noqa: SIM118 (iterating gives pairs)
+            value = self.parameters[key]
+            if _is_array(value):
+                self._own[key] = _reference(value)
+        self._settings: dict[str, _Setting] = {}
+        _registry[next(_serial)] = self
+
+    def value(self, key: str) -> mi.TensorXf:
+        """The scene's own value of a parameter, as loaded."""
+        return to_tensor(self._own[key] if key in self._own else self.parameters[key])
+
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Of the parameters that are set."""
+        return tuple(tuple(setting.value.shape) for setting in self._settings.values())
+
+    def set_parameters(self, values: Tree, attached: bool) -> None:
+        """Give these parameters these values and all others the scene's own. Nothing happens where that is so already.
+
+        Args:
+            values: {key: `mi.TensorXf`}.
+            attached: whether they are leaves of the derivative graph.
+        """
+        self._restore([key for key in self._settings if key not in values])
+        changed = False
+        for key, value in values.items():
+            if key in self._settings and self._settings[key].is_of(value, attached):
+                continue
+            leaf = from_tensor(value, self._own[key])
+            self.leaves.pop(key, None)
+            if attached:
+                dr.enable_grad(leaf)
+                self.leaves[key] = leaf
+            self.parameters[key] = leaf
+            self._settings[key] = _Setting(mi.TensorXf(value), attached)
+            changed = True
+        if changed:
+            self.parameters.update()
+
+    def _restore(self, keys: list[str]) -> None:
+        if not keys:
+            return
+        for key in keys:
+            del self._settings[key]
+            self.leaves.pop(key, None)
+            self.parameters[key] = _reference(self._own[key])
+        self.parameters.update()
+        # A mesh whose vertices were set computes its normals anew, also where it was loaded with others.
+        normals = [name for name in map(normals_key, keys) if name in self._own and name not in self._settings]
+        for name in normals:
+            self.parameters[name] = _reference(self._own[name])
+        if normals:
+            self.parameters.update()
+
+    def detach(self) -> None:
+        """Keep the values, and cut them from the derivative graph."""
+        if self.leaves:
+            self.set_parameters({key: setting.value for key, setting in self._settings.items()}, attached=False)
+
+    def clear_gradients(self) -> None:
+        """Forget the gradients of all leaves."""
+        for leaf in self.leaves.values():
+            dr.clear_grad(leaf)
+
+    def gradients(self) -> Tree:
+        """The gradients of all leaves, as tensors."""
+        return {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
+
+    def set_tangents(self, values: Tree, tangents: Tree) -> None:
+        """Give these parameters these values, and carry their tangents to all that the scene computes from them.
+
+        Afterwards what the scene holds has tangents, no way leads back to the leaves, and every other scene of the process is detached.
+        """
+        for other in loaded_scenes():
+            if other is not self:
+                other.detach()
+        self._spend()
+        self.set_parameters(values, attached=True)
+        for key, leaf in self.leaves.items():
+            if key not in tangents:
+                raise InputError(f"parameter {key}: its tangent is missing")
+            dr.clear_grad(leaf)
+            dr.set_grad(leaf, from_tensor(tangents[key], self._own[key]))
+        for leaf in self.leaves.values():
+            dr.enqueue(dr.ADMode.Forward, leaf)
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+        self._spend()
+
+    def _spend(self) -> None:
+        self._settings = {key: replace(setting, spent=True) for key, setting in self._settings.items()}
+
+
+def _is_array(value: Any) -> bool:
+    try:
+        native_shape(value)
+    except TypeError:
+        return False
+    return not isinstance(value, (int, float))
+
+
+def _reference(value: Any) -> Any:
+    """Another reference to the same memory."""
+    return type(value)(value)

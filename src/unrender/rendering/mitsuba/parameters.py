@@ -1,0 +1,147 @@
+"""How a parameter reaches the image, read off the scene graph, and the physical range of its values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.path import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
+
+__all__ = ["ParameterTraits", "normals_key", "parameter_traits", "physical_range"]
+
+# Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
+# depend on the parameter.
+_SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
+_WRAPPERS = {"TwoSidedBRDF"}
+_BENDERS = {"BumpMap", "NormalMap"}
+
+
+@dataclass(frozen=True)
+class ParameterTraits:
+    """How a parameter reaches the image, read off the scene graph.
+
+    Attributes:
+        geometric: whether it moves shapes, sensors or emitters, so that paths themselves change.
+        bsdf: the outermost BSDF it belongs to, or None.
+        reason: why one path cannot serve two values of it, "" if it can.
+        replayable: whether path replay gives its derivative; if not, for the same reason.
+        delta: how the BSDF's perfectly specular lobes follow it, one of the `DELTA_...` constants of the integrators.
+        medium: whether extinction or scattering of a participating medium depends on it.
+        phase: whether it belongs to a phase function.
+    """
+
+    geometric: bool
+    bsdf: mi.BSDF | None
+    reason: str
+    replayable: bool = True
+    delta: int = DELTA_EQUAL
+    medium: bool = False
+    phase: bool = False
+
+    @property
+    def shares_paths(self) -> bool:
+        """Whether one path serves two values of it."""
+        return not self.reason
+
+    @property
+    def changes_delta(self) -> bool:
+        """Whether perfectly specular lobes change with it."""
+        return self.delta != DELTA_EQUAL
+
+
+def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTraits:
+    """How the parameter `key` of a traversed scene reaches the image, from the chain of objects that holds it."""
+    node = parameters.properties[key][2]
+    leaf = key.rsplit(".", 1)[-1]
+    chain: list[Any] = []
+    while node is not None and node in parameters.hierarchy:
+        chain.append(node)
+        node = parameters.hierarchy[node][0]
+    bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
+    if bsdfs:
+        return _bsdf_traits(bsdfs, chain)
+    if any(isinstance(n, mi.Emitter) for n in chain):
+        if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
+            return ParameterTraits(True, None, "it moves an emitter")
+        return ParameterTraits(False, None, "")
+    if any(isinstance(n, mi.Medium) for n in chain):
+        volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
+        return ParameterTraits(False, None, "", medium=volume, phase=phase)
+    if any(isinstance(n, mi.Sensor) for n in chain):
+        return ParameterTraits(True, None, "it moves the sensor")
+    if any(isinstance(n, mi.Shape) for n in chain):
+        if leaf.startswith(("vertex_color", "face_color")) or (leaf.startswith(("vertex_", "face_")) and leaf not in (
+            "vertex_positions", "vertex_normals", "vertex_texcoords"
+        )):  # fmt: skip
+            return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
+        return ParameterTraits(True, None, "it moves a shape")
+    return ParameterTraits(True, None, "it is neither a material's nor an emitter's")
+
+
+def _bsdf_traits(bsdfs: list[Any], chain: list[Any]) -> ParameterTraits:
+    """How a parameter inside this nest of BSDFs (innermost first) reaches the image: what its delta lobes make of it."""
+    outer = bsdfs[-1]
+    if not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta):
+        return ParameterTraits(False, outer, "")  # whatever mirrors stand beside it do not change
+    names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
+    if names == ["MaskBSDF"] and not _masks_delta(outer):
+        return ParameterTraits(False, outer, "", delta=DELTA_MASK)
+    inner = names[0]
+    if inner in _SIMPLE_DELTA and all(name in _BENDERS for name in names[1:]):
+        if not any(isinstance(c, mi.Texture) for c in chain):  # the index of refraction is no texture
+            return ParameterTraits(
+                False, outer, "it bends the direction of a perfectly specular lobe", replayable=False
+            )
+        turned = "it lies under a bump or normal map that turns a specular lobe" if names[1:] else ""
+        return ParameterTraits(False, outer, turned, delta=DELTA_SIMPLE)
+    if inner in _BENDERS:
+        return ParameterTraits(False, outer, "it bends the direction of a perfectly specular lobe", replayable=False)
+    return ParameterTraits(False, outer, "its BSDF mixes perfectly specular lobes with others", replayable=False)
+
+
+def _masks_delta(bsdf: Any) -> bool:
+    """Whether what lies under a mask (the outermost BSDF) has perfectly specular lobes of its own."""
+    return any(
+        mi.has_flag(bsdf.flags(), kind) for kind in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
+    )
+
+
+def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | None, float | None]:
+    """The range that makes physical sense, from the names Mitsuba gives to its parameters."""
+    node = parameters.properties[key][2]
+    names = key.split(".")
+    role = next((n for n in reversed(names) if n not in ("value", "data", "color0", "color1", "scale")), "")
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Medium)):
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    if isinstance(node, mi.Emitter):
+        return (
+            (0.0, None)
+            if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data")
+            else (None, None)
+        )
+    if isinstance(node, mi.Medium):
+        ranges = {"sigma_t": (0.0, None), "albedo": (0.0, 1.0), "emission": (0.0, None), "g": (-0.99, 0.99)}
+        return ranges.get(role, (None, None))
+    if not isinstance(node, mi.BSDF):
+        return None, None
+    if role in ("alpha", "alpha_u", "alpha_v", "roughness"):
+        return 0.02, 1.0
+    if role in ("eta", "k"):
+        return 0.0, None
+    if role == "normalmap":
+        return 0.0, 1.0
+    if role in (
+        "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "diffuse_transmittance",
+        "transmittance", "base_color", "metallic", "specular", "anisotropic", "spec_tint", "sheen", "sheen_tint",
+        "clearcoat", "clearcoat_gloss", "spec_trans", "flatness", "diff_trans", "opacity", "weight",
+    ):  # fmt: skip
+        return 0.0, 1.0
+    return None, None
+
+
+def normals_key(key: str) -> str:
+    """The key of the normals that Mitsuba computes when the parameter `key` changes, "" where it computes none."""
+    owner, _, name = key.rpartition(".")
+    return f"{owner}.vertex_normals" if name == "vertex_positions" else ""

@@ -1,0 +1,249 @@
+"""The launches that answer a sample request, one class each: which scene is traced, with which tables, and what for.
+
+A pass makes the function that is recorded. Its arguments after the first six are the pass's own, see `trace`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.integrators.path import PathPair
+from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+from unrender.rendering.mitsuba.poses import PosedScene
+from unrender.rendering.mitsuba.scene_pair import ScenePair
+
+__all__ = [
+    "AdjointPairPass",
+    "AdjointPass",
+    "ImagePairPass",
+    "ImagePass",
+    "Kernel",
+    "LaunchSize",
+    "Pass",
+    "PosesPass",
+    "TangentPass",
+]
+
+Kernel = PathPair | VolumePair | PrbKernel
+"""What traces paths."""
+
+Tables = dict[str, Any]
+"""{name: `mi.UInt32`}."""
+
+
+@dataclass(frozen=True)
+class LaunchSize:
+    """What a kernel is compiled for.
+
+    Attributes:
+        sensor: its index; of no account where each pixel has its own.
+        spp: samples per pixel.
+        pixels: how many.
+    """
+
+    sensor: int
+    spp: int
+    pixels: int
+
+
+class Pass(ABC):
+    """One kind of launch. Equal passes have equal kernels."""
+
+    previous: bool = False  # whether the previous scene is traced
+    pair: ClassVar[bool] = False  # whether both states share the paths
+    needs_tangents: ClassVar[bool] = False  # whether what the scene holds has tangents, which are an input
+
+    def scene(self, pair: ScenePair) -> Any:
+        """What is handed to the kernel as the scene."""
+        return pair.loaded(self.previous).scene
+
+    def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int) -> Tables:
+        """The tables that the kernel looks up."""
+        tables = self._surface_tables(pair, delta)
+        if pair.volumetric:
+            tables = {**tables, **pair.media(self.previous, sensor), **pair.majorants(self.previous, self.pair)}
+        return tables
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {"delta": delta}
+
+    def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
+        """What is recorded: of the scene, all loaded scenes, tables, the seed, pixels or None, the films and each pixel's sensor or
+        None, and the pass's own arrays."""
+
+        def launch(scene, loaded, tables, seed, pixels, sensors, *own):
+            del loaded  # read through pointers, if at all
+            # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
+            numbers = sampler.clone()
+            with dr.suspend_grad():
+                ray, ray_weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
+
+                def sample(mode, replay=()):
+                    return _sample(kernel, mode, scene, tables, numbers, ray, replay, self.pair)
+
+                return self.trace(sample, ray_weight, size, *own)
+
+        return launch
+
+    @abstractmethod
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+        """Trace the camera rays.
+
+        Args:
+            sample: of the mode and what is replayed, `_sample` of these rays.
+            ray_weight: the sensor's weight per lane.
+            size: what the kernel is compiled for.
+            own: the pass's own arrays.
+        """
+
+
+@dataclass(frozen=True)
+class ImagePass(Pass):
+    """One state's radiance per lane."""
+
+    previous: bool = False
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {}
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+        """The radiance of each lane."""
+        L, _ = sample(dr.ADMode.Primal)
+        return L * ray_weight
+
+
+@dataclass(frozen=True)
+class ImagePairPass(Pass):
+    """Both states' radiance per lane, on the current state's paths."""
+
+    pair: ClassVar[bool] = True
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {**pair.tables(), "delta": delta}
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+        """The radiance of each lane, of the current and of the previous state."""
+        L, Lₚ = sample(dr.ADMode.Primal)
+        return L * ray_weight, Lₚ * ray_weight
+
+
+@dataclass(frozen=True)
+class AdjointPass(Pass):
+    """One state's path replay backward: accumulates the gradients of its leaves."""
+
+    previous: bool = False
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> None:
+        """`own`: the radiance that the primal pass returned, and the film's weights."""
+        radiance, weights = own
+        δL = film.film_adjoint(weights, size.spp, size.pixels) * ray_weight
+        sample(dr.ADMode.Backward, ((δL, radiance),))
+
+
+@dataclass(frozen=True)
+class AdjointPairPass(Pass):
+    """Both states' path replay backward, on the current state's paths."""
+
+    pair: ClassVar[bool] = True
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {**pair.tables(), "delta": delta}
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> None:
+        """`own`: as for `AdjointPass`, of the current and then of the previous state."""
+        radiance, weights, radianceₚ, weightsₚ = own
+        δL = film.film_adjoint(weights, size.spp, size.pixels) * ray_weight
+        δLₚ = film.film_adjoint(weightsₚ, size.spp, size.pixels) * ray_weight
+        sample(dr.ADMode.Backward, ((δL, radiance), (δLₚ, radianceₚ)))
+
+
+@dataclass(frozen=True)
+class TangentPass(Pass):
+    """Path replay forward: the squared derivative of each lane's radiance along the tangents."""
+
+    needs_tangents: ClassVar[bool] = True
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+        """`own`: the radiance that the primal pass returned."""
+        (radiance,) = own
+        δ, _ = sample(dr.ADMode.Forward, ((None, radiance),))
+        return dr.square(δ * ray_weight)
+
+
+@dataclass(frozen=True, eq=False)
+class PosesPass(Pass):
+    """The radiance of many poses per lane, one image behind the other.
+
+    Attributes:
+        posed: the scene.
+        copies: how many poses.
+    """
+
+    posed: PosedScene
+    copies: int
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PosesPass) and self.posed is other.posed and self.copies == other.copies
+
+    def __hash__(self) -> int:
+        return hash((id(self.posed), self.copies))
+
+    def scene(self, pair: ScenePair) -> Any:
+        """Its static scene and those of the posed shapes."""
+        return self.posed.scenes()
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {}
+
+    def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
+        """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled."""
+
+        def launch(scenes, loaded, tables, seed, pixels, sensors, numbers):
+            del loaded, tables, sensors
+            lanes = size.pixels * size.spp
+            batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes
+            assembly = self.posed.at(scenes, numbers, batch)
+            repeating = film.RepeatingSampler(lanes)
+            with dr.suspend_grad():
+                camera = assembly.static.sensors()[size.sensor]
+                ray, ray_weight = film.rays(camera, repeating, seed, size.spp, pixels, size.pixels, self.copies)
+                if camera.id() in assembly.poses:
+                    ray = assembly.poses[camera.id()].ray_outside(ray)
+                L, _ = _sample(kernel, dr.ADMode.Primal, assembly.static, None, repeating, ray, geometry=assembly)
+                return L * ray_weight
+
+        return launch
+
+    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+        """Never called: `function` traces all copies."""
+        raise NotImplementedError
+
+
+def _camera_rays(
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    size: LaunchSize,
+    seed: mi.UInt32,
+    pixels: mi.UInt32 | None,
+    sensors: tuple[film.Films, mi.UInt32] | None,
+) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    if sensors is None:
+        return film.rays(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
+    films, which = sensors
+    return film.rays_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
+
+
+def _sample(kernel, mode, scene, tables, sampler, ray, replay=(), pair=False, geometry=None) -> tuple[Any, Any]:
+    """Call the kernel; `replay`: (loss derivative, radiance of the primal pass) per lane, of the current and of the previous state."""
+    (δL, radiance), (δLₚ, radianceₚ) = (*replay, (None, None), (None, None))[:2]
+    if geometry is None:
+        return kernel.sample(mode, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ)
+    return kernel.sample(mode, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ, geometry)

@@ -1,0 +1,65 @@
+"""Loading a scene description, with errors in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from unrender.backend.variant import ensure
+from unrender.core.errors import InputError
+from unrender.rendering.mitsuba import emissive
+
+__all__ = ["SceneDescription", "load", "media"]
+
+SceneDescription = str | Path | dict | Callable[[], Any]
+"""An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
+meshes are made twice)."""
+
+
+def load(description: SceneDescription) -> mi.Scene:
+    """One Mitsuba scene. Meshes are not merged, so that two loads have their shapes in the same order.
+
+    Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
+    """
+    ensure()
+    emissive.register()
+    if callable(description):
+        description = description()
+    try:
+        if isinstance(description, (str, Path)):
+            path = Path(description)
+            if not path.is_file():
+                raise InputError(f"scene {path}: no such file")
+            scene = mi.load_file(str(path), parallel=False, optimize=False)
+        elif isinstance(description, dict):
+            scene = mi.load_dict(description, parallel=False, optimize=False)
+        else:
+            raise InputError(f"scene: expected an .xml path or a Mitsuba dictionary, got {type(description).__name__}")
+    except InputError:
+        raise
+    except Exception as error:
+        name = str(description) if isinstance(description, (str, Path)) else "dictionary"
+        raise InputError(f"scene {name}: Mitsuba could not load it: {_one_line(error)}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
+    if not scene.sensors():
+        raise InputError("scene: it has no sensor, and nothing can be rendered without one")
+    return scene
+
+
+def _one_line(error: Exception) -> str:
+    if own := re.search(r"InputError: (.+)", str(error)):  # of a plugin of ours, under Mitsuba's traceback
+        return own[1]
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines)[:400] or type(error).__name__
+
+
+def media(scene: mi.Scene) -> list[mi.Medium]:
+    """All participating media of a scene, once for each place they are in, in an order that two loads share."""
+    found = [medium for shape in scene.shapes() for medium in (shape.interior_medium(), shape.exterior_medium())]
+    found += [sensor.get_medium() for sensor in scene.sensors()]
+    return [medium for medium in found if medium is not None]

@@ -1,0 +1,261 @@
+"""Images and gradients of a Mitsuba scene, for a set of parameters announced before: recorded kernels, and how they are launched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.integrators.path import PathPair
+from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+from unrender.rendering.mitsuba.loaded_scene import loaded_scenes
+from unrender.rendering.mitsuba.passes import (
+    AdjointPairPass,
+    AdjointPass,
+    ImagePairPass,
+    ImagePass,
+    Kernel,
+    LaunchSize,
+    Pass,
+    PosesPass,
+    TangentPass,
+)
+from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
+from unrender.rendering.mitsuba.scene_pair import ScenePair
+from unrender.rendering.mitsuba.tensors import tensor
+from unrender.rendering.renderer import Rendering, SampleRequest, Space
+
+__all__ = ["MitsubaSession", "Paths"]
+
+_LANES = 1 << 22
+"""Paths per launch of a batch: what fits a small machine's memory."""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """What `adjoint` needs to walk the paths of a rendering again.
+
+    Attributes:
+        request: the samples taken.
+        radiance: per lane.
+        radiance_previous: likewise of the previous state; None unless a pair was rendered.
+        space: where the pair shares its samples.
+        previous: parameters of the previous state; None unless a pair was rendered.
+    """
+
+    request: SampleRequest
+    radiance: mi.Spectrum
+    radiance_previous: mi.Spectrum | None = None
+    space: Space = "path"
+    previous: Tree | None = None
+
+
+class MitsubaSession:
+    """Kernels for one set of parameters. Equal arguments give equal results, whatever other sessions do between two calls.
+
+    What the two scenes hold when a call begins is of no account: each call sets them to its own parameters, and all others to the
+    scene's own values. Where they hold these already, nothing is done.
+
+    Args:
+        pair: both loads of the scene, which sessions share.
+        keys: the parameters, poses left out.
+        poses: {key: what it stands for} of those that are poses.
+        derivatives: whether parameters are leaves of the derivative graph: for all of a session or never, since recorded kernels
+            would be recorded anew if that changed between the primal and the adjoint pass.
+        max_depth: longest path in segments.
+        sampler: is cloned.
+
+    Raises `InputError` where poses and other parameters that move geometry come together: the scenes that posed shapes live in are
+    not rebuilt.
+    """
+
+    def __init__(
+        self,
+        pair: ScenePair,
+        keys: list[str],
+        poses: dict[str, PoseKey],
+        derivatives: bool,
+        max_depth: int,
+        sampler: mi.Sampler,
+    ):
+        traits = {key: pair.parameter_traits(key) for key in keys}
+        moving = next((key for key in keys if traits[key].geometric), None)
+        if poses and moving is not None:
+            raise InputError(
+                f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
+            )
+        self._pair, self._keys, self._poses, self._attached = pair, keys, poses, derivatives
+        self._posed = PosedScene(pair.current, poses) if poses else None
+        self._max_depth, self._sampler = max_depth, sampler
+        self._geometric = derivatives and moving is not None
+        self._traits = list(traits.values()) if derivatives else []
+        # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
+        self._recordable = not any(of.phase for of in traits.values())
+        self._delta_table = pair.delta_table(self._traits)
+        self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
+
+    @cached_property
+    def _path_kernel(self) -> Kernel:
+        """The path tracer for these parameters' derivatives."""
+        delta = any(traits.changes_delta for traits in self._traits)
+        if not self._pair.volumetric:
+            return PathPair(self._max_depth, changing_delta=delta)
+        media = any(traits.medium for traits in self._traits)
+        emission = self._pair.emissive
+        return VolumePair(self._max_depth, changing_delta=delta, differentiate_media=media, emission=emission)
+
+    @cached_property
+    def _geometry_kernel(self) -> Kernel:
+        return PrbKernel(self._max_depth)
+
+    # ------------------------------------------------------------------ rendering
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """Render. Unbiased; box filter. Posed shapes are in one group only."""
+        if self._posed is not None:
+            stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
+            return Rendering(self.image_batch(stacked, request), None, None)
+        self._set_parameters(parameters)
+        radiance = self._run(ImagePass(), request)
+        dr.eval(radiance)
+        return Rendering(self._develop(radiance, request), None, Paths(request, radiance))
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
+        """Render many states with the same random numbers. See `RenderSession.image_batch`.
+
+        Poses alone: one launch for as many as fit the memory. Otherwise one replay of the recorded kernel for each.
+        """
+        count = len(next(iter(parameters.values())))
+        shape = (*self._pair.resolutions[request.sensor], 3)
+        size = 1 if self._keys else max(1, _LANES // (self._count(request) * request.spp))
+        images = []
+        for start in range(0, count, size):
+            part = {key: value[start : start + size] for key, value in parameters.items()}
+            images.append(self._batch(part, request))
+        flat = images[0] if len(images) == 1 else dr.concat(images)
+        return mi.TensorXf(flat, (count, *shape))
+
+    def _batch(self, parameters: Tree, request: SampleRequest) -> mi.Float:
+        """The pixels of states that share all but their poses, one behind the other."""
+        count = len(next(iter(parameters.values())))
+        self._set_parameters({key: tensor(parameters[key][0]) for key in self._keys if key in parameters})
+        if self._posed is None:
+            radiance = self._run(ImagePass(), request)
+        else:
+            numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
+            radiance = self._run(PosesPass(self._posed, count), request, tensor(numbers).array)
+        dr.eval(radiance)
+        return film.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
+        self._set_parameters(current)
+        self._set_parameters(previous, previous=True)
+        if space == "primary":
+            radiance = self._run(ImagePass(), request)
+            radiance_previous = self._run(ImagePass(previous=True), request)
+        else:
+            radiance, radiance_previous = self._run(ImagePairPass(), request)
+        dr.eval(radiance, radiance_previous)
+        images = self._develop(radiance, request), self._develop(radiance_previous, request)
+        return Rendering(*images, Paths(request, radiance, radiance_previous, space, previous))
+
+    # ------------------------------------------------------------------ derivatives
+
+    def adjoint(self, parameters: Tree, paths: Paths, weights: mi.TensorXf) -> Tree:
+        """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `RenderSession.adjoint`."""
+        if self._pair.volumetric and paths.previous is not None and paths.space == "path":
+            # Where a pair collides in a medium depends on both states: so does its replay.
+            nothing = tensor(np.zeros(weights.shape))
+            return self.adjoint_pair(parameters, paths.previous, paths, weights, nothing)[0]
+        self._set_parameters(parameters)
+        self._run(AdjointPass(), paths.request, paths.radiance, weights)
+        return self._gradients()
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
+    ) -> tuple[Tree, Tree]:
+        """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space each on its own.
+        See `RenderSession.adjoint_pair`."""
+        self._set_parameters(current)
+        self._set_parameters(previous, previous=True)
+        request = paths.request
+        if paths.space == "primary":
+            self._run(AdjointPass(), request, paths.radiance, weights)
+            gradient = self._gradients()
+            self._run(AdjointPass(previous=True), request, paths.radiance_previous, weights_previous)
+            return gradient, self._gradients(previous=True)
+        states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
+        self._run(AdjointPairPass(), request, *states)
+        gradient = self._pair.loaded().gradients(), self._pair.loaded(previous=True).gradients()
+        dr.eval(gradient)
+        return gradient
+
+    def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
+        """Path replay in forward mode: the squared derivative of each path along the tangents. See `RenderSession.tangent_moment`."""
+        self._check_keys(parameters)
+        self._pair.loaded().set_tangents(parameters, tangents)
+        squares = self._run(TangentPass(), paths.request, paths.radiance)
+        dr.eval(squares)
+        return self._develop(squares, paths.request)[0]
+
+    def _gradients(self, previous: bool = False) -> Tree:
+        found = self._pair.loaded(previous).gradients()
+        dr.eval(found)
+        return found
+
+    # ------------------------------------------------------------------ launches
+
+    def _set_parameters(self, parameters: Tree, previous: bool = False) -> None:
+        self._check_keys(parameters)
+        self._pair.loaded(previous).set_parameters(parameters, self._attached)
+
+    def _check_keys(self, parameters: Tree) -> None:
+        for key in parameters:
+            if key not in self._keys:
+                raise InputError(f"parameter {key}: the renderer was not prepared for it")
+
+    def _count(self, request: SampleRequest) -> int:
+        if request.pixels is not None:
+            return dr.width(request.pixels)
+        height, width = self._pair.resolutions[request.sensor]
+        return height * width
+
+    def _develop(self, radiance: mi.Spectrum, request: SampleRequest) -> mi.TensorXf:
+        size = self._pair.resolutions[request.sensor] if request.pixels is None else (self._count(request),)
+        return film.develop(radiance, request.spp, request.groups, (*size, 3))
+
+    def _run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
+        """Launch the kernel for requests of this form: traced once, replayed at each step."""
+        pair = self._pair
+        size = LaunchSize(request.sensor, request.spp, self._count(request))
+        several = request.sensors is not None
+        # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
+        shapes = pair.loaded().shapes()
+        key = (task, size, request.groups, request.pixels is None, several, shapes)
+        if key not in self._functions:
+            traced = task.function(self._kernel_of(task), self._sampler, size)
+            self._functions[key] = FrozenFunction(traced, self._recordable)
+        scenes = [loaded.scene for loaded in loaded_scenes()]
+        sensors = (pair.films(), request.sensors) if several else None
+        tables = task.tables(pair, self._delta_table, request.sensor)
+        seed = mi.UInt32(request.seed)
+        before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
+        return self._functions[key](before, task.scene(pair), scenes, tables, seed, request.pixels, sensors, *own)
+
+    def _kernel_of(self, task: Pass) -> Kernel:
+        return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
+
+
+def _nothing() -> None:
+    return None

@@ -1,0 +1,52 @@
+"""Mitsuba values and the tensors that stand for them: a number is (), a colour (3,), a bitmap (H, W, C), a grid (Z, Y, X, C)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core import arrays
+
+__all__ = ["from_tensor", "native_shape", "tensor", "to_tensor"]
+
+
+def tensor(values: np.ndarray) -> mi.TensorXf:
+    """A tensor with these values, in memory of its own."""
+    return mi.TensorXf(arrays.owned(values, mi.Float), np.shape(values))
+
+
+def native_shape(value: Any) -> tuple[int, ...]:
+    """The shape of the tensor that stands for a Mitsuba value. Raises `TypeError` for what is no array."""
+    if isinstance(value, (int, float)):
+        return ()
+    if not dr.is_array_v(value) or dr.is_matrix_v(value) or dr.is_special_v(value):
+        raise TypeError(type(value).__name__)
+    if dr.is_tensor_v(value):
+        return tuple(value.shape)
+    if dr.depth_v(value) == 1:
+        return () if len(value) == 1 else (len(value),)
+    if dr.depth_v(value) == 2 and dr.width(value) == 1:
+        return (len(value),)
+    raise TypeError(type(value).__name__)
+
+
+def to_tensor(value: Any) -> mi.TensorXf:
+    """The tensor (`mi.TensorXf`, detached) that stands for a Mitsuba value."""
+    shape = native_shape(value)
+    if isinstance(value, (int, float)):
+        return mi.TensorXf(np.float32(value))
+    if dr.is_tensor_v(value):
+        return mi.TensorXf(dr.detach(value))
+    return mi.TensorXf(dr.ravel(dr.detach(value)), shape)
+
+
+def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
+    """The Mitsuba value of the type of `like` for a tensor; the inverse of `to_tensor`."""
+    if dr.is_tensor_v(like):
+        return type(like)(tensor.array, tuple(tensor.shape))
+    if dr.depth_v(like) == 1:
+        return type(like)(tensor.array)
+    return dr.unravel(type(like), type(like[0])(tensor.array))
