@@ -10,7 +10,8 @@ import numpy as np
 from unrender.core import arrays, checks, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import LOSSES, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
@@ -37,9 +38,9 @@ class LossValues:
         checks.integer("LossValues", "spp", self.spp, at_least=1)
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """The loss at any points."""
-        return frozenset({LOSSES})
+        return Capabilities(LossFunction)
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
         """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
@@ -50,14 +51,14 @@ class LossValues:
         """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those that the optimizer asks for
         included), "images" per view."""
         box = BlackBox(problem, parameters, self.spp, key)
-        return Estimate(box.here(), {}, losses=box.losses, info=box.info), state
+        return Estimate(box.center(), {}, (LossFunction(box.losses),), box.info), state
 
 
 class BlackBox:
     """The problem's loss at any points, all with the same random numbers.
 
-    The loss at the parameters themselves is rendered once, beside the first points that are asked for: launches of small pictures cost
-    as much as what is in them.
+    The loss at the parameters themselves is rendered once, in one batch with the first points that are asked for: for small images the
+    overhead of a launch exceeds the cost of its content.
 
     Args:
         problem: whose renderer has selected the parameters (`Renderer.select`, `derivatives=False`).
@@ -73,33 +74,34 @@ class BlackBox:
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
         self.info: dict[str, Any] = {"samples": 0}
         self._theta = vectors.ravel(parameters)
-        self._here: float | None = None
+        self._center: float | None = None
 
     def losses(self, points: np.ndarray) -> np.ndarray:
-        """(B, n), all parameters flattened in key order, to (B,). Points outside the bounds count as the nearest inside.
+        """The loss at points (B, n), all parameters flattened in key order, as (B,). Points are projected onto the bounds.
 
         Unbiased for the expected loss of images with this noise.
         """
         if len(points) == 1 and np.array_equal(points[0], self._theta):
-            return np.array([self.here()])
-        if self._here is not None:
-            return self._losses(points)[0]
-        return self._with_here(points)[1:]
+            return np.array([self.center()])
+        if self._center is not None:
+            return self._evaluate(points)[0]
+        return self._evaluate_with_center(points)[1][1:]
 
-    def here(self) -> float:
+    def center(self) -> float:
         """The loss at the parameters themselves."""
-        if self._here is None:
-            self._with_here(np.empty((0, self._theta.size)))
-        assert self._here is not None
-        return self._here
+        if self._center is None:
+            return self._evaluate_with_center(np.empty((0, self._theta.size)))[0]
+        return self._center
 
-    def _with_here(self, points: np.ndarray) -> np.ndarray:
-        losses, images = self._losses(np.concatenate([self._theta[None], points]))
+    def _evaluate_with_center(self, points: np.ndarray) -> tuple[float, np.ndarray]:
+        """The loss at the parameters, and at the parameters and `points` (B, n) in one array (1 + B,)."""
+        losses, images = self._evaluate(np.concatenate([self._theta[None], points]))
         self.info["images"] = {view: image[0] for view, image in images.items()}
-        self._here = float(losses[0])
-        return losses
+        self._center = float(losses[0])
+        return self._center, losses
 
-    def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
+    def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
+        """The losses (B,) and, per view, the images (B, H, W, 3)."""
         renderer, bounds = self.problem.renderer, self.problem.bounds
         stacked = {key: project(x, *bounds[key]) for key, x in vectors.parts(points, self.parameters).items()}
         images, parts = {}, []

@@ -10,7 +10,8 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
@@ -136,9 +137,9 @@ class MetaEstimator:
             )
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """A gradient and its variance."""
-        return frozenset({GRADIENT, VARIANCE})
+        return Capabilities(Gradient, Variance)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
@@ -192,7 +193,7 @@ class MetaEstimator:
             **step.info,
         }
         loss = sum(arrays.number(value) for value in step.losses)
-        return Estimate(loss, gradient, variance, preconditioned=True, info=info), after
+        return Estimate(loss, gradient, (Variance(variance),), info, preconditioned=True), after
 
     def _space(self, problem: Problem, parameters: Tree) -> Space:
         if self.space != "auto":

@@ -9,7 +9,8 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
@@ -68,9 +69,9 @@ class PathGradient:
         check_pixels("PathGradient", self.pixels, self.image)
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """A gradient."""
-        return frozenset({GRADIENT})
+        return Capabilities(Gradient)
 
     @property
     def groups(self) -> int:

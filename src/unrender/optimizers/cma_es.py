@@ -14,7 +14,8 @@ import numpy as np
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.estimators.base import LOSSES, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.optimizers import rates
 
 _NEAR = 0.01
@@ -92,31 +93,31 @@ class CMAES:
             raise InputError(f"CMAES: diagonal must be True or False, got {self.diagonal!r}")
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """The loss at points of its own."""
-        return frozenset({LOSSES})
+        return Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
         """See `Optimizer.init`."""
         own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
-        start = vectors.ravel(parameters) / vectors.spread(own, parameters)
+        start = vectors.ravel(parameters) / vectors.repeat_per_element(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))
         ranks, held = np.zeros((0, population), np.int32), np.zeros(0, np.int32)
         return CMAESState(own, start, ranks, held, np.zeros((0, start.size)))
 
     def update(self, estimate: Estimate, state: CMAESState, parameters: Tree) -> tuple[Tree, CMAESState]:
         """See `Optimizer.update`. On the host. Raises `InputError` for losses of another shape than one per point."""
-        assert estimate.losses is not None
+        evaluate = estimate.require("CMAES", LossFunction).evaluate
         search = state._search or self._again(state)
         object.__setattr__(state, "_search", None)  # whatever comes now, it is no longer this state's
-        scale = vectors.spread(state.learning_rates, parameters)
+        scale = vectors.repeat_per_element(state.learning_rates, parameters)
         here, generation = vectors.ravel(parameters) / scale, len(state.ranks)
         if search.is_elsewhere(here):
             search.hold(here)
             held = np.append(state.held, np.int32(generation))
             state = replace(state, held=held, held_at=np.concatenate([state.held_at, here[None]]))
         points = search.draw(self._random(generation))
-        losses = np.asarray(estimate.losses(points * scale), np.float64)
+        losses = np.asarray(evaluate(points * scale), np.float64)
         if losses.shape != (len(points),):
             raise InputError(f"CMAES: losses must have shape ({len(points)},), one per point, got {losses.shape}")
         ranks = _ranks(losses)

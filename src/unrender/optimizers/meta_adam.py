@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.optimizers import rates
 from unrender.schedules.functions import Schedule
 
@@ -57,9 +58,9 @@ class MetaAdam:
             checks.number("MetaAdam", "longest", self.longest, above=0.0)
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """A gradient and its variance."""
-        return frozenset({GRADIENT, VARIANCE})
+        return Capabilities(Gradient, Variance)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> MetaAdamState:
         """See `Optimizer.init`."""
@@ -68,11 +69,11 @@ class MetaAdam:
     def update(self, estimate: Estimate, state: MetaAdamState, parameters: Tree) -> tuple[Tree, MetaAdamState]:
         """See `Optimizer.update`. Lazy on Dr.Jit."""
         del parameters
-        assert estimate.variance is not None
+        variance = estimate.require("MetaAdam", Variance).values
         factor = rates.factor("MetaAdam", self.schedule, state.step)
         steps: Tree = {}
         for key, gradient in estimate.gradient.items():
             rate = arrays.scalar(-state.learning_rates[key] * factor, gradient)
-            step = gradient / arrays.sqrt(estimate.variance[key] + self.epsilon)
+            step = gradient / arrays.sqrt(variance[key] + self.epsilon)
             steps[key] = rate * (step if self.longest is None else arrays.clip(step, -self.longest, self.longest))
         return steps, replace(state, step=state.step + 1)
