@@ -1,4 +1,4 @@
-"""Trees as one vector on the host, for optimizers that look at all parameters at once."""
+"""Parameter trees as one vector on the host, for optimizers that treat all parameters jointly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loss as a function that can be evaluated anywhere, and nothing else."""
+"""The loss as a function of the parameters, without derivatives."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
 
+__all__ = ["BlackBox", "LossState", "LossValues"]
+
 
 @dataclass(frozen=True)
 class LossState:
-    """Nothing is kept."""
+    """Empty: there is no state."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class LossValues:
         return LossState()
 
     def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
-        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those that the optimizer asks for
-        included), "images" per view."""
+        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those of the optimizer's
+        evaluations included), "images" per view."""
         box = BlackBox(problem, parameters, self.spp, key)
         return Estimate(box.center(), {}, (LossFunction(box.losses),), box.info), state
 

@@ -166,9 +166,9 @@ class Problem:
 
     def loss_values(self, view: int, images: Array) -> Array:
         """`loss_value` of each of many images (B, H, W, 3): (B,), lazy."""
-        reference, mask = arrays.stacked(self.reference(view)), self.mask(view)
-        values = self._values(images, reference, None if mask is None else arrays.stacked(mask))
-        return arrays.mean_rest(values) * self.views[view].weight
+        reference, mask = arrays.add_first_axis(self.reference(view)), self.mask(view)
+        values = self._values(images, reference, None if mask is None else arrays.add_first_axis(mask))
+        return arrays.mean_over_rest(values) * self.views[view].weight
 
     def loss_derivative(self, view: int, image: Array) -> Array:
         """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
