@@ -1,4 +1,4 @@
-"""What an optimizer is."""
+"""The protocol of optimizers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from unrender.estimators.base import Estimate
 
 
 class Optimizer(Protocol):
-    """Turns estimates into steps. Immutable; all that changes is in the state."""
+    """Computes steps from estimates. Immutable; all that changes is in the state."""
 
     @property
     def requires(self) -> AbstractSet[str]:
