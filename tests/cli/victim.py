@@ -56,7 +56,7 @@ CASES: dict[str, Callable[[], tuple[Any, Any]]] = {
     ),
     "smoothed-newton": lambda: (
         ur.SmoothedDerivatives(0.03, 32, "hessian", schedule=_schedules.Exponential(20)),
-        _optimizers.Newton(trust_radius=None, through=_optimizers.Adam(0.02)),
+        _optimizers.Newton(trust_radius=None, inner_optimizer=_optimizers.Adam(0.02)),
     ),
     "smoothed-newton-cg": lambda: (ur.SmoothedDerivatives(0.03, 16, "hvp"), _optimizers.NewtonCG()),
     "smoothed-lbfgs": lambda: (ur.SmoothedDerivatives(0.03, 16), _optimizers.LBFGS(trust_radius=0.5)),

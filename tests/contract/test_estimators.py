@@ -51,10 +51,10 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "meta, other statistics": lambda: ur.MetaEstimator(statistics="independent"),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=3),
     "smoothed gradient": lambda: ur.SmoothedDerivatives(0.03, samples=16),
-    "smoothed Hessian": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hessian", together=False),
-    "smoothed products": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hvp", together=False),
-    "smoothed Hessian, together": lambda: ur.SmoothedDerivatives(0.03, samples=64, order="hessian"),
-    "smoothed products, together": lambda: ur.SmoothedDerivatives({"colour": 0.03, "*": 0.02}, samples=64, order="hvp"),
+    "smoothed Hessian": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hessian", joint=False),
+    "smoothed products": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hvp", joint=False),
+    "smoothed Hessian, joint": lambda: ur.SmoothedDerivatives(0.03, samples=64, order="hessian"),
+    "smoothed products, joint": lambda: ur.SmoothedDerivatives({"colour": 0.03, "*": 0.02}, samples=64, order="hvp"),
     "loss values": lambda: ur.LossValues(spp=4),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
@@ -84,9 +84,11 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
-    "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, share=0.1),
-    "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, share=0.1),
-    "LBFGS": lambda: ur.optimizers.LBFGS(trust_radius=0.1, curvature=0.5, history=20, through=OPTIMIZERS["Adam"]()),
+    "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, step_scale=0.1),
+    "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, step_scale=0.1),
+    "LBFGS": lambda: ur.optimizers.LBFGS(
+        trust_radius=0.1, curvature=0.5, history=20, inner_optimizer=OPTIMIZERS["Adam"]()
+    ),
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
 }
 FITTING = [
@@ -168,13 +170,13 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
     assert worst_z(rows * 1.1, exact)[0] > limit, "a planted bias of 10 % went unseen"
 
 
-@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("joint", [True, False])
 @pytest.mark.parametrize("order", ["gradient", "hessian", "hvp"])
-def test_smoothed_derivatives_are_unbiased_where_images_have_no_noise(order: Any, together: bool) -> None:
+def test_smoothed_derivatives_are_unbiased_where_images_have_no_noise(order: Any, joint: bool) -> None:
     """The loss is quadratic, and so its smoothed derivatives are its own."""
     asked = problem(ur.losses.RelativeL2(), views=2, noise=0.0)
     at = asked.initial()
-    estimator = ur.SmoothedDerivatives({"colour": 0.03, "map": 0.05}, samples=256, order=order, together=together)
+    estimator = ur.SmoothedDerivatives({"colour": 0.03, "map": 0.05}, samples=256, order=order, joint=joint)
 
     def flat(tree: dict[str, np.ndarray]) -> np.ndarray:
         return np.concatenate([x.ravel() for x in tree.values()])

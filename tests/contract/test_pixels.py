@@ -13,8 +13,9 @@ from scipy import stats
 
 import unrender as ur
 from unrender.core.random import Key
-from unrender.pixels import guided, pixel_statistics
+from unrender.pixels import pixel_statistics
 from unrender.pixels import tiles as cells_module
+from unrender.pixels.map_denoising import denoise_side_by_side
 from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
 from unrender.problem.batches import PixelBatch, PixelSample, WholeView
 from unrender.problem.references import References
@@ -64,12 +65,12 @@ def test_maps_split_join_and_coarsen() -> None:
     found = two_views([(5, 7), (4, 4)], 1000)
     values = np.random.default_rng(0).random((len(found.views), 3))
     assert np.array_equal(found.join(found.split(values)), values)
-    assert np.array_equal(found.coarser(values, 0), values)
-    level = found.split(found.coarser(values, 1))
+    assert np.array_equal(found.coarsen(values, 0), values)
+    level = found.split(found.coarsen(values, 1))
     first = found.split(values)[0]
     np.testing.assert_allclose(level[0][2:4, 4:6], np.broadcast_to(first[2:4, 4:6].mean((0, 1)), (2, 2, 3)))
     np.testing.assert_allclose(level[0][4, 6], first[4, 6])  # a block that the border cuts
-    whole = found.split(found.coarser(values, 10))[1]
+    whole = found.split(found.coarsen(values, 10))[1]
     np.testing.assert_allclose(whole, np.broadcast_to(found.split(values)[1].mean((0, 1)), (4, 4, 3)))
 
 
@@ -78,7 +79,7 @@ def test_coarse_means_count_pixels_and_not_cells() -> None:
     assert found.grids == (Grid(3, 2, 2),)
     values = np.arange(6.0)[:, None] * np.ones(3)
     expected = (np.array([0, 1, 2, 3]).sum() * 4 + (4 + 5) * 2) / 20
-    np.testing.assert_allclose(found.coarser(values, 2), expected)
+    np.testing.assert_allclose(found.coarsen(values, 2), expected)
 
 
 # ---------------------------------------------------------------- tables
@@ -285,7 +286,7 @@ def test_maps_are_cleaned_side_by_side_and_come_back_in_their_places(count: int)
         seen.append(picture.shape)
         return picture
 
-    np.testing.assert_allclose(guided._together(maps, clean), maps)
+    np.testing.assert_allclose(denoise_side_by_side(maps, clean), maps)
     assert len(seen) == 1
 
 
@@ -356,15 +357,15 @@ def test_tangents_go_through_preconditioners() -> None:
     eased = ur.Problem(
         asked.renderer, [dataclasses.replace(p, preconditioner=Halve()) for p in asked.parameters], asked.views
     )
-    looks = []
+    found = []
     for one in (asked, eased):
         whole = cut(one, 16)
         uniform_table = InverseCdfTable.of(whole, whole.sizes, one.renderer.array)
         seen = pixel_statistics.estimate_statistics(
             one, one.initial(), whole, uniform_table, 4, Key(0), [], pixel_statistics.scales(one.initial(), {})
         )
-        looks.append(seen.moments)
-    np.testing.assert_allclose(looks[1], looks[0] * 0.25)
+        found.append(seen.second_moment)
+    np.testing.assert_allclose(found[1], found[0] * 0.25)
 
 
 def test_relative_variances_are_not_ruled_by_one_bright_element() -> None:
@@ -399,7 +400,7 @@ def test_maps_are_means_over_refreshes() -> None:
     assert one / four == pytest.approx(4.0, rel=0.25)
 
 
-def test_a_control_variate_looks_at_whole_views_now_and_then() -> None:
+def test_a_control_variate_found_at_whole_views_now_and_then() -> None:
     asked = problem(views=2, noise=0.9)
     image = ur.images.RecursiveControlVariate(whole_views=4)
     estimator = ur.PathGradient(image, ur.pixels.Uniform(16), spp=2)
@@ -451,7 +452,7 @@ def test_what_makes_no_sense_is_refused() -> None:
     for pixels in (ur.pixels.All, "all", None, 100):
         with pytest.raises(ur.InputError, match="PathGradient: pixels"):
             ur.PathGradient(pixels=pixels)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ur.InputError, match="MetaEstimator: drawn pixels go with plain images"):
+    with pytest.raises(ur.InputError, match="MetaEstimator: pixel mini-batches go with plain images"):
         ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate(), pixels=ur.pixels.Uniform(8))
     with pytest.raises(ur.InputError, match="whole_views"):
         ur.images.RecursiveControlVariate(whole_views=0)
@@ -462,5 +463,5 @@ def test_what_makes_no_sense_is_refused() -> None:
         def pixelwise(self) -> bool:
             return False
 
-    with pytest.raises(ur.InputError, match=r"Blurred looks at whole pictures"):
+    with pytest.raises(ur.InputError, match=r"Blurred is of whole images"):
         ur.optimize(problem(Blurred()), ur.PathGradient(pixels=ur.pixels.Uniform(8)), ur.optimizers.Adam(), steps=1)

@@ -128,7 +128,7 @@ def test_derivatives_from_the_same_evaluations_agree_with_the_closed_form(
         counted[0] += len(x)
         return case.f(x)
 
-    found = ur.smoothed.together(f, case.theta, case.sigma, 16384, 3, low_discrepancy)
+    found = ur.smoothed.joint(f, case.theta, case.sigma, 16384, 3, low_discrepancy)
     v = V[:n]
     answers = (
         (found.gradient(), case.gradient()),
@@ -152,7 +152,7 @@ def test_standard_errors_of_derivatives_from_the_same_evaluations_are_honest() -
     case = Sine(2)
     rows = []
     for seed in range(400):
-        found = ur.smoothed.together(case.f, case.theta, case.sigma, 256, seed)
+        found = ur.smoothed.joint(case.f, case.theta, case.sigma, 256, seed)
         (g, g_error), (h, h_error) = found.gradient(), found.hvp(V[:2])
         rows.append([((g - case.gradient()) / g_error)[0], ((h - case.hessian() @ V[:2]) / h_error)[0]])
     z = np.array(rows)
@@ -216,7 +216,7 @@ def test_curvature_of_a_bowl_in_many_dimensions_is_not_lost_in_its_depth(low_dis
     v = np.random.default_rng(0).standard_normal(n)
     errors, bare = [], []
     for seed in range(20):
-        found = ur.smoothed.together(lambda x: 0.5 * (x * x) @ bend, np.zeros(n), sigma, 128, seed, low_discrepancy)
+        found = ur.smoothed.joint(lambda x: 0.5 * (x * x) @ bend, np.zeros(n), sigma, 128, seed, low_discrepancy)
         errors.append(found.hvp(v)[0] - bend * v)
         z = np.random.default_rng(seed).standard_normal((64, n))
         values = 0.5 * (sigma * z) ** 2 @ bend

@@ -97,10 +97,10 @@ def test_each_order_is_one_call_of_the_black_box(torch: Any, loss: Any) -> None:
     assert f.calls[2:] == [5]
 
 
-def test_together_products_cost_no_call_of_the_black_box(torch: Any, loss: Any) -> None:
+def test_joint_products_cost_no_call_of_the_black_box(torch: Any, loss: Any) -> None:
     f = Counted(bowls)
     phi = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
-    values = loss(f, phi, 0.1, 64, together=True)
+    values = loss(f, phi, 0.1, 64, joint=True)
     np.testing.assert_allclose(values.detach().numpy(), bowls(phi.detach().numpy(), np.arange(5)))
     (gradient,) = torch.autograd.grad(values.sum(), phi, create_graph=True)
     basis = [torch.autograd.grad(gradient, phi, v.expand(5, 3), retain_graph=True)[0].numpy() for v in torch.eye(3)]

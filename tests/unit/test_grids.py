@@ -15,8 +15,8 @@ import pytest
 
 import unrender as ur
 from unrender.core.errors import InputError
+from unrender.io import parameter_values as values
 from unrender.io.volumes import read_grid, write_grid
-from unrender.problem import values
 
 GRID = np.random.default_rng(0).random((4, 3, 5, 2)).astype(np.float32)
 

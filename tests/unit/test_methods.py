@@ -73,7 +73,7 @@ def test_smoothed_takes_its_options():
     narrowing = schedules.Cosine(50)
     assert estimator == SmoothedDerivatives(0.4, 16, "hvp", spp=2, schedule=narrowing)
     assert optimizer == NewtonCG(trust_radius=0.25, iterations=3)
-    settings = {"sigma": 0.4, "step": 0.25, "spp": 4, "sigma_schedule": "none", "together": "false"}
+    settings = {"sigma": 0.4, "step": 0.25, "spp": 4, "sigma_schedule": "none", "joint": "false"}
     cases: list[tuple[str, Any, Any]] = [
         ("newton", "hessian", Newton(trust_radius=0.25)),
         ("lbfgs", "gradient", LBFGS(trust_radius=0.25)),
@@ -81,7 +81,7 @@ def test_smoothed_takes_its_options():
     ]
     for name, order, made in cases:
         estimator, optimizer = method("smoothed").start({**settings, "optimizer": name})
-        assert estimator == SmoothedDerivatives(0.4, 16, order, together=False, spp=4)
+        assert estimator == SmoothedDerivatives(0.4, 16, order, joint=False, spp=4)
         assert optimizer == made
     estimator, _ = method("smoothed").start({"sigma": "0.2, mug.rotation.y=0.6"})
     assert estimator == SmoothedDerivatives(
@@ -113,7 +113,7 @@ def test_none_is_none():
         ("smoothed", {"sigma": -1}, "option sigma: expected a number above 0 or text, got -1"),
         ("smoothed", {"sigma": "a.b=1"}, "method smoothed: sigma: expected a number for all others too"),
         ("smoothed", {"sigma": "0.1, a.b=wide"}, "method smoothed: sigma: expected a number above 0, got 'wide'"),
-        ("smoothed", {"together": "maybe"}, "option together: expected true or false, got 'maybe'"),
+        ("smoothed", {"joint": "maybe"}, "option joint: expected true or false, got 'maybe'"),
         ("smoothed", {"samples": 3}, "option samples: expected a whole number of at least 4, got 3"),
         ("plain", {"schedule": "cosin(3)"}, "method plain: schedule: unknown 'cosin'; did you mean cosine?"),
     ],

@@ -11,6 +11,7 @@ import pytest
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Variance
 from unrender.optimizers import SGD, Adam, MetaAdam
 from unrender.schedules.functions import Constant, Cosine, Exponential, Steps, Warmup
 
@@ -185,7 +186,7 @@ def test_bad_arguments_are_named(make, message):
 def meta_take(optimizer, gradients, variances, learning_rates=None):
     state, steps = optimizer.init(gradients[0], learning_rates), []
     for gradient, variance in zip(gradients, variances, strict=True):
-        step, state = optimizer.update(Estimate(0.0, gradient, variance), state, gradient)
+        step, state = optimizer.update(Estimate(0.0, gradient, (Variance(variance),)), state, gradient)
         steps.append(step)
     return steps
 
@@ -222,7 +223,7 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
     state, made = optimizer.init(device[0]), 0
     for n, (gradient, variance) in enumerate(zip(device, spread, strict=True)):
         with kernels.recorded() as new:
-            step, state = optimizer.update(Estimate(0.0, gradient, variance), state, gradient)
+            step, state = optimizer.update(Estimate(0.0, gradient, (Variance(variance),)), state, gradient)
             dr.eval(step)
         made += sum(new)
         np.testing.assert_allclose(np.array(step["a"]), expected[n]["a"], rtol=1e-4)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from unrender.core.errors import InputError
 from unrender.io import images
-from unrender.problem import values
+from unrender.io import parameter_values as values
 
 COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
 

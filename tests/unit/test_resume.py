@@ -306,7 +306,7 @@ def test_a_part_that_no_file_can_say_is_to_be_handed_in(tmp_path: Path) -> None:
 def test_components_become_tables_and_come_back() -> None:
     schedules = ur.optimizers.schedules
     for component in (
-        ur.optimizers.Newton(trust_radius=None, through=ur.optimizers.Adam(schedule=schedules.Warmup(3, schedules.Cosine(9)))),
+        ur.optimizers.Newton(trust_radius=None, inner_optimizer=ur.optimizers.Adam(schedule=schedules.Warmup(3, schedules.Cosine(9)))),
         ur.SmoothedDerivatives({"*": 0.1, "mug.rotation.y": 0.6}, order="hvp", schedule=schedules.Exponential(5, 0.1)),
         ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate()),
         ur.preconditioners.LargeSteps(3.0, wrap=(False, True)),

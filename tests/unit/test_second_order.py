@@ -14,6 +14,7 @@ import unrender as ur
 from unrender.core import vectors
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capability, Hessian, HessianProduct, LossFunction, Smoothing
 from unrender.optimizers import CMAES, LBFGS, Adam, Newton, NewtonCG
 from unrender.optimizers.cma_es import CMAESState
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -35,12 +36,13 @@ def bowl(n: int = 6, seed: int = 0, condition: float = 1000.0) -> tuple[np.ndarr
 
 
 def known(gradient, hessian=None, like=LIKE, losses=None) -> Estimate:
-    """All that can be told of a quadratic."""
-    if hessian is None:
-        return Estimate(0.0, split(gradient, like), losses=losses)
-    return Estimate(
-        0.0, split(gradient, like), None, hessian, lambda v: split(hessian @ vectors.ravel(v), like), losses=losses
-    )
+    """The gradient of a quadratic, and its Hessian, products and losses where they are given."""
+    capabilities: list[Capability] = []
+    if hessian is not None:
+        capabilities = [Hessian(hessian), HessianProduct(lambda v: split(hessian @ vectors.ravel(v), like))]
+    if losses is not None:
+        capabilities.append(LossFunction(losses))
+    return Estimate(0.0, split(gradient, like), tuple(capabilities))
 
 
 def first_step(optimizer, gradient, hessian=None, learning_rates=None, like=LIKE) -> np.ndarray:
@@ -114,7 +116,7 @@ def test_newton_cg_asks_for_no_more_products_than_it_may(count):
 
     optimizer = NewtonCG(trust_radius=1e3, iterations=count, tolerance=0.0, damping=0.0)
     gradient = {"a": -hessian @ minimum}
-    optimizer.update(Estimate(0.0, gradient, None, None, product), optimizer.init(gradient), gradient)
+    optimizer.update(Estimate(0.0, gradient, (HessianProduct(product),)), optimizer.init(gradient), gradient)
     assert len(calls) == count
 
 
@@ -144,7 +146,7 @@ def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
         return 0.5 * np.einsum("bi,ij,bj->b", away, hessian, away)
 
     def step(sign):
-        estimate = dataclasses.replace(known(sign * gradient, 50 * hessian, like), losses=losses)
+        estimate = known(sign * gradient, 50 * hessian, like, losses)
         optimizer = NewtonCG(trust_radius=radius, iterations=1, line=True)
         assert optimizer.requires == {"gradient", "hvp", "losses"}
         return vectors.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
@@ -210,7 +212,7 @@ def test_a_later_product_that_is_not_finite_ends_the_iterations():
         return split(hessian @ vectors.ravel(v) * (np.nan if len(calls) == 3 else 1.0))
 
     gradient = -hessian @ minimum
-    estimate = Estimate(0.0, split(gradient), None, None, product)
+    estimate = Estimate(0.0, split(gradient), (HessianProduct(product),))
     step, _ = optimizer.update(estimate, optimizer.init(LIKE), LIKE)
     expected = first_step(dataclasses.replace(optimizer, iterations=2), gradient, hessian)
     np.testing.assert_array_equal(vectors.ravel(step), expected)
@@ -230,7 +232,9 @@ def test_noisy_products_lead_neither_upwards_nor_astray(noise):
             return split(exact + noise * np.linalg.norm(exact) / math.sqrt(6) * rng.normal(size=6))
 
         optimizer = NewtonCG(trust_radius=0.5, iterations=12, tolerance=0.0)
-        step, _ = optimizer.update(Estimate(0.0, split(gradient), None, None, product), optimizer.init(LIKE), LIKE)
+        step, _ = optimizer.update(
+            Estimate(0.0, split(gradient), (HessianProduct(product),)), optimizer.init(LIKE), LIKE
+        )
         assert vectors.ravel(step) @ gradient < 0
         assert 0 < np.linalg.norm(vectors.ravel(step)) <= 0.5 * (1 + 1e-9)
 
@@ -287,7 +291,7 @@ def test_learning_rates_do_not_matter_inside_the_trust_region():
 def test_share_and_schedule_are_factors_of_the_step(kind):
     gradient, (hessian, _) = np.arange(6.0), bowl()
     whole = first_step(kind(), gradient, hessian)
-    np.testing.assert_allclose(first_step(kind(share=0.25), gradient, hessian), 0.25 * whole)
+    np.testing.assert_allclose(first_step(kind(step_scale=0.25), gradient, hessian), 0.25 * whole)
     np.testing.assert_allclose(first_step(kind(schedule=Constant(0.5)), gradient, hessian), 0.5 * whole)
 
 
@@ -299,7 +303,7 @@ def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
     """Of the first kind of step, on a fixed list of gradients at fixed parameters."""
     rng = np.random.default_rng(1)
     adam, (hessian, _) = Adam(0.02, beta_1=0.8), bowl()
-    plain, passed = kind(), kind(through=adam, schedule=Exponential(3))
+    plain, passed = kind(), kind(inner_optimizer=adam, schedule=Exponential(3))
     own, state, states = passed.init(LIKE, {"b": 0.3}), adam.init(LIKE, {"b": 0.3}), plain.init(LIKE, {"b": 0.3})
     for step in range(5):
         estimate = known(rng.normal(size=6), hessian)
@@ -309,7 +313,9 @@ def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
         np.testing.assert_allclose(vectors.ravel(found), 0.5 ** (step / 3) * vectors.ravel(expected), rtol=1e-12)
 
 
-@pytest.mark.parametrize("optimizer", [Newton(through=Adam(0.05)), NewtonCG(through=Adam(0.05))], ids=["Newton", "CG"])
+@pytest.mark.parametrize(
+    "optimizer", [Newton(inner_optimizer=Adam(0.05)), NewtonCG(inner_optimizer=Adam(0.05))], ids=["Newton", "CG"]
+)
 def test_through_adam_reaches_the_bottom(optimizer):
     hessian, minimum = bowl(condition=100)
     optimizer = dataclasses.replace(optimizer, schedule=Exponential(60))
@@ -402,7 +408,7 @@ def search(optimizer, losses, state, parameters, steps, project=lambda x: x):
     """The parameters and states after each step."""
     path, states = [], []
     for _ in range(steps):
-        step, state = optimizer.update(Estimate(0.0, {}, losses=losses), state, parameters)
+        step, state = optimizer.update(Estimate(0.0, {}, (LossFunction(losses),)), state, parameters)
         parameters = {key: project(x + step[key]) for key, x in parameters.items()}
         path.append(vectors.ravel(parameters))
         states.append(state)
@@ -492,7 +498,7 @@ def test_the_search_is_as_wide_as_learning_rates_say():
         return points @ np.ones(6)
 
     optimizer = CMAES(sigma0=0.5, population=4000)
-    optimizer.update(Estimate(0.0, {}, losses=losses), optimizer.init(LIKE, RATES), LIKE)
+    optimizer.update(Estimate(0.0, {}, (LossFunction(losses),)), optimizer.init(LIKE, RATES), LIKE)
     np.testing.assert_allclose(seen[0].std(axis=0), 0.5 * SPREAD, rtol=0.05)
     scaled = search(CMAES(), sphere, CMAES().init(LIKE), LIKE, 5)[0]
     other = search(CMAES(), lambda p: sphere(p / SPREAD), CMAES().init(LIKE, RATES), LIKE, 5)[0]
@@ -550,7 +556,7 @@ def test_a_long_search_survives_its_own_success():
 def test_states_and_steps_on_the_device_are_those_of_numpy():
     hessian, minimum = bowl()
     device = {key: kernels.on_device(x) for key, x in LIKE.items()}
-    optimizers: list[Any] = [*FIRST_STEPS, Newton(through=Adam()), CMAES()]
+    optimizers: list[Any] = [*FIRST_STEPS, Newton(inner_optimizer=Adam()), CMAES()]
     for optimizer in optimizers:
         like, other = LIKE, device
         states, compiled = [optimizer.init(like), optimizer.init(other)], []
@@ -585,7 +591,7 @@ def test_steps_have_the_parameters_type_and_memory_of_their_own():
     ("optimizer", "order"),
     [
         (Newton(trust_radius=2.0), "hessian"),
-        (NewtonCG(trust_radius=2.0, through=Adam(0.03, schedule=Exponential(20))), "hvp"),
+        (NewtonCG(trust_radius=2.0, inner_optimizer=Adam(0.03, schedule=Exponential(20))), "hvp"),
         (LBFGS(trust_radius=2.0), "gradient"),
         (CMAES(sigma0=0.2), "gradient"),
     ],
@@ -610,8 +616,8 @@ def test_a_whole_run(optimizer, order):
         (lambda: Newton(damping=0.0), "Newton: damping must be a finite number > 0 and < 1, got 0.0"),
         (lambda: Newton(trust_radius=-1), "Newton: trust_radius must be a finite number > 0, got -1"),
         (lambda: Newton(learning_rate=0), "Newton: learning_rate must be a finite number > 0, got 0"),
-        (lambda: Newton(share=1.5), "Newton: share must be at most 1, got 1.5"),
-        (lambda: Newton(through="adam"), "Newton: through must be an Adam or None, got 'adam'"),  # type: ignore
+        (lambda: Newton(step_scale=1.5), "Newton: step_scale must be at most 1, got 1.5"),
+        (lambda: Newton(inner_optimizer="adam"), "Newton: inner_optimizer must be an Adam or None, got 'adam'"),  # type: ignore
         (lambda: NewtonCG(iterations=0), "NewtonCG: iterations must be a whole number of at least 1, got 0"),
         (lambda: NewtonCG(trust_radius=0), "NewtonCG: trust_radius must be a finite number > 0, got 0"),
         (lambda: NewtonCG(tolerance=1.0), "NewtonCG: tolerance must be a finite number >= 0 and < 1, got 1.0"),
@@ -649,20 +655,16 @@ def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
     parameters = {"a": np.zeros(2), "b": np.zeros(1)}
     gradient = {"a": np.array([3e3, -1e3]), "b": np.array([2e3])}
 
-    def first(width: dict[str, float] | None) -> np.ndarray:
-        scale = np.array([width["a"], width["a"], width["b"]]) if width else np.ones(3)
+    def first(sigma: dict[str, float] | None) -> np.ndarray:
+        scale = np.array([sigma["a"], sigma["a"], sigma["b"]]) if sigma else np.ones(3)
         hessian = np.diag(1 / scale**2)
-        found = Estimate(
-            0.0,
-            gradient,
-            hessian=hessian,
-            hvp=lambda v: vectors.unravel(hessian @ vectors.ravel(v), parameters),
-            width=width,
-        )
+        products = HessianProduct(lambda v: vectors.unravel(hessian @ vectors.ravel(v), parameters))
+        smoothing = () if sigma is None else (Smoothing(sigma),)
+        found = Estimate(0.0, gradient, (Hessian(hessian), products, *smoothing))
         return vectors.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
 
-    for width in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
-        step = first(width)
-        reach = np.linalg.norm(step / np.array([width["a"], width["a"], width["b"]]))
+    for sigma in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
+        step = first(sigma)
+        reach = np.linalg.norm(step / np.array([sigma["a"], sigma["a"], sigma["b"]]))
         assert reach == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
     assert np.linalg.norm(first(None)) == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)

@@ -80,9 +80,9 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
     assert samples(ur.SmoothedDerivatives(0.1, samples=16, aggregate=False), optimizers.Adam()) == 1 + 3 * 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2)
     assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16
-    products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, together=False)
+    products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, joint=False)
     assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
-    whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, together=False)
+    whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, joint=False)
     assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16
     assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
 
@@ -129,7 +129,7 @@ class _Landscape:
         return np.broadcast_to(self.height(parameters["x"])[:, :, None, None], (len(parameters["x"]), 2, 2, 3))
 
     def age(self, at: float, steps: int = 40, **options: Any) -> float:
-        estimator = ur.SmoothedDerivatives(0.1, samples=8, arrival=True, **options)
+        estimator = ur.SmoothedDerivatives(0.1, samples=8, adaptive_annealing=True, **options)
         parameters = {"x": np.array([at])}
         state = estimator.init(self.problem, parameters)
         for step in range(steps):
@@ -137,7 +137,7 @@ class _Landscape:
         return state.age / steps
 
 
-@pytest.mark.parametrize("options", [{}, {"order": "hvp"}, {"order": "hvp", "together": False}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"order": "hvp"}, {"order": "hvp", "joint": False}], ids=str)
 def test_sigma_waits_for_the_descent_to_arrive(options: dict[str, Any]) -> None:
     """At the bottom of a bowl time passes, on a slope, a plateau and a summit it stands still."""
     bowl = _Landscape(lambda x: 1 + x * x)
@@ -146,10 +146,10 @@ def test_sigma_waits_for_the_descent_to_arrive(options: dict[str, Any]) -> None:
     assert _Landscape(lambda x: np.abs(x)).age(0.0, **options) > 0.7
     assert _Landscape(lambda x: np.ones_like(x)).age(0.0, **options) == 0.0
     assert _Landscape(lambda x: 9 - x * x).age(0.0, **options) == 0.0
-    still = ur.SmoothedDerivatives(0.1, samples=8, schedule=Exponential(1), arrival=True, **options)
+    still = ur.SmoothedDerivatives(0.1, samples=8, schedule=Exponential(1), adaptive_annealing=True, **options)
     parameters = {"x": np.array([3.0])}
     found, _ = still.estimate(bowl.problem, parameters, still.init(bowl.problem, parameters), Key(0))
-    assert found.width == {"x": 0.1}
+    assert found.sigma == {"x": 0.1}
 
 
 def test_sigma_follows_its_schedule() -> None:
@@ -172,11 +172,11 @@ def test_sigma_follows_its_schedule() -> None:
     np.testing.assert_allclose(np.array(seen) / seen[0], [1, 0.5, 0.25, 0.2, 0.2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("together", [True, False])
-def test_products_never_make_a_matrix(together: bool) -> None:
+@pytest.mark.parametrize("joint", [True, False])
+def test_products_never_make_a_matrix(joint: bool) -> None:
     """A step of Newton-CG on 6000 numbers, whose Hessian would take 288 MB."""
     asked = problem(6000)
-    estimator = ur.SmoothedDerivatives(0.05, samples=8, order="hvp", together=together)
+    estimator = ur.SmoothedDerivatives(0.05, samples=8, order="hvp", joint=joint)
     optimizer = ur.optimizers.NewtonCG(iterations=2)
     parameters = asked.initial()
     state, memory = estimator.init(asked, parameters), optimizer.init(parameters)

@@ -48,7 +48,7 @@ def _fr22(_: int) -> tuple[Any, Any]:
 
 def _together(n: int) -> tuple[Any, Any]:
     optimizer = ur.optimizers.NewtonCG(trust_radius=0.5 * math.sqrt(n), iterations=1, line=True)
-    return _smoothed(order="hvp", arrival=True), optimizer
+    return _smoothed(order="hvp", adaptive_annealing=True), optimizer
 
 
 def _search(_: int) -> tuple[Any, Any]:

@@ -112,11 +112,11 @@ def train(task: str, method: str, rate: float, seconds: float, seed: int, sample
     curve, clock = [(0.0, data.error(network))], 0.0
     sigma = SIGMA
 
-    together = method.startswith("OurTogether")
+    joint = method.startswith("OurTogether")
 
     def loss() -> torch.Tensor:
         answers = network(data.pictures)
-        options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "together": together}
+        options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "joint": joint}
         return ur.grey_box.loss(data.losses, answers, sigma, samples, **options).mean()
 
     def gradient_step() -> None:

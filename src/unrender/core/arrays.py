@@ -1,7 +1,7 @@
-"""The few array functions that operators do not give, for NumPy arrays and Dr.Jit arrays alike.
+"""Array functions beyond operators, for NumPy arrays and Dr.Jit arrays alike.
 
-Every formula of `statistics/`, `losses.py` and `optimizers/` is written with operators and with these, so that it is
-tested in NumPy against closed forms and runs unchanged on the device.
+Every formula of `statistics/`, `losses/` and `optimizers/` uses operators and these functions only, so that it is tested in NumPy
+against closed forms and runs unchanged on the device.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = Any
 
 
 def is_drjit(x: Array) -> bool:
-    """Whether `x` lives in Dr.Jit (and so may be lazy, symbolic, on a GPU)."""
+    """Whether `x` is a Dr.Jit array (and so may be lazy, symbolic, on a GPU)."""
     return dr.is_array_v(x)
 
 
@@ -36,7 +36,7 @@ def maximum(a: Array, b: Array) -> Array:
 
 
 def clip(x: Array, low: Array, high: Array) -> Array:
-    """`x` held within [low, high]."""
+    """`x` clamped to [low, high]."""
     return minimum(maximum(x, low), high)
 
 
@@ -90,24 +90,24 @@ def mean(x: Array) -> Array:
     return dr.mean(x, axis=None) if is_drjit(x) else np.mean(x)
 
 
-def mean_first(x: Array) -> Array:
+def mean_over_first(x: Array) -> Array:
     """The mean over the first axis, (n, ...) -> (...), left lazy on Dr.Jit."""
     return dr.mean(x, axis=0) if is_drjit(x) else np.mean(x, axis=0)
 
 
-def mean_rest(x: Array) -> Array:
+def mean_over_rest(x: Array) -> Array:
     """The mean over all axes but the first, (n, ...) -> (n,), left lazy on Dr.Jit."""
     axes = tuple(range(1, len(x.shape)))
     return dr.mean(x, axis=axes) if is_drjit(x) else np.mean(x, axis=axes)
 
 
-def stacked(x: Array) -> Array:
+def add_first_axis(x: Array) -> Array:
     """`x` with a first axis of length 1, (...) -> (1, ...)."""
     return type(x)(x.array, (1, *x.shape)) if is_drjit(x) else x[None]
 
 
-def concatenated(parts: list[Array]) -> Array:
-    """Arrays (n, ...) one behind the other, along their first axis."""
+def concatenate(parts: list[Array]) -> Array:
+    """Arrays (n, ...) concatenated along their first axis."""
     if len(parts) == 1:
         return parts[0]
     return dr.concat(parts, axis=0) if is_drjit(parts[0]) else np.concatenate(parts)
@@ -126,7 +126,7 @@ def scalar(value: float, like: Array) -> Array:
 
 
 def evaluate(*arrays: Any) -> None:
-    """Start the computation of lazy arrays (nothing to do for NumPy). Accepts nested lists, tuples and dicts."""
+    """Start the computation of lazy arrays (no effect on NumPy). Accepts nested lists, tuples and dicts."""
     dr.eval(*arrays)
 
 
@@ -136,11 +136,11 @@ def numpy(x: Array) -> np.ndarray:
 
 
 def owned(values: Array, kind: type) -> Array:
-    """A flat Dr.Jit array of type `kind` (32 bits an element) with the elements of `values`, in memory of its own.
+    """A one-dimensional Dr.Jit array of type `kind` (32 bits an element) with the elements of `values`, in memory of its own.
 
-    Dr.Jit borrows NumPy's memory where it can. What is written there later would change the array, frozen kernels read stale
-    texels or abort (Dr.Jit 1.5), and kernels are compiled once for memory that starts on a multiple of 64 bytes and once more for
-    any other, which in NumPy is chance. So the elements are laid on such a multiple, and copied by one and the same kernel.
+    Dr.Jit borrows NumPy's memory where it can. Later writes to it would change the array, frozen kernels read stale texels or abort
+    (Dr.Jit 1.5), and kernels are compiled once for memory aligned to 64 bytes and once more for any other, which in NumPy is
+    chance. So the elements are copied to aligned memory, and from there by one and the same kernel.
     """
     given = np.ravel(values)
     room = np.empty(given.size + 16, np.uint32 if dr.is_integral_v(kind) else np.float32)
@@ -166,7 +166,7 @@ def number(x: Array) -> float:
 
 
 def like_integers(values: np.ndarray, like: Array) -> Array:
-    """Whole numbers in [0, 2**32) in the form that indexes arrays such as `like`: `np.uint32`, or Dr.Jit's UInt32 in memory of its own."""
+    """Integers in [0, 2**32) of the type that indexes arrays such as `like`: `np.uint32`, or Dr.Jit's UInt32 in memory of its own."""
     if not is_drjit(like):
         return np.ascontiguousarray(values, np.uint32)
     return owned(values, dr.uint32_array_t(dr.array_t(like)))
@@ -190,7 +190,7 @@ def gather(x: Array, index: Array) -> Array:
 
 
 def searchsorted(ascending: Array, values: Array) -> Array:
-    """For each value the index of the last element of `ascending` that is not above it; the first element must not be."""
+    """For each value, the index of the last element of `ascending` that is at most the value; the first element must be."""
     if not is_drjit(ascending):
         return (np.searchsorted(ascending, values, side="right") - 1).astype(np.uint32)
     kind = type(values)
@@ -199,26 +199,26 @@ def searchsorted(ascending: Array, values: Array) -> Array:
 
 
 def arange(like: Array, count: int) -> Array:
-    """0, 1, 2, ..., whole numbers that index arrays such as `like`."""
+    """0, 1, 2, ..., integers of the type that indexes arrays such as `like`."""
     return (
         dr.arange(dr.uint32_array_t(dr.array_t(like)), count) if is_drjit(like) else np.arange(count, dtype=np.uint32)
     )
 
 
 def integer(value: int, like: Array) -> Array:
-    """A whole number in [0, 2**32) that changes from step to step, in a form that does not compile a new kernel each time."""
+    """An integer in [0, 2**32) that changes from step to step, in a form that does not compile a new kernel each time."""
     return dr.opaque(dr.uint32_array_t(dr.array_t(like)), value) if is_drjit(like) else np.uint32(value)
 
 
 def random_integers(like: Array, seed: int, count: int, below: int) -> Array:
-    """`count` whole numbers, uniform in [0, below)."""
+    """`count` integers, uniform in [0, below)."""
     if not is_drjit(like):
         return np.random.default_rng(seed).integers(below, size=count, dtype=np.uint32)
     return dr.rng(seed).integers(dr.uint32_array_t(dr.array_t(like)), count, 0, below)
 
 
 def random_below(bounds: Array, like: Array, seed: int) -> Array:
-    """For each whole number one that is uniform below it."""
+    """For each bound, an integer uniform in [0, bound)."""
     if not is_drjit(like):
         return np.random.default_rng(seed).integers(bounds, dtype=np.uint32)
     kind = type(bounds)

@@ -22,7 +22,7 @@ class Key:
     Args:
         seed: the run's seed, any integer.
         step: the step of the run, from 0.
-        stream: which of the step's independent draws; `fold` makes further ones.
+        stream: which of the step's independent streams of draws; `fold` derives further ones.
     """
 
     seed: int = 0

@@ -1,4 +1,4 @@
-"""Trees as one vector on the host, for optimizers that look at all parameters at once."""
+"""Parameter trees as one vector on the host, for optimizers that treat all parameters jointly."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def unravel(vector: np.ndarray, like: Tree) -> Tree:
     return found
 
 
-def spread(numbers: Mapping[str, float], like: Tree) -> np.ndarray:
+def repeat_per_element(numbers: Mapping[str, float], like: Tree) -> np.ndarray:
     """One number per parameter, repeated for its elements, (n,)."""
     return np.concatenate([np.full(math.prod(arrays.shape(x)), float(numbers[key])) for key, x in like.items()])
 

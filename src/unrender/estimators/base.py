@@ -3,59 +3,114 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from unrender.core import arrays, trees
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.estimators.capabilities import (
+    Capability,
+    Hessian,
+    HessianProduct,
+    LossFunction,
+    Smoothing,
+    Variance,
+)
 from unrender.problem.problem import Problem
 
-GRADIENT = "gradient"
-VARIANCE = "variance"
-HESSIAN = "hessian"
-HVP = "hvp"
-LOSSES = "losses"
+__all__ = ["Estimate", "Estimator", "as_numpy"]
+
+C = TypeVar("C", bound=Capability)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One step's knowledge of the loss around the current parameters.
+    """The loss and its derivatives at the current parameters, as estimated in one step.
 
     Attributes:
         loss: of this step's samples (biased upward by their noise).
-        gradient: {key: array}, the parameters' keys and shapes.
-        variance: of `gradient`, per element; None where the estimator provides none.
-        hessian: (n, n) over all parameters flattened in key order, or None.
-        hvp: the product of the Hessian with a tree, or None.
-        losses: the loss at many points at once, (B, n) to (B,) NumPy arrays over all parameters flattened in key order, every point
-            with this step's random numbers; or None.
-        width: {key: σ}, how far around the parameters the derivatives tell of the loss, where they are smoothed; None where they are local.
-            Trust regions are measured in it.
+        gradient: {key: array}, the parameters' keys and shapes; {} from estimators that compute none.
+        capabilities: what else was computed, at most one of each type; library code reads it by `get` and `require`, which return
+            typed values.
         info: for people: samples traced, control weights, images. Never read back.
-        preconditioned: whether `gradient` and `variance` are already those of u, where a parameter with a preconditioner S is
-            x = S u: estimators that remember per element must do so in the coordinates of the descent.
+        preconditioned: whether `gradient` and its variance are already those of u, where a parameter with a preconditioner S is
+            x = S u: estimators with a per-element state keep it in the coordinates of the descent.
     """
 
     loss: float
     gradient: Tree
-    variance: Tree | None = None
-    hessian: Array | None = None
-    hvp: Callable[[Tree], Tree] | None = None
-    losses: Callable[[np.ndarray], np.ndarray] | None = None
-    width: Mapping[str, float] | None = None
+    capabilities: tuple[Capability, ...] = ()
     info: Mapping[str, Any] = field(default_factory=dict)
     preconditioned: bool = False
+
+    def get(self, kind: type[C]) -> C | None:
+        """The capability of this type; None where it was not computed."""
+        return next((found for found in self.capabilities if isinstance(found, kind)), None)
+
+    def require(self, owner: str, kind: type[C]) -> C:
+        """The capability of this type. Raises `InputError` that names `owner` where it was not computed."""
+        if (found := self.get(kind)) is None:
+            raise InputError(f'{owner} requires "{kind.name}", which this estimate does not have')
+        return found
+
+    @property
+    def variance(self) -> Tree | None:
+        """Variance of `gradient` per element, {key: array}; None where it was not computed."""
+        found = self.get(Variance)
+        return None if found is None else found.values
+
+    @property
+    def hessian(self) -> Array | None:
+        """(n, n) over all parameters flattened in key order; None where it was not computed."""
+        found = self.get(Hessian)
+        return None if found is None else found.matrix
+
+    @property
+    def hvp(self) -> Callable[[Tree], Tree] | None:
+        """The product of the Hessian with a tree; None where there is none."""
+        found = self.get(HessianProduct)
+        return None if found is None else found.apply
+
+    @property
+    def losses(self) -> Callable[[np.ndarray], np.ndarray] | None:
+        """The loss at points (B, n), as (B,), all with this step's random numbers; None where there is no such function."""
+        found = self.get(LossFunction)
+        return None if found is None else found.evaluate
+
+    @property
+    def sigma(self) -> Mapping[str, float] | None:
+        """{key: σ} of the Gaussian that the derivatives are smoothed by; None where they are not smoothed."""
+        found = self.get(Smoothing)
+        return None if found is None else found.sigma
+
+
+def as_numpy(estimate: Estimate) -> Estimate:
+    """The same estimate, its gradient, variance and Hessian as NumPy arrays."""
+
+    def convert(capability: Capability) -> Capability:
+        match capability:
+            case Variance(values):
+                return Variance(trees.numpy(values))
+            case Hessian(matrix):
+                return Hessian(arrays.numpy(matrix))
+        return capability
+
+    converted = tuple(convert(capability) for capability in estimate.capabilities)
+    return replace(estimate, gradient=trees.numpy(estimate.gradient), capabilities=converted)
 
 
 class Estimator(Protocol):
     """A way to estimate the loss gradient. Immutable; all that changes is in the state."""
 
     @property
-    def provides(self) -> frozenset[str]:
-        """Subset of {"gradient", "variance", "hessian", "hvp", "losses"}."""
+    def provides(self) -> AbstractSet[str]:
+        """What its estimates have: `Capabilities` of types, e.g. `Capabilities(Gradient, Variance)`; reads as a set of names."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:

@@ -1,4 +1,4 @@
-"""The loss as a function that can be evaluated anywhere, and nothing else."""
+"""The loss as a function of the parameters, without derivatives."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ import numpy as np
 from unrender.core import arrays, checks, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import LOSSES, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
 
+__all__ = ["BlackBox", "LossState", "LossValues"]
+
 
 @dataclass(frozen=True)
 class LossState:
-    """Nothing is kept."""
+    """Empty: there is no state."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,9 @@ class LossValues:
         checks.integer("LossValues", "spp", self.spp, at_least=1)
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """The loss at any points."""
-        return frozenset({LOSSES})
+        return Capabilities(LossFunction)
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
         """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
@@ -47,17 +50,17 @@ class LossValues:
         return LossState()
 
     def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
-        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those that the optimizer asks for
-        included), "images" per view."""
+        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those of the optimizer's
+        evaluations included), "images" per view."""
         box = BlackBox(problem, parameters, self.spp, key)
-        return Estimate(box.here(), {}, losses=box.losses, info=box.info), state
+        return Estimate(box.center(), {}, (LossFunction(box.losses),), box.info), state
 
 
 class BlackBox:
     """The problem's loss at any points, all with the same random numbers.
 
-    The loss at the parameters themselves is rendered once, beside the first points that are asked for: launches of small pictures cost
-    as much as what is in them.
+    The loss at the parameters themselves is rendered once, in one batch with the first points that are asked for: for small images the
+    overhead of a launch exceeds the cost of its content.
 
     Args:
         problem: whose scene.
@@ -73,33 +76,34 @@ class BlackBox:
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
         self.info: dict[str, Any] = {"samples": 0}
         self._theta = vectors.ravel(parameters)
-        self._here: float | None = None
+        self._center: float | None = None
 
     def losses(self, points: np.ndarray) -> np.ndarray:
-        """(B, n), all parameters flattened in key order, to (B,). Points outside the bounds count as the nearest inside.
+        """The loss at points (B, n), all parameters flattened in key order, as (B,). Points are projected onto the bounds.
 
         Unbiased for the expected loss of images with this noise.
         """
         if len(points) == 1 and np.array_equal(points[0], self._theta):
-            return np.array([self.here()])
-        if self._here is not None:
-            return self._losses(points)[0]
-        return self._with_here(points)[1:]
+            return np.array([self.center()])
+        if self._center is not None:
+            return self._evaluate(points)[0]
+        return self._evaluate_with_center(points)[1][1:]
 
-    def here(self) -> float:
+    def center(self) -> float:
         """The loss at the parameters themselves."""
-        if self._here is None:
-            self._with_here(np.empty((0, self._theta.size)))
-        assert self._here is not None
-        return self._here
+        if self._center is None:
+            return self._evaluate_with_center(np.empty((0, self._theta.size)))[0]
+        return self._center
 
-    def _with_here(self, points: np.ndarray) -> np.ndarray:
-        losses, images = self._losses(np.concatenate([self._theta[None], points]))
+    def _evaluate_with_center(self, points: np.ndarray) -> tuple[float, np.ndarray]:
+        """The loss at the parameters, and at the parameters and `points` (B, n) in one array (1 + B,)."""
+        losses, images = self._evaluate(np.concatenate([self._theta[None], points]))
         self.info["images"] = {view: image[0] for view, image in images.items()}
-        self._here = float(losses[0])
-        return losses
+        self._center = float(losses[0])
+        return self._center, losses
 
-    def _losses(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
+    def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
+        """The losses (B,) and, per view, the images (B, H, W, 3)."""
         renderer, bounds = self.problem.renderer, self.problem.bounds
         session = renderer.prepare(list(self.parameters), None, derivatives=False)
         stacked = {key: project(x, *bounds[key]) for key, x in vectors.parts(points, self.parameters).items()}

@@ -1,4 +1,4 @@
-"""Meta-estimation: a gradient that remembers its past, moved along by finite differences, and knows its variance."""
+"""Meta-estimation: a gradient estimate that combines all earlier ones, updated by finite differences, with its own variance."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
@@ -20,7 +21,10 @@ from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 from unrender.statistics import meta
 
+__all__ = ["MetaEstimator", "MetaState"]
+
 _PROPORTIONAL, _DIFFERENCE, _OBSERVED = 0, 1, 2  # streams of a step's key
+_PROPORTIONAL_SPP, _DIFFERENCE_SPP, _COUPLED_SPP = 2, 1, 3
 
 
 @dataclass(frozen=True)
@@ -29,15 +33,17 @@ class MetaState:
 
     Attributes:
         parameters: of the last step; None before the first.
-        elements: {key: what is known of each element of its gradient}; empty before the first step.
+        elements: {key: meta-estimate and statistics of each element of its gradient}; empty before the first step.
         image: the image estimator's, in the coupled form.
         pixels: the pixel sampler's.
+        step: how many steps were made; see `PairRequest.step`.
     """
 
     parameters: Tree | None
     elements: dict[str, meta.State]
     image: Any
     pixels: Any = None
+    step: int = 0
 
 
 @dataclass(frozen=True)
@@ -46,42 +52,42 @@ class MetaEstimator:
 
     The independent form is the paper's. F comes from `proportional_spp` samples per pixel. ΔF comes from `difference_spp`
     others: one set of paths, traced in the current scene, gives the images and the adjoints of both states, and the loss
-    derivative of each state comes from a pair of images that knows nothing of those paths (the other groups of the same
-    samples; for one sample per pixel, a pair of its own).
+    derivative of each state comes from a pair of images independent of those paths (the other sample groups; for one sample per
+    pixel, a pair of its own).
 
-    The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and writes
-    M = F + w (M − H), with w from their covariance: each sample serves both terms, for little more than a plain one costs. With
-    `image=RecursiveControlVariate()` the images that the loss sees remember too, from the same passes.
+    The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and computes
+    M = F + w (M − H), with w from their covariance: each sample serves both terms, at little more than the cost of a plain one. With
+    `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes.
 
     In path space the two states share directions, weighted by the current state's density: the paper's shift mapping, which
     reuses BSDF samples, in the solid angle measure, where its Jacobian is one. Var ΔF then falls with the square of the step.
-    Where any parameter moves geometry, a path of one state is none of the other, and the whole difference is taken in
+    Where any parameter moves geometry, a path of one state is not valid in the other, and the whole difference is taken in
     primary sample space, from the same random numbers: `info["space"]` says which was taken, for each parameter.
 
     Gradient and variance are those of u where a parameter with a preconditioner S is x = S u (`Estimate.preconditioned`): a
     variance per element does not pass through S.
 
     Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does not
-    depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α knows the
-    samples that it weighs, which pulls the gradient toward zero, most at the start. The variance is that of the recurrence (15):
-    zero-centred, so too large where the gradient stands out of the noise of one step. On a control variate's images, successive
-    steps share the image's memory besides, which the recurrence does not know of: biased as that image is, and somewhat noisier
-    than its variance says. The memory starts anew when a parameter changes its shape.
+    depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α
+    depends on the samples that it weighs, which biases the gradient toward zero, most at the start. The variance is that of the
+    recurrence (15): a zero-centred second moment, so too large where the gradient exceeds the noise of one step. With a control
+    variate, successive steps also share its image, which the recurrence does not model: the gradient is biased as that image is, and
+    somewhat noisier than its variance says. The state starts anew when a parameter changes its shape.
 
     Args:
         proportional_spp: samples per pixel and view of F in the independent form, >= 1; 2 where none is given.
         difference_spp: of ΔF in the independent form, >= 1; 1 where none is given.
         coupled: take the coupled form.
         spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
-        image: what the loss sees, in the coupled form; the independent one sees plain renderings.
-        pixels: which pixels a step looks at; F and ΔF of the independent form draw their own. Drawn ones go with plain images.
-        space: "path", "primary", or "auto": path space where it carries all parameters.
+        image: estimates the image that the loss sees, in the coupled form; the independent form uses plain images.
+        pixels: the pixels of a step; F and ΔF of the independent form draw their own. Mini-batches go with plain images.
+        space: "path", "primary", or "auto": path space where all parameters share paths.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
         clip: hold α below 1 / (2 − α_{i-1}) (Eq. 17).
         centred: variances about the mean in place of mean squares. For comparison (Fig. 5).
         decouple: divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
-        statistics: "shared" learns variances from the samples that it sums; "independent" from as many more, at twice the cost.
+        statistics: "shared" estimates variances from the samples that it sums; "independent" from as many more, at twice the cost.
     """
 
     proportional_spp: int | None = None
@@ -100,9 +106,9 @@ class MetaEstimator:
 
     def __post_init__(self):
         for name, coupled, default in (
-            ("proportional_spp", False, 2),
-            ("difference_spp", False, 1),
-            ("spp", True, 3),
+            ("proportional_spp", False, _PROPORTIONAL_SPP),
+            ("difference_spp", False, _DIFFERENCE_SPP),
+            ("spp", True, _COUPLED_SPP),
         ):
             given = getattr(self, name)
             if given is not None:
@@ -128,7 +134,7 @@ class MetaEstimator:
         check_pixels("MetaEstimator", self.pixels, self.image)
         if not isinstance(self.pixels, All) and not isinstance(self.image, Plain):
             raise InputError(
-                "MetaEstimator: drawn pixels go with plain images; a control variate's snapshot is of another step"
+                "MetaEstimator: pixel mini-batches go with plain images; a control variate's snapshot is of another step"
             )
         if self.image.space is not None and self.space not in ("auto", self.image.space):
             raise InputError(
@@ -136,18 +142,18 @@ class MetaEstimator:
             )
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """A gradient and its variance."""
-        return frozenset({GRADIENT, VARIANCE})
+        return Capabilities(Gradient, Variance)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that the space cannot carry."""
+        """See `Estimator.init`. Raises `InputError` for a parameter whose values share no paths, with `space="path"`."""
         problem.renderer.prepare(list(parameters), self._space(problem, parameters))
         return MetaState(None, {}, self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space" and
-        "alpha" (the weight of the past) per parameter, and what the image estimator tells, per view."""
+        "alpha" (the weight of the past) per parameter, and the info of the image estimator, per view."""
         fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
         if fresh or state.parameters is None:
             elements, previous = {name: meta.init(x) for name, x in parameters.items()}, parameters
@@ -157,7 +163,7 @@ class MetaEstimator:
             moved = trees.subtract(parameters, previous)
             step_norm = arrays.sqrt(sum(arrays.total(x * x) for x in moved.values()))
         space = self._space(problem, parameters)
-        pair_request = PairRequest(previous, space)
+        pair_request = PairRequest(previous, space, state.step)
         take = self._coupled if self.coupled else self._independent
         first, second, step, pixels = take(problem, parameters, state, pair_request, fresh, key)
         observed, samples = None, step.samples
@@ -182,7 +188,8 @@ class MetaEstimator:
             for name in parameters
         }
         gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
-        after = MetaState(parameters, {name: parts[3] for name, parts in found.items()}, step.image, pixels)
+        elements = {name: parts[3] for name, parts in found.items()}
+        after = MetaState(parameters, elements, step.image, pixels, state.step + 1)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
         info = {
             "samples": samples,
@@ -192,7 +199,7 @@ class MetaEstimator:
             **step.info,
         }
         loss = sum(arrays.number(value) for value in step.losses)
-        return Estimate(loss, gradient, variance, preconditioned=True, info=info), after
+        return Estimate(loss, gradient, (Variance(variance),), info, preconditioned=True), after
 
     def _space(self, problem: Problem, parameters: Tree) -> Space:
         if self.space != "auto":
@@ -205,29 +212,23 @@ class MetaEstimator:
     def _independent(
         self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, ΔF from other samples, what else the step brought, and the pixel sampler's next state."""
-        assert self.proportional_spp is not None
-        assert self.difference_spp is not None
-        step, pixels = self._gather(problem, parameters, state, self.proportional_spp, key.fold(_PROPORTIONAL))
+        """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state."""
+        spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
+        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL))
         F = problem.precondition(step.gradient)
         if fresh:  # no change to be estimated
             return F, trees.zeros_like(F), step, pixels
         again = replace(state, pixels=pixels)
-        pair, pixels = self._gather(
-            problem, parameters, again, self.difference_spp, key.fold(_DIFFERENCE), pair_request
-        )
-        assert pair.previous is not None
+        pair, pixels = self._gather(problem, parameters, again, difference_spp, key.fold(_DIFFERENCE), pair_request)
         difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
         return F, difference, replace(step, samples=step.samples + pair.samples), pixels
 
     def _coupled(
         self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, H of the previous state from the same samples, and the rest as for `_independent`."""
+        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state."""
         del fresh
-        assert self.spp is not None
-        step, pixels = self._gather(problem, parameters, state, self.spp, key, pair_request)
-        assert step.previous is not None
+        step, pixels = self._gather(problem, parameters, state, self.spp or _COUPLED_SPP, key, pair_request)
         return problem.precondition(step.gradient), problem.precondition(step.previous), step, pixels
 
     def _gather(

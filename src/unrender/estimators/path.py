@@ -1,4 +1,4 @@
-"""The gradient by path replay, weighted by the loss derivative of an image that knows nothing of those paths."""
+"""The gradient by path replay, weighted by the loss derivative at an image from independent samples."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.problem import Problem
+
+__all__ = ["PathGradient", "PathGradientState"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class PathGradientState:
     Attributes:
         image: the image estimator's.
         pixels: the pixel sampler's.
-        batches: steps of drawn pixels since the last that looked at whole views.
+        batches: steps with pixel mini-batches since the last that rendered whole views.
     """
 
     image: Any
@@ -37,23 +40,23 @@ class PathGradientState:
 class PathGradient:
     """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).
 
-    Independence comes from crossing: each pixel's samples form groups (halves at 2 spp), and the adjoint of each group is
-    weighted by the loss derivative at the image of all the others. Two traces serve what the usual loop traces three times. With a
-    control variate the groups' images share the memory, which is independent of them all. For noise that dominates, G groups have
-    G / (G - 1) times the variance of an adjoint on paths of its own, so there are as many as samples, up to 16.
+    Independence comes from leave-one-out sample groups (dual buffers at 2 spp): the adjoint of each group is weighted by the loss
+    derivative at the image of all other groups. That takes two traces where the usual loop takes three. With a control variate the
+    groups' images share the control variate, which is independent of them all. Where noise dominates, G groups have G / (G - 1)
+    times the variance of an adjoint on paths of its own, so there are as many as samples, up to 16.
 
     Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image; otherwise biased by the noise of
     the image that the loss sees, which a control variate reduces step by step.
 
-    With drawn pixels (Eq. 4 of the paper of `pixels.Adaptive`) each draw brings its samples, weighted by 1 / (N p): unbiased as the
-    gradient of all pixels is, for whatever probabilities.
+    With pixel mini-batches (Eq. 4 of the paper of `pixels.Adaptive`) each pixel's samples are weighted by 1 / (N p): as unbiased as the
+    gradient of all pixels, for any positive probabilities.
 
     Args:
-        image: what the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
-        pixels: which pixels a step looks at: `pixels.All()`, or a number drawn by `Uniform`, `LossProportional` or `Adaptive`.
-        spp: samples per pixel and view of the image, or per drawn pixel, >= 1.
-        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for crossed groups, and for `spp` paths of
-            its own where `spp` cannot be cut into groups: 1, and primes above 16.
+        image: estimates the image that the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
+        pixels: the pixels of a step: `pixels.All()`, or a mini-batch by `Uniform`, `LossProportional` or `Adaptive`.
+        spp: samples per pixel and view of the image, or per pixel of the mini-batch, >= 1.
+        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for leave-one-out groups, and for `spp` paths of
+            its own where `spp` cannot be divided into groups: 1, and primes above 16.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -68,13 +71,13 @@ class PathGradient:
         check_pixels("PathGradient", self.pixels, self.image)
 
     @property
-    def provides(self) -> frozenset[str]:
+    def provides(self) -> Capabilities:
         """A gradient."""
-        return frozenset({GRADIENT})
+        return Capabilities(Gradient)
 
     @property
     def groups(self) -> int:
-        """How many groups are crossed; 1 where the adjoint has paths of its own."""
+        """How many leave-one-out sample groups there are; 1 where the adjoint has paths of its own."""
         return leave_one_out_groups(self.spp, self.adjoint_spp)
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
@@ -85,14 +88,14 @@ class PathGradient:
     def estimate(
         self, problem: Problem, parameters: Tree, state: PathGradientState, key: Key
     ) -> tuple[Estimate, PathGradientState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and what the
-        image estimator tells, per view that was looked at whole, "pixel_probability" per view where pixels are drawn."""
+        """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
+        the info of the image estimator, per view that was rendered whole, "pixel_probability" per view of a mini-batch."""
         batch, pixels = MiniBatch(None), state.pixels
         if not self.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp, batch=batch)
         pixels = self.pixels.observe(problem, pixels, step.gradient)
-        whole, image = batch.draw is None, step.image
+        whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):
             image = self.image.prepare(problem, image)
         next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1)

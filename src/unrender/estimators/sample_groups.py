@@ -1,9 +1,11 @@
-"""What all gradient estimators by path replay do with each frame, a view or a batch of pixels: image, loss derivative, adjoint; of one
-state, or of two on one set of paths."""
+"""Image, loss derivative and adjoint of each frame, a view or a pixel mini-batch, with leave-one-out sample groups; of one state, or of
+two on one set of paths."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Protocol, runtime_checkable
 
 from unrender.core import trees
@@ -14,12 +16,14 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
-from unrender.problem.batches import PixelBatch, WholeView, whole_views
+from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
+__all__ = ["PIXELS", "GradientSample", "check_pixels", "gather", "leave_one_out_groups"]
+
 PIXELS = 1 << 32
-"""The stream of a step's key that draws its pixels; those below are its frames'."""
+"""The stream of a step's key that draws its pixels; the streams below are its frames'."""
 
 _MOST_GROUPS = 16
 
@@ -30,20 +34,20 @@ class _PixelSampler(PixelSampler, Protocol): ...
 
 @dataclass(frozen=True)
 class GradientSample:
-    """What one step's paths tell, over all frames.
+    """The gradient estimate of one step's paths, over all frames.
 
     Attributes:
         gradient: of the loss with respect to the current parameters.
-        previous: that of the previous state, with respect to its own; None where it was not asked for.
+        previous: of the loss at the previous parameters with respect to them, from the same paths; {} where it was not requested.
         losses: of the current state, one per frame, lazy.
-        images: of the current state, per whole view, as the loss saw them.
-        samples: paths traced for images, adjoints and the pick.
-        told: what the image estimator tells of whole views, and the pick of its probabilities, {name: {view: array}}.
+        images: of the current state, per whole view, as the loss sees them.
+        samples: paths traced for images, adjoints and the probabilities of pixels.
+        info: for people, {name: {view: array}}: of the image estimator for whole views, and of the pixels' probabilities.
         image: the image estimator's next state.
     """
 
     gradient: Tree
-    previous: Tree | None
+    previous: Tree
     losses: list[Array]
     images: dict[int, Array]
     samples: int
@@ -52,12 +56,12 @@ class GradientSample:
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
-    """How many groups `spp` samples are cut into; 1 where they cannot be, or the adjoint has paths of its own."""
+    """How many groups `spp` samples are divided into; 1 where they cannot be, or where the adjoint has paths of its own."""
     return 1 if adjoint_spp is not None else max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
 
 
 def check_pixels(owner: str, pixels: Any, image: ImageEstimator) -> None:
-    """Raise `InputError` for what is no pixel sampler, or one that draws pixels where the image must be whole."""
+    """Raise `InputError` for what is no pixel sampler, or for mini-batches where the image estimator needs whole views."""
     if isinstance(pixels, type) or not isinstance(pixels, _PixelSampler):
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
@@ -77,50 +81,77 @@ def gather(
 ) -> GradientSample:
     """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
 
-    A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, the previous state's
-    gradient too, on the same paths and weighted by its own images: the noise of the two is as much alike as the space allows, and
-    their difference is a finite difference of gradients. With a `batch` of pixels, of these alone, in one launch for all views; the image
-    estimator's state advances where whole views were looked at.
+    A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, also the gradient
+    of the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space
+    allows, and their difference is a finite difference of gradients. With a pixel mini-batch, of its pixels alone, in one launch for
+    all views; the image estimator's state advances where whole views are rendered.
     """
-    drawn = batch is not None and batch.draw is not None
-    frames = whole_views(problem)
-    if batch is not None and batch.draw is not None:
-        frames = [PixelBatch(problem, batch.draw)]
+    sample = batch.sample if batch else None
+    frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
+    parts = [
+        _gather_frame(problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request)
+        for index, frame in enumerate(frames)
+    ]
+    info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
+    images: dict[int, Array] = {}
+    for frame, part in zip(frames, parts, strict=True):
+        if isinstance(frame, WholeView):
+            images[frame.view] = part.image
+            for name, value in part.info.items():
+                info.setdefault(name, {})[frame.view] = value
+    return GradientSample(
+        gradient=reduce(trees.add, [part.gradient for part in parts]),
+        previous=reduce(trees.add, [part.previous for part in parts]),
+        losses=[part.loss for part in parts],
+        images=images,
+        samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
+        info=info,
+        image=image.advance(parameters, state, tuple(part.kept for part in parts)) if sample is None else state,
+    )
+
+
+@dataclass(frozen=True)
+class _FrameGradient:
+    """The part of one frame in a `GradientSample`; `kept` is its contribution to the image estimator's next state."""
+
+    gradient: Tree
+    previous: Tree
+    loss: Array
+    image: Array
+    samples: int
+    info: Mapping[str, Any]
+    kept: Any
+
+
+def _gather_frame(
+    problem: Problem,
+    parameters: Tree,
+    image: ImageEstimator,
+    state: Any,
+    frame: Frame,
+    spp: int,
+    key: Key,
+    adjoint_spp: int | None,
+    pair_request: PairRequest | None,
+) -> _FrameGradient:
     groups = leave_one_out_groups(spp, adjoint_spp)
     session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
-    gradient: Tree = {}
-    previous: Tree | None = None
-    losses: list[Array] = []
-    kept: list[Any] = []
-    images: dict[int, Array] = {}
-    info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
-    samples = batch.samples if batch else 0
-    for index, frame in enumerate(frames):
-        key_frame = key.fold(index)
-        found, keep = image.estimate(problem, parameters, state, frame, spp, groups, key_frame.fold(0), pair_request)
-        kept.append(keep)
-        picture = found.mean()
-        losses.append(frame.loss_value(picture))
-        paths, traced = found.paths, spp
-        if groups == 1:
-            request = frame.request(adjoint_spp or spp, key_frame.fold(1).uint32())
-            paths = _paths(session, parameters, request, pair_request)
-            traced += request.spp
-        weights = frame.loss_derivative(found.others())
-        if pair_request is None:
-            part = session.adjoint(parameters, paths, weights)
-        else:
-            weights_previous = frame.loss_derivative(found.previous_others())
-            part, other = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
-            previous = other if previous is None else trees.add(previous, other)
-        gradient = trees.add(gradient, part) if gradient else part
-        samples += traced * frame.pixels
-        if isinstance(frame, WholeView):
-            images[frame.view] = picture
-            for name, value in found.info.items():
-                info.setdefault(name, {})[frame.view] = value
-    after = state if drawn else image.advance(parameters, state, tuple(kept))
-    return GradientSample(gradient, previous, losses, images, samples, info, after)
+    found, kept = image.estimate(problem, parameters, state, frame, spp, groups, key.fold(0), pair_request)
+    mean = found.mean()
+    loss = frame.loss_value(mean)
+    paths, traced = found.paths, spp
+    if groups == 1:
+        request = frame.request(adjoint_spp or spp, key.fold(1).uint32())
+        paths = _paths(session, parameters, request, pair_request)
+        traced += request.spp
+    weights = frame.loss_derivative(found.others())
+    previous: Tree = {}
+    if pair_request is None:
+        gradient = session.adjoint(parameters, paths, weights)
+    else:
+        weights_previous = frame.loss_derivative(found.previous_others())
+        gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
+    return _FrameGradient(gradient, previous, loss, mean, traced * frame.pixels, found.info, kept)
 
 
 def _paths(session: RenderSession, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:

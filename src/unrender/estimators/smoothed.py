@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -14,13 +14,24 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, HESSIAN, HVP, LOSSES, VARIANCE, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import (
+    Capabilities,
+    Capability,
+    Gradient,
+    Hessian,
+    HessianProduct,
+    LossFunction,
+    Smoothing,
+    Variance,
+)
 from unrender.estimators.loss_values import BlackBox
 from unrender.problem.problem import Problem
 from unrender.schedules.functions import Schedule
+from unrender.smoothing.function import estimate_gradient, estimate_hessian, estimate_hvp
+from unrender.smoothing.options import SamplingOptions
 
-_Derivatives = tuple[tuple[np.ndarray, np.ndarray], Callable[[], np.ndarray], Callable[[np.ndarray], np.ndarray]]
-"""Gradient with standard error, what makes the Hessian, what makes its product with a vector."""
+__all__ = ["SmoothedDerivatives", "SmoothedState"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class SmoothedState:
     """State between steps.
 
     Attributes:
-        age: what the schedule of σ is asked for: the steps made or, with `arrival`, the sum of how far each had arrived.
+        age: the argument of the schedule of σ: the steps made or, with `adaptive_annealing`, the sum of their convergence measures.
     """
 
     age: float = 0.0
@@ -38,12 +49,12 @@ class SmoothedState:
 class SmoothedDerivatives:
     """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of deviation σ.
 
-    The renderer is a black box: no derivative of it is asked for, so plateaus, silhouettes, shadows and poses (`rendering/poses.py`)
-    count. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not of
-    the noise. Perturbed parameters are moved into their bounds before they are rendered.
+    The renderer is a black box, never differentiated, so plateaus, silhouettes, shadows and poses (`rendering/mitsuba/poses.py`) are
+    included. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not
+    of the noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
     Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss; but
-    products that are not `together` have the bias of their central difference (`smoothed.hvp`).
+    products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
 
     Args:
         sigma: σ in units of the parameters, > 0: one number, or {key: number}, where "*" stands for all keys that are not named.
@@ -52,20 +63,20 @@ class SmoothedDerivatives:
         aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
         product: every dimension from its own gradient kernel at once, in place of `aggregate`: the gradient of Fischer and
             Ritschel 2023, "FR22" in the paper, whose smoothing is not a Gaussian's; gradients only.
-        together: with "hessian" and "hvp", gradient and curvature from the same renders (`smoothed.together`), so that curvature costs
+        joint: with "hessian" and "hvp", gradient and curvature from the same renders (`smoothed.joint`), so that curvature costs
             nothing. Without, as the paper has it: a Hessian from draws of its own, products by the difference of two gradients, each
             taking twice `samples` renders. `aggregate` and `baseline` are for that.
         antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
-        epsilon: of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): pictures of edges jump, so more than the
+        epsilon: of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): images of edges jump, so more than the
             default there.
         schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.schedules.functions`.
-        arrival: let time stand still for the schedule until the descent arrives: a step counts by how far the loss here is below those
-            of the perturbations around it, which the gradient has rendered anyway: by the mean of the differences over their root mean
-            square, if positive. That is near 1 at a minimum of the smoothed loss (0.6 to 0.8 for one parameter, with noise less),
-            and 0 on a slope or a plateau, of whatever length. So σ shrinks where it is at home and no sooner; half-lives are shorter,
-            e.g. `Exponential(6)`. For few parameters: with many, the bowl in all other directions outweighs the slope in one, and time
-            always passes.
+        adaptive_annealing: let the schedule of σ advance by convergence in place of steps. A step advances it by the mean over the root
+            mean square, if positive, of the losses at the perturbed points less the loss at the parameters, which the gradient has
+            evaluated anyway. That is near 1 at a minimum of the smoothed loss (0.6 to 0.8 for one parameter, with noise less), and 0
+            on a slope or a plateau, of whatever length. So σ shrinks after convergence at the present σ; half-lives are shorter, e.g.
+            `Exponential(6)`. For few parameters: with many, the curvature in all other directions outweighs the slope in one, and the
+            schedule advances at every step.
     """
 
     sigma: float | Mapping[str, float]
@@ -73,14 +84,14 @@ class SmoothedDerivatives:
     order: Literal["gradient", "hessian", "hvp"] = "gradient"
     aggregate: bool = True
     product: bool = False
-    together: bool = True
+    joint: bool = True
     antithetic: bool = True
     baseline: bool = True
     low_discrepancy: bool = False
     spp: int = 4
     epsilon: float = 0.3
     schedule: Schedule | None = None
-    arrival: bool = False
+    adaptive_annealing: bool = False
 
     def __post_init__(self):
         if self.order not in ("gradient", "hessian", "hvp"):
@@ -94,9 +105,16 @@ class SmoothedDerivatives:
         checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
 
     @property
-    def provides(self) -> frozenset[str]:
-        """A gradient with its variance, the loss at any points, and what `order` says."""
-        return frozenset({GRADIENT, VARIANCE, LOSSES, *{"hessian": [HESSIAN], "hvp": [HVP]}.get(self.order, [])})
+    def provides(self) -> Capabilities:
+        """A gradient with its variance and σ, the loss at any points, and what `order` says."""
+        common = (Gradient, Variance, LossFunction)
+        match self.order:
+            case "gradient":
+                return Capabilities(*common)
+            case "hessian":
+                return Capabilities(*common, Hessian)
+            case "hvp":
+                return Capabilities(*common, HessianProduct)
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
         """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed, has a preconditioner, or has no σ."""
@@ -105,7 +123,7 @@ class SmoothedDerivatives:
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
         problem.renderer.prepare(list(parameters), None, derivatives=False)
-        self._widths(parameters)
+        self._sigma_per_parameter(parameters)
         return SmoothedState()
 
     def estimate(
@@ -115,48 +133,69 @@ class SmoothedDerivatives:
         at the parameters themselves."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0))
         factor = self.schedule(state.age) if self.schedule else 1.0
-        width = {k: factor * number for k, number in self._widths(parameters).items()}
-        theta, sigma = vectors.ravel(parameters), vectors.spread(width, parameters)
-        heard: list[np.ndarray] = []
+        sigma = {name: factor * value for name, value in self._sigma_per_parameter(parameters).items()}
+        perturbed: list[np.ndarray] = []
 
-        def listen(points: np.ndarray) -> np.ndarray:
-            heard.append(box.losses(points))
-            return heard[-1]
+        def record_losses(points: np.ndarray) -> np.ndarray:
+            perturbed.append(box.losses(points))
+            return perturbed[-1]
 
-        ask = self._together if self.together and self.order != "gradient" else self._apart
-        (gradient, error), hessian, product = ask(listen, theta, sigma, key.fold(1).uint32())
-        around = np.concatenate(heard)
-        found = Estimate(
-            box.here(),
-            vectors.unravel(gradient, parameters),
-            vectors.unravel(error**2, parameters),
-            hessian() if self.order == "hessian" else None,
-            (lambda v: vectors.unravel(product(vectors.ravel(v)), parameters)) if self.order == "hvp" else None,
-            box.losses,
-            width,
-            info=box.info,
+        point = vectors.ravel(parameters), vectors.repeat_per_element(sigma, parameters)
+        derive = self._joint if self.joint and self.order != "gradient" else self._separate
+        gradient, error, curvature = derive(record_losses, *point, key.fold(1).uint32(), parameters)
+        losses = np.concatenate(perturbed)
+        capabilities = (
+            Variance(vectors.unravel(error**2, parameters)),
+            *curvature,
+            LossFunction(box.losses),
+            Smoothing(sigma),
         )
-        return found, SmoothedState(state.age + (_arrival(around, found.loss) if self.arrival else 1.0))
+        found = Estimate(box.center(), vectors.unravel(gradient, parameters), capabilities, box.info)
+        age = state.age + (_convergence(losses, found.loss) if self.adaptive_annealing else 1.0)
+        return found, replace(state, age=age)
 
-    def _together(self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int) -> _Derivatives:
-        """The gradient with its standard error, and how to get the others: from the same renders."""
-        found = smoothed.together(f, theta, sigma, self.samples, seed, self.low_discrepancy)
-        return found.gradient(), lambda: found.hessian()[0], lambda v: found.hvp(v)[0]
+    def _joint(
+        self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
+    ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
+        """The gradient (n,), its standard error (n,), and the curvature that `order` asks for: all from the same renders."""
+        found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy)
+        return *found.gradient(), self._curvature(lambda: found.hessian()[0], lambda v: found.hvp(v)[0], like)
 
-    def _apart(self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int) -> _Derivatives:
-        """Likewise, each from renders of its own."""
-        point = (f, theta, sigma, self.samples, seed, self.aggregate)
-        options: dict[str, Any] = {"antithetic": self.antithetic, "low_discrepancy": self.low_discrepancy}
-        gradient = smoothed.gradient(*point, product=self.product, baseline=self.baseline, **options)
+    def _separate(
+        self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
+    ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
+        """As `_joint`, each derivative from renders of its own."""
+        options = SamplingOptions(
+            self.samples,
+            seed,
+            self.aggregate,
+            self.antithetic,
+            self.baseline,
+            self.low_discrepancy,
+            self.product,
+            self.epsilon,
+        )
+        gradient, error = estimate_gradient(f, theta, sigma, options)
 
         def product(v: np.ndarray) -> np.ndarray:
-            samples = 2 * self.samples
-            return smoothed.hvp(f, theta, v, sigma, samples, seed, self.aggregate, epsilon=self.epsilon, **options)[0]
+            return estimate_hvp(f, theta, v, sigma, replace(options, samples=2 * self.samples))[0]
 
-        return gradient, lambda: smoothed.hessian(*point, baseline=self.baseline, **options)[0], product
+        curvature = self._curvature(lambda: estimate_hessian(f, theta, sigma, options)[0], product, like)
+        return gradient, error, curvature
 
-    def _widths(self, parameters: Tree) -> dict[str, float]:
-        """σ of each parameter at the start."""
+    def _curvature(
+        self, hessian: Callable[[], np.ndarray], product: Callable[[np.ndarray], np.ndarray], like: Tree
+    ) -> tuple[Capability, ...]:
+        match self.order:
+            case "gradient":
+                return ()
+            case "hessian":
+                return (Hessian(hessian()),)
+            case "hvp":
+                return (HessianProduct(lambda v: vectors.unravel(product(vectors.ravel(v)), like)),)
+
+    def _sigma_per_parameter(self, parameters: Tree) -> dict[str, float]:
+        """σ of each parameter before the schedule. Raises `InputError` for a key that is unknown or missing."""
         if not isinstance(self.sigma, Mapping):
             return dict.fromkeys(parameters, float(self.sigma))
         for key in self.sigma:
@@ -169,8 +208,9 @@ class SmoothedDerivatives:
         return {key: float(self.sigma[key] if key in self.sigma else self.sigma["*"]) for key in parameters}
 
 
-def _arrival(around: np.ndarray, here: float) -> float:
-    """How much better a point is than those around it, 0 to 1: the mean of their losses' differences over its root mean square."""
-    worse = around - here
-    size = float(np.sqrt(np.mean(worse * worse)))
-    return max(0.0, float(np.mean(worse))) / size if size > 0.0 else 0.0
+def _convergence(losses: np.ndarray, center: float) -> float:
+    """How far the descent has converged at the present σ, in [0, 1]: mean over root mean square of `losses` (B,) less the loss at the
+    parameters; 0 where the mean is negative."""
+    differences = losses - center
+    root_mean_square = float(np.sqrt(np.mean(differences * differences)))
+    return max(0.0, float(np.mean(differences))) / root_mean_square if root_mean_square > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""What the loss sees: the image as rendered, or one that remembers."""
+"""Image estimators: what the loss is evaluated at."""
 
 from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain

@@ -1,4 +1,4 @@
-"""What an image estimator is: it makes the image that the loss sees."""
+"""The protocol of image estimators, which estimate the image that the loss is evaluated at."""
 
 from __future__ import annotations
 
@@ -14,60 +14,65 @@ from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
+__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest"]
+
 
 @dataclass(frozen=True)
 class ImageEstimate:
-    """The image of one frame at one step: of a view, (H, W, 3), or of N drawn pixels, (N, 3).
+    """The image of one frame at one step: of a view, (H, W, 3), or of a mini-batch of N pixels, (N, 3).
 
     Attributes:
-        images: (groups, H, W, 3) or (groups, N, 3), one estimate per group of samples, made without the other groups' samples.
-        paths: the renderer's own, to replay these samples.
+        images: (groups, H, W, 3) or (groups, N, 3), one estimate per sample group, independent of the other groups' samples.
+        paths: the renderer's record of the samples, for their replay.
         info: for people, e.g. {"control_weight": array}.
         previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
-        clean: what is done to an image (H, W, 3) before the loss sees it; None for nothing.
+        filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
     """
 
     images: Array
     paths: Any
     info: Mapping[str, Any] = field(default_factory=dict)
     previous: Array | None = None
-    clean: Callable[[Array], Array] | None = None
+    filter: Callable[[Array], Array] | None = None
 
     def mean(self) -> Array:
         """The image of all samples together, (H, W, 3) or (N, 3)."""
-        whole = arrays.mean_first(self.images)
-        return whole if self.clean is None else self.clean(whole)
+        whole = arrays.mean_over_first(self.images)
+        return whole if self.filter is None else self.filter(whole)
 
     def others(self) -> Array:
-        """For each group, the image of all other groups' samples; of its own where it is alone."""
-        return self._cleaned(_others(self.images))
+        """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group."""
+        return self._filtered(_leave_one_out(self.images))
 
     def previous_others(self) -> Array:
         """`others()` of the previous step's parameters."""
-        return self._cleaned(_others(self.previous))
+        return self._filtered(_leave_one_out(self.previous))
 
-    def _cleaned(self, images: Array) -> Array:
-        if self.clean is None:
+    def _filtered(self, images: Array) -> Array:
+        if self.filter is None:
             return images
-        return arrays.concatenated([arrays.stacked(self.clean(images[group])) for group in range(images.shape[0])])
+        filtered = [self.filter(images[group]) for group in range(images.shape[0])]
+        return arrays.concatenate([arrays.add_first_axis(image) for image in filtered])
 
 
-def _others(images: Array) -> Array:
+def _leave_one_out(images: Array) -> Array:
     groups = images.shape[0]
-    return images if groups == 1 else (arrays.mean_first(images) * groups - images) / (groups - 1)
+    return images if groups == 1 else (arrays.mean_over_first(images) * groups - images) / (groups - 1)
 
 
 @dataclass(frozen=True)
 class PairRequest:
-    """The state that is to be rendered beside the current one, from the same samples.
+    """A request for the image of the previous parameters too, from the samples of the current one.
 
     Attributes:
         previous: the parameters of the last step that the estimator took.
-        space: where to share samples, for image estimators without a space of their own.
+        space: in which to share samples, for image estimators without a space of their own.
+        step: how many steps the estimator has taken. Image estimators with a state of earlier steps require it to be their own count.
     """
 
     previous: Tree
     space: Space
+    step: int = 0
 
 
 class ImageEstimator(Protocol):
@@ -75,12 +80,12 @@ class ImageEstimator(Protocol):
 
     @property
     def space(self) -> Space | None:
-        """Where samples are shared between two states, or None if they are not."""
+        """The space in which two states share samples; None where they do not."""
         ...
 
     @property
     def pixelwise(self) -> bool:
-        """Whether it can estimate drawn pixels without all others."""
+        """Whether it can estimate pixel mini-batches."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
@@ -98,17 +103,17 @@ class ImageEstimator(Protocol):
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """The image of one frame, and what is to be kept of it; with `pair_request`, that of the previous parameters too."""
+        """The image of one frame, and its contribution to the next state; with `pair_request`, that of the previous parameters too."""
         ...
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
-        """Whether the next step must look at whole views, where `batches` steps of drawn pixels came after the last that did."""
+        """Whether the next step must render whole views, after `batches` steps of pixel mini-batches since the last that did."""
         ...
 
     def prepare(self, problem: Problem, state: Any) -> Any:
-        """The state after a step that looked at whole views, made ready for drawn pixels."""
+        """The state after a step that rendered whole views, prepared for pixel mini-batches."""
         ...
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:
-        """The state after a step at `parameters` that looked at whole views, from what was kept of each."""
+        """The state after a step at `parameters` that rendered whole views, from the contributions of each."""
         ...

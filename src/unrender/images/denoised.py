@@ -1,4 +1,4 @@
-"""An image without its noise, and with a denoiser's error in its place."""
+"""Denoised images for the loss."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
+__all__ = ["Denoised"]
+
 
 @dataclass(frozen=True)
 class Denoised:
-    """What another image estimator makes, denoised before the loss sees it. Biased.
+    """The image of another estimator, denoised before the loss is evaluated. Biased.
 
-    A denoiser trades noise for an error of its own, which no number of steps averages out: a descent comes to rest where the
-    *denoised* image fits the reference, next to the truth at best. It pays where the loss's derivative is not linear and the image is so
-    noisy that its bias is the larger one, and for previews. Memory, where `inner` has one, is of the image as it was rendered.
+    A denoiser trades variance for a systematic error, which no number of steps averages out: a descent converges to where the
+    *denoised* image fits the reference, near the truth at best. It pays where the loss derivative is not linear and the image so noisy
+    that the bias by noise is the larger one, and for previews. A control variate of `inner` is of the image before denoising.
 
-    Image and adjoint stay independent: for each group of samples, the image of all the *others* is denoised by itself, so that no adjoint
-    is weighted by an image that knows its samples. Each of these is a call of the denoiser, so samples form fewer groups than elsewhere.
+    Image and adjoint stay independent: for each sample group, the image of all *other* groups is denoised by itself, so that no adjoint
+    is weighted by an image of its own samples. Each is a call of the denoiser, so there are fewer groups than elsewhere.
 
-    Every film of `unrender` has a box filter, which denoisers need: with a wider one neighbours share samples, and their noise looks like
-    a picture.
+    Every film of `unrender` has a box filter, which denoisers need: with a wider one neighbouring pixels share samples, and their
+    correlated noise is taken for texture.
 
     Args:
-        inner: makes the image, `images.Plain()` or `images.RecursiveControlVariate()`.
-        by: who denoises: "auto" (OptiX on a GPU, else OIDN: `pip install 'unrender[denoise]'`), "oidn", "optix", or "variation".
-        groups: the most groups that samples form, >= 2, where their number can be divided so. Two groups are two calls beside that of
-            the whole image; more of them leave each image less noisy.
+        inner: estimates the image, `images.Plain()` or `images.RecursiveControlVariate()`.
+        by: the denoiser: "auto" (OptiX on a GPU, else OIDN: `pip install 'unrender[denoise]'`), "oidn", "optix", or "variation".
+        groups: the most sample groups, >= 2; fewer where the number of samples has no such divisor. Two groups are two calls of the
+            denoiser beside that of the whole image; more groups make each image less noisy.
 
     Raises:
         InputError: at construction, a value out of range; from `init`, a denoiser that cannot run here.
@@ -55,16 +57,16 @@ class Denoised:
 
     @property
     def space(self) -> Space | None:
-        """That of the image that is denoised."""
+        """That of `inner`."""
         return self.inner.space
 
     @property
     def pixelwise(self) -> bool:
-        """False: a denoiser needs a pixel's neighbours."""
+        """False: a denoiser needs the neighbours of a pixel."""
         return False
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """See `ImageEstimator.init`. The state is that of the image that is denoised."""
+        """See `ImageEstimator.init`. The state is that of `inner`."""
         denoising.choose(self.by)
         return self.inner.init(problem, parameters)
 
@@ -83,7 +85,7 @@ class Denoised:
         found, kept = self.inner.estimate(
             problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
         )
-        return replace(found, clean=self._cleaner(problem)), kept
+        return replace(found, filter=self._filter(problem)), kept
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Always."""
@@ -100,15 +102,15 @@ class Denoised:
         return self.inner.advance(parameters, state, kept)
 
     def _groups(self, asked: int) -> int:
-        """As many of the groups asked for as may be; where their number has no such divisor, its smallest one."""
+        """The largest divisor of `asked` up to `groups`; its smallest one above 1 where there is none."""
         divisors = [n for n in range(2, asked + 1) if asked % n == 0]
         return max((n for n in divisors if n <= self.groups), default=min(divisors, default=1))
 
-    def _cleaner(self, problem: Problem) -> Callable[[Array], Array]:
-        def clean(image: Array) -> Array:
+    def _filter(self, problem: Problem) -> Callable[[Array], Array]:
+        def denoise(image: Array) -> Array:
             noisy = arrays.numpy(image)
             if not arrays.all_finite(noisy):
-                return image  # for the loop to see
+                return image  # so that the loop skips the step
             return problem.renderer.array(denoising.denoise(noisy, by=self.by))
 
-        return clean
+        return denoise

@@ -1,4 +1,4 @@
-"""The image as it is rendered."""
+"""The plain Monte Carlo image."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
+__all__ = ["Plain", "PlainState"]
+
 
 @dataclass(frozen=True)
 class PlainState:
-    """Nothing is kept."""
+    """Empty: there is no state."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Plain:
 
     @property
     def space(self) -> Space | None:
-        """No samples are shared."""
+        """None: steps share no samples."""
         return None
 
     @property

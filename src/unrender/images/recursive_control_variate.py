@@ -17,14 +17,16 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
-from unrender.rendering.renderer import Space
+from unrender.rendering.renderer import Rendering, Space
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
+
+__all__ = ["RecursiveControlVariate", "RecursiveControlVariateState", "Snapshot", "ViewMemory"]
 
 
 @dataclass(frozen=True)
 class ViewMemory:
-    """What is kept of one view; every array (H, W, 3).
+    """The control variate of one view and its statistics; every array (H, W, 3).
 
     Attributes:
         image: the control variate ⟨F_n⟩_CV.
@@ -41,11 +43,11 @@ class ViewMemory:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What steps of drawn pixels look up: all views' pixels one behind the other, (P, 3) each.
+    """The control variate that pixel mini-batches use: the pixels of all views, concatenated, (P, 3) each.
 
     Attributes:
         image: the control variate.
-        weight: that a new sample gives it.
+        weight: w of each pixel, from the statistics at the time of the snapshot.
     """
 
     image: Array
@@ -57,14 +59,16 @@ class RecursiveControlVariateState:
     """State between steps.
 
     Attributes:
-        parameters: of the last step that looked at whole views; None before the first.
-        views: what is kept of each view; empty before the first step.
-        snapshot: the same for drawn pixels; None where none are drawn.
+        parameters: of the last step that rendered whole views; None before the first.
+        views: control variate and statistics of each view; empty before the first step.
+        snapshot: the same for pixel mini-batches; None without them.
+        step: how many steps rendered whole views; with `PairRequest.step`, says whether two states are of the same step.
     """
 
     parameters: Tree | None = None
     views: tuple[ViewMemory, ...] = ()
     snapshot: Snapshot | None = None
+    step: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,22 +84,22 @@ class RecursiveControlVariate:
             numbers (two traces; any parameter, less correlation).
         alpha: decay of the running means, in [0, 1).
         beta: decay of the running (co)variances, in [0, 1).
-        whole_views: with drawn pixels, a step of whole views comes after that many steps of drawn ones, >= 1.
+        whole_views: with pixel mini-batches, every so many of them are followed by a step that renders whole views, >= 1.
         update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
 
-    With drawn pixels the control variate is a snapshot, since a pixel that is not drawn is not carried along: a step of whole views
-    brings image and statistics to its parameters, and until the next one the drawn pixels take ⟨F_n⟩ + w (⟨F_s⟩_CV − ⟨F_s⟩_n) against
-    that step s. Whole steps cost what they do: few for large pictures.
+    With pixel mini-batches the control variate is a snapshot, since pixels outside the batch are not updated: a step that renders whole
+    views updates image and statistics, and until the next one each mini-batch uses ⟨F_n⟩ + w (⟨F_s⟩_CV − ⟨F_s⟩_n) against that
+    step s. Steps of whole views have their full cost; large images afford few.
 
     The state starts anew when a parameter changes its shape.
 
-    Var[⟨F_n⟩_CV] is kept relative to Var[⟨F_n⟩_n], which the recurrence (10) leaves as it is. Kept absolute, it would
-    freeze the first, worst estimate of the variance: a pixel whose first samples happen to agree would get variance 0, weight
-    1, and its first value for ever.
+    Var[⟨F_n⟩_CV] is stored relative to Var[⟨F_n⟩_n], to which the recurrence (10) is invariant. An absolute value would freeze the
+    first, worst estimate of the variance: a pixel whose first samples happen to agree would have variance 0 and weight 1, and keep its
+    first value for ever.
 
-    Where no variance was seen yet, at the first steps or in a pixel that has only been black, the two states count as fully correlated:
-    the weight is 1 / (1 + r) for the relative variance r, which becomes r / (1 + r), so that images are averaged. A weight of 0 would
-    drop the black samples as soon as a bright one comes, and leave the pixel too bright.
+    Where the sample variance is still zero, at the first steps or in a pixel that has only been black, the two states count as fully
+    correlated: the weight is 1 / (1 + r) for the relative variance r, which becomes r / (1 + r), so that images are averaged. A weight
+    of 0 would discard the black samples at the first bright one, and leave the pixel too bright.
     """
 
     space: Space = "path"
@@ -123,14 +127,14 @@ class RecursiveControlVariate:
         return True
 
     def needs_whole_views(self, parameters: Tree, state: RecursiveControlVariateState, batches: int) -> bool:
-        """At first, when shapes change, and every so often."""
-        return batches >= self.whole_views or self._fresh(parameters, state)
+        """At the first step, when shapes change, and after every `whole_views` mini-batches."""
+        return batches >= self.whole_views or self._is_first(parameters, state)
 
     def prepare(self, problem: Problem, state: RecursiveControlVariateState) -> RecursiveControlVariateState:
         """See `ImageEstimator.prepare`."""
         del problem
         parts = [(memory.image, self._weight(memory)) for memory in state.views]
-        image, weight = (arrays.concatenated([arrays.rows(part[n]) for part in parts]) for n in range(2))
+        image, weight = (arrays.concatenate([arrays.rows(part[n]) for part in parts]) for n in range(2))
         return replace(state, snapshot=Snapshot(image, weight))
 
     def estimate(
@@ -148,56 +152,64 @@ class RecursiveControlVariate:
 
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
         one as far as the two can share it: they differ by F − H.
+
+        Raises:
+            InputError: the pair requested is not of the step of the control variate, or a mini-batch comes before whole views.
         """
+        first = self._is_first(parameters, state)
+        if pair_request is not None and pair_request.step != state.step:
+            raise InputError(
+                f"RecursiveControlVariate: its state is of step {state.step}, the pair requested of step {pair_request.step}"
+            )
+        previous = parameters if first or state.parameters is None else state.parameters
         request = frame.request(spp, key.uint32(), groups)
-        fresh = self._fresh(parameters, state)
-        previous = parameters if fresh or state.parameters is None else state.parameters
-        # Two memories that are carried together must be of the same step.
-        assert pair_request is None or all(previous[key] is value for key, value in pair_request.previous.items())
         session = problem.renderer.prepare(list(parameters), self.space)
         rendering = session.image_pair(parameters, previous, request, self.space)
-        assert rendering.previous is not None
-        if isinstance(frame, PixelBatch):
-            assert state.snapshot is not None
-            assert not fresh
-            row = problem.references.rows(frame.draw.views, frame.draw.pixels)
-            image, weight = (arrays.gather_rows(x, row) for x in (state.snapshot.image, state.snapshot.weight))
-            images = advance(image, rendering.images, rendering.previous, weight)
-            beside_it = advance(image, rendering.previous, rendering.previous, weight)
-            return ImageEstimate(images, rendering.paths, previous=beside_it), None
-        assert isinstance(frame, WholeView)
-        if fresh:
-            estimate = ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous)
-            return estimate, self._start(estimate.mean())
-        memory = state.views[frame.view]
-        F, H = arrays.mean_first(rendering.images), arrays.mean_first(rendering.previous)
+        match frame:
+            case PixelBatch():
+                if first or state.snapshot is None:
+                    raise InputError("RecursiveControlVariate: a pixel mini-batch needs an earlier step of whole views")
+                return self._combine_pixels(problem, state.snapshot, frame, rendering), None
+            case WholeView():
+                if first:
+                    estimate = ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous)
+                    return estimate, self._start(estimate.mean())
+                return self._combine_view(state.views[frame.view], rendering)
+        raise InputError(f"RecursiveControlVariate: expected a whole view or a pixel mini-batch, got {frame!r}")
+
+    @staticmethod
+    def _combine_pixels(problem: Problem, snapshot: Snapshot, frame: PixelBatch, rendering: Rendering) -> ImageEstimate:
+        """Both images of a mini-batch, (groups, N, 3), with the snapshot as control variate."""
+        row = problem.references.rows(frame.sample.views, frame.sample.pixels)
+        image, weight = (arrays.gather_rows(x, row) for x in (snapshot.image, snapshot.weight))
+        current = advance(image, rendering.images, rendering.previous, weight)
+        previous = advance(image, rendering.previous, rendering.previous, weight)
+        return ImageEstimate(current, rendering.paths, previous=previous)
+
+    def _combine_view(self, memory: ViewMemory, rendering: Rendering) -> tuple[ImageEstimate, ViewMemory]:
+        """Both images of a view, (groups, H, W, 3), and the view's memory after the step."""
+        F, H = arrays.mean_over_first(rendering.images), arrays.mean_over_first(rendering.previous)
         used = self._observe(memory, F, H) if self.update_before_use else memory
         past, weight = memory.relative_variance, self._weight(used)
-        images = advance(memory.image, rendering.images, rendering.previous, weight)
-        seen = used if self.update_before_use else self._observe(memory, F, H)
-        var_current, var_previous = welford.covariance(seen.current), welford.covariance(seen.previous)
-        variance = statistics.control_variate_variance(
-            weight,
-            var_current,
-            var_previous,
-            welford.covariance(seen.joint),
-            past * var_previous,
-        )
+        current = advance(memory.image, rendering.images, rendering.previous, weight)
+        observed = used if self.update_before_use else self._observe(memory, F, H)
+        var_current, var_previous = welford.covariance(observed.current), welford.covariance(observed.previous)
+        cov = welford.covariance(observed.joint)
+        variance = statistics.control_variate_variance(weight, var_current, var_previous, cov, past * var_previous)
         known = var_current > 0
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
         info = {"control_weight": weight, "variance": variance}
-        beside_it = advance(memory.image, rendering.previous, rendering.previous, weight)
-        estimate = ImageEstimate(images, rendering.paths, info, beside_it)
-        return estimate, replace(seen, image=estimate.mean(), relative_variance=relative)
+        previous = advance(memory.image, rendering.previous, rendering.previous, weight)
+        estimate = ImageEstimate(current, rendering.paths, info, previous)
+        return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
 
     def advance(
         self, parameters: Tree, state: RecursiveControlVariateState, kept: tuple[Any, ...]
     ) -> RecursiveControlVariateState:
         """See `ImageEstimator.advance`."""
-        del state
-        return RecursiveControlVariateState(parameters, kept)
+        return RecursiveControlVariateState(parameters, kept, step=state.step + 1)
 
-    def _fresh(self, parameters: Tree, state: RecursiveControlVariateState) -> bool:
+    def _is_first(self, parameters: Tree, state: RecursiveControlVariateState) -> bool:
         return state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
 
     def _weight(self, memory: ViewMemory) -> Array:

@@ -179,7 +179,7 @@ class SmoothedOptions(Options):
     )
     samples: int = Field(16, ge=4, description="renders per view and step, for each derivative that has its own")
     spp: PositiveInt = Field(2, description="samples per pixel of a render")
-    together: bool = Field(
+    joint: bool = Field(
         True, description="gradient and curvature from the same renders; else each from its own, as in the paper"
     )
     iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
@@ -191,9 +191,7 @@ class SmoothedOptions(Options):
         if self.optimizer == "cma-es":
             return LossValues(self.spp), optimizers.CMAES(sigma0=self.step * common)
         order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
-        estimator = SmoothedDerivatives(
-            sigma, self.samples, order, together=self.together, spp=self.spp, schedule=schedule
-        )
+        estimator = SmoothedDerivatives(sigma, self.samples, order, joint=self.joint, spp=self.spp, schedule=schedule)
         made: dict[str, Callable[[], Optimizer]] = {
             "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
             "newton": lambda: optimizers.Newton(trust_radius=self.step),

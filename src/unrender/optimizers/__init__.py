@@ -1,4 +1,4 @@
-"""What turns estimates into steps."""
+"""Optimizers: steps from estimates."""
 
 from unrender import schedules
 from unrender.optimizers.adam import Adam

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
 from unrender.schedules.functions import Schedule
 
@@ -61,9 +62,9 @@ class Adam:
         checks.number("Adam", "epsilon", self.epsilon, above=0.0)
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """A gradient."""
-        return frozenset({GRADIENT})
+        return Capabilities(Gradient)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AdamState:
         """See `Optimizer.init`."""

@@ -1,8 +1,9 @@
-"""What an optimizer is."""
+"""The protocol of optimizers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any, Protocol
 
 from unrender.core.trees import Tree
@@ -10,11 +11,11 @@ from unrender.estimators.base import Estimate
 
 
 class Optimizer(Protocol):
-    """Turns estimates into steps. Immutable; all that changes is in the state."""
+    """Computes steps from estimates. Immutable; all that changes is in the state."""
 
     @property
-    def requires(self) -> frozenset[str]:
-        """What the estimator must provide: subset of {"gradient", "variance", "hessian", "hvp", "losses"}."""
+    def requires(self) -> AbstractSet[str]:
+        """What the estimator must provide: `Capabilities` of types, e.g. `Capabilities(Gradient, Variance)`; reads as a set of names."""
         ...
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> Any:

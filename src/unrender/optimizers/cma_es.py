@@ -14,27 +14,28 @@ import numpy as np
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.estimators.base import LOSSES, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.optimizers import rates
 
-_NEAR = 0.01
-"""How far parameters may be from the search's mean, in its standard deviations, and still count as there."""
+_TOLERANCE = 0.01
+"""Distance of the parameters from the mean, in standard deviations, up to which they count as equal."""
 
 
 @dataclass(frozen=True)
 class CMAESState:
-    """State between steps: what the search was told, which with its seed is all that it ever knew.
+    """State between steps: the ranks of all generations, from which the search is reproduced with its seed.
 
-    A state that was read back searches on as if it had never been away, after its generations have been told again (no loss is
-    evaluated for that, but all of the search's own arithmetic is repeated).
+    The first step after a checkpoint is read repeats the arithmetic of all generations, without evaluating losses; the search then
+    continues as if uninterrupted.
 
     Attributes:
         learning_rates: of each parameter: its scale.
         start: (n,), the first mean, in the scaled coordinates u.
-        ranks: (generations, population) whole numbers: each point's place in its generation, from 0, the least loss; equal losses share
-            a place.
-        held: (k,), the generations before which the parameters turned out to be held back from the mean.
-        held_at: (k, n), where, in u.
+        ranks: (generations, population) integers: each point's rank in its generation, from 0, the least loss; equal losses have equal
+            ranks.
+        held: (k,), the generations before which bounds kept the parameters from the mean.
+        held_at: (k, n), the parameters there, in u.
     """
 
     learning_rates: dict[str, float]
@@ -43,27 +44,26 @@ class CMAESState:
     held: np.ndarray
     held_at: np.ndarray
 
-    # The live search of this very state: no field, but a cache, which goes on to the next state and is built again where it is missing.
+    # A cache of the search at this state, not a field: it moves on to the next state, and is rebuilt from the ranks where it is missing.
     _search: ClassVar[_Search | None] = None
 
 
 @dataclass(frozen=True)
 class CMAES:
-    """One generation of CMA-ES a step: points around a mean are drawn from a Gaussian, their losses ranked, and mean and covariance moved
-    towards the better ones. The step goes to the new mean.
+    """One generation of CMA-ES a step: points are drawn from a Gaussian around a mean, their losses ranked, and mean and covariance moved
+    towards the better ones. The step ends at the new mean.
 
     Invariant to any monotonic function of the loss. Every point of a generation is evaluated with the same random numbers, other ones in
     the next generation. Losses that are not finite rank last. A generation whose losses are all equal, on a plateau or where none is
-    finite, teaches nothing: there is no step, and the next one draws others.
+    finite, makes no step and no update; the next one draws other points.
 
     Scales: the search is for u = x / η with each parameter's learning rate η; its first standard deviation is `sigma0` η, the same in all
     directions of u.
 
-    Bounds are the caller's, who holds the parameters back where a step would leave them. The search takes notice: where the parameters turn
-    out to be short of its mean it goes on from there, and from then on moves the points it draws beyond to that place. (Their losses are
-    those at the bound anyway, and left there they would make the mean drift, or the deviations explode, in directions that no loss
-    depends on. `cma`'s own handling of bounds did much worse on a quadratic with a few of them.) So nothing but steps and bounds may
-    move the parameters during a search.
+    Bounds are the caller's, who projects the parameters onto them. Where the parameters differ from the mean, the search takes them as its
+    mean, and from then on clips the points that it draws to that bound. (Beyond it the loss is that of the bound, and unclipped points
+    would make the mean drift, or the deviations explode, in directions that no loss depends on. `cma`'s own handling of bounds did much
+    worse on a quadratic with a few of them.) So nothing but steps and bounds may move the parameters during a search.
 
     Costs O(n²) time a point and O(n²) memory, and O(n³) every few generations; O(n) with `diagonal`. The state grows by `population`
     numbers a generation, and by n each time a bound is found.
@@ -72,7 +72,7 @@ class CMAES:
         sigma0: the first standard deviation, in units of η, > 0: about a third of the distance to where the optimum may be.
         population: λ, points a generation, >= 4; None for 4 + ⌊3 log n⌋. More suits noise.
         seed: of the points drawn, >= 0.
-        diagonal: learn the variances of the parameters alone, not their covariance: for more than some hundred.
+        diagonal: adapt the variances of the parameters only, not their covariances: for more than some hundred.
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
     """
 
@@ -92,49 +92,49 @@ class CMAES:
             raise InputError(f"CMAES: diagonal must be True or False, got {self.diagonal!r}")
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """The loss at points of its own."""
-        return frozenset({LOSSES})
+        return Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
         """See `Optimizer.init`."""
         own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
-        start = vectors.ravel(parameters) / vectors.spread(own, parameters)
+        start = vectors.ravel(parameters) / vectors.repeat_per_element(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))
         ranks, held = np.zeros((0, population), np.int32), np.zeros(0, np.int32)
         return CMAESState(own, start, ranks, held, np.zeros((0, start.size)))
 
     def update(self, estimate: Estimate, state: CMAESState, parameters: Tree) -> tuple[Tree, CMAESState]:
         """See `Optimizer.update`. On the host. Raises `InputError` for losses of another shape than one per point."""
-        assert estimate.losses is not None
-        search = state._search or self._again(state)
-        object.__setattr__(state, "_search", None)  # whatever comes now, it is no longer this state's
-        scale = vectors.spread(state.learning_rates, parameters)
+        evaluate = estimate.require("CMAES", LossFunction).evaluate
+        search = state._search or self._replay(state)
+        object.__setattr__(state, "_search", None)  # it is about to change
+        scale = vectors.repeat_per_element(state.learning_rates, parameters)
         here, generation = vectors.ravel(parameters) / scale, len(state.ranks)
-        if search.is_elsewhere(here):
-            search.hold(here)
+        if search.differs(here):
+            search.bound_at(here)
             held = np.append(state.held, np.int32(generation))
             state = replace(state, held=held, held_at=np.concatenate([state.held_at, here[None]]))
         points = search.draw(self._random(generation))
-        losses = np.asarray(estimate.losses(points * scale), np.float64)
+        losses = np.asarray(evaluate(points * scale), np.float64)
         if losses.shape != (len(points),):
             raise InputError(f"CMAES: losses must have shape ({len(points)},), one per point, got {losses.shape}")
         ranks = _ranks(losses)
-        search.learn(ranks)
+        search.update(ranks)
         state = replace(state, ranks=np.concatenate([state.ranks, ranks[None]]))
         object.__setattr__(state, "_search", search)
         step = scale * (search.mean - here) if ranks.any() else np.zeros_like(here)
         return vectors.unravel(step, parameters), state
 
-    def _again(self, state: CMAESState) -> _Search:
-        """The search of a state that has none: it is told everything once more."""
+    def _replay(self, state: CMAESState) -> _Search:
+        """The search at a state, from its ranks."""
         search = _Search(state.start, self.sigma0, state.ranks.shape[1], self.diagonal)
         held = dict(zip(state.held.tolist(), state.held_at, strict=True))
         for generation, ranks in enumerate(state.ranks):
             if generation in held:
-                search.hold(held[generation])
+                search.bound_at(held[generation])
             search.draw(self._random(generation))
-            search.learn(ranks)
+            search.update(ranks)
         return search
 
     def _random(self, generation: int) -> np.random.Generator:
@@ -142,7 +142,7 @@ class CMAES:
 
 
 def _ranks(losses: np.ndarray) -> np.ndarray:
-    """Places from 0, the least; equal losses share one, and all that are not finite the last."""
+    """Ranks from 0, the least; equal losses have equal ranks, and those that are not finite the last."""
     known = np.where(np.isfinite(losses), losses, np.inf)
     return np.unique(known, return_inverse=True)[1].astype(np.int32)
 
@@ -175,19 +175,19 @@ class _Search:
         """(n,)."""
         return np.array(self._strategy.mean)
 
-    def is_elsewhere(self, here: np.ndarray) -> bool:
-        """Whether `here` (n,) is not the mean."""
-        return bool(np.any(np.abs(here - self._strategy.mean) > self._near()))
+    def differs(self, here: np.ndarray) -> bool:
+        """Whether `here` (n,) differs from the mean."""
+        return bool(np.any(np.abs(here - self._strategy.mean) > self._tolerance()))
 
-    def hold(self, here: np.ndarray) -> None:
-        """Make `here` the mean, and a bound wherever it is short of the mean that was."""
-        mean, near = self._strategy.mean, self._near()
+    def bound_at(self, here: np.ndarray) -> None:
+        """Make `here` (n,) the mean, and a bound in each dimension where it differs from the earlier mean."""
+        mean, near = self._strategy.mean, self._tolerance()
         self._least = np.where(here > mean + near, here, self._least)
         self._most = np.where(here < mean - near, here, self._most)
         self._strategy.mean = here.copy()
 
     def draw(self, random: np.random.Generator) -> np.ndarray:
-        """(population, n): the next generation, or other points of this one if nothing was learnt from it."""
+        """(population, n): the next generation, or other points of this one if all of its ranks were equal."""
         self._random, strategy = random, self._strategy
         with _quiet():
             if len(self._points):  # its first two may be a mirrored pair along the last step, drawn only once
@@ -198,15 +198,15 @@ class _Search:
         self._points = np.clip(drawn, self._least, self._most)
         return self._points
 
-    def learn(self, ranks: np.ndarray) -> None:
-        """Tell the ranks of the points drawn last, (population,). If all are the same there is nothing to tell."""
+    def update(self, ranks: np.ndarray) -> None:
+        """Update by the ranks (population,) of the points drawn last; no update where all are equal."""
         if ranks.any():
             with _quiet():
                 self._strategy.tell(list(self._points), ranks.astype(np.float64).tolist(), check_points=False)
             self._points = self._points[:0]
 
-    def _near(self) -> np.ndarray:
-        return _NEAR * self._strategy.stds
+    def _tolerance(self) -> np.ndarray:
+        return _TOLERANCE * self._strategy.stds
 
 
 @contextmanager

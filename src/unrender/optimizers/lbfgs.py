@@ -11,13 +11,22 @@ from scipy.optimize import LbfgsInvHessProduct
 
 from unrender.core import arrays, checks, vectors
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
+from unrender.optimizers.directions import (
+    NewtonState,
+    apply_direction,
+    check_options,
+    coordinate_scales,
+    init_state,
+)
 from unrender.schedules.functions import Schedule
 
-_FIRST = 0.1
-"""Length of a step before any curvature is known, as a share of the trust radius."""
+__all__ = ["LBFGS", "LBFGSState"]
+
+_FIRST_STEP = 0.1
+"""Length of a step before any curvature is known, as a fraction of the trust radius."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +34,13 @@ class LBFGSState:
     """State between steps.
 
     Attributes:
-        directed: what it shares with `Newton`.
+        newton: the step count, scales and inner Adam, as of `Newton`.
         parameters, gradient: (n,) each, of the last step.
-        moves, changes: (history, n) each: s = Δx and y = Δg of past steps, the last one in the last row.
+        moves, changes: (history, n) each: s = Δx and y = Δg of past steps, the most recent in the last row.
         count: how many rows of them are in use, the last ones.
     """
 
-    directed: NewtonState
+    newton: NewtonState
     parameters: np.ndarray
     gradient: np.ndarray
     moves: np.ndarray
@@ -49,7 +58,7 @@ class LBFGS:
     Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, times its σ, and so is Δ.
 
     Noise: y is the difference of two gradients that each have noise of their own, which does not shrink with s. A pair with sᵀy below
-    `curvature` ‖s‖ ‖y‖, as where the objective bends downwards or y is mostly noise, is left out; what noise is in the others stays for
+    `curvature` ‖s‖ ‖y‖, as where the curvature is negative or y is mostly noise, is left out; the noise of the others stays for
     `history` steps. So noise in proportion to the gradient, up to a third of it, does little harm; noise of a constant size soon ends
     the descent (the paper found that it "almost never converges" there), which a `schedule` delays. B is biased even where the
     gradients are not.
@@ -60,9 +69,9 @@ class LBFGS:
         trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0.
         history: pairs that are kept, >= 1.
         curvature: the least cosine between s and y of a pair that is kept, in (0, 1).
-        share: γ, the share of the step that is taken, in (0, 1]; not with `through`.
-        through: an Adam that takes the step's opposite in place of the gradient, and makes a step of its own length, by its own
-            learning rate or the parameter's.
+        step_scale: γ, factor of the step, in (0, 1]; without effect with `inner_optimizer`.
+        inner_optimizer: an Adam whose gradient is the negated step; the length of its step follows from its own learning rate or the
+            parameter's. None to take the step itself.
         schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`.
     """
 
@@ -70,39 +79,39 @@ class LBFGS:
     trust_radius: float = 0.5
     history: int = 5
     curvature: float = 0.01
-    share: float = 1.0
-    through: Adam | None = None
+    step_scale: float = 1.0
+    inner_optimizer: Adam | None = None
     schedule: Schedule | None = None
 
     def __post_init__(self):
-        check("LBFGS", self)
+        check_options("LBFGS", self)
         checks.number("LBFGS", "trust_radius", self.trust_radius, above=0.0)
         checks.integer("LBFGS", "history", self.history, at_least=1)
         checks.number("LBFGS", "curvature", self.curvature, above=0.0, below=1.0)
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """A gradient."""
-        return frozenset({GRADIENT})
+        return Capabilities(Gradient)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> LBFGSState:
         """See `Optimizer.init`."""
         n = sum(math.prod(arrays.shape(x)) for x in parameters.values())
         none, rows = np.zeros(n), np.zeros((self.history, n))
-        return LBFGSState(begin("LBFGS", self, parameters, learning_rates), none, none, rows, rows)
+        return LBFGSState(init_state("LBFGS", self, parameters, learning_rates), none, none, rows, rows)
 
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
         """See `Optimizer.update`. On the host."""
-        scale = scales(estimate, state.directed, parameters)
+        scale = coordinate_scales(estimate, state.newton, parameters)
         here, gradient = vectors.ravel(parameters), vectors.ravel(estimate.gradient)
-        if state.directed.step:
+        if state.newton.step:
             state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)
         direction = scale * self._direction(state, scale * gradient, scale)
-        steps, directed = finish("LBFGS", self, direction, state.directed, parameters)
-        return steps, replace(state, directed=directed, parameters=here, gradient=gradient)
+        steps, newton = apply_direction("LBFGS", self, direction, state.newton, parameters)
+        return steps, replace(state, newton=newton, parameters=here, gradient=gradient)
 
     def _remember(self, state: LBFGSState, move: np.ndarray, change: np.ndarray, scale: np.ndarray) -> LBFGSState:
-        """With this pair as the last one, where it tells of curvature."""
+        """With this pair as the most recent one, where its curvature is positive and large enough."""
         least = self.curvature * float(np.linalg.norm(move / scale) * np.linalg.norm(change * scale))
         if not 0.0 < least <= float(move @ change):
             return state
@@ -118,7 +127,7 @@ class LBFGS:
         if not 0.0 < length < math.inf:
             return np.zeros_like(gradient)
         if state.count == 0:
-            return gradient * (-_FIRST * self.trust_radius / length)
+            return gradient * (-_FIRST_STEP * self.trust_radius / length)
         moves, changes = state.moves[-state.count :] / scale, state.changes[-state.count :] * scale
         # SciPy's B starts from the identity: in coordinates u / √β that is β in those of u.
         beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])

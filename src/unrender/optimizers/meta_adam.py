@@ -1,4 +1,4 @@
-"""The step rule that goes with a gradient of known variance (Balint et al. 2023, section 5)."""
+"""The step rule for a gradient with an estimated variance (Balint et al. 2023, section 5)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks
 from unrender.core.trees import Tree
-from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.optimizers import rates
 from unrender.schedules.functions import Schedule
 
@@ -27,20 +28,20 @@ class MetaAdamState:
 
 @dataclass(frozen=True)
 class MetaAdam:
-    """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator itself gives.
+    """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator provides.
 
-    Adam divides by the root mean square of many gradients, which it takes for independent; a meta-estimate is an average already and
-    resembles the ones before it. Here the divisor is the standard deviation of this very gradient: where it is lost in noise the step
-    is short, about η at most; where many samples agree it grows with their number, up to η √n after n steps of a constant gradient
-    (Var g counts the mean square of a sample as its variance), and falls as soon as the gradient turns small or its memory is cut.
-    So learning rates are lower than Adam's, and the same rate serves the start and the end of a descent.
+    Adam divides by the root mean square of many gradients, which it assumes independent; a meta-estimate is an average already and
+    correlated with earlier ones. Here the divisor is the standard deviation of the present gradient: where noise dominates, the step is
+    about η at most; where many samples agree it grows with their number, up to η √n after n steps of a constant gradient (Var g is
+    the mean square of a sample), and falls as soon as the gradient or the weight of the past becomes small. So learning rates are
+    lower than Adam's, and the same rate serves the start and the end of a descent.
 
-    The start: before there is a past, a meta-estimate's variance is its square, and the first step is −η sign(g), as Adam's.
+    At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's.
 
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
-        epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 stay where they are.
-            It is far below Adam's (whose ε stands outside the root): a texel's share of a mean over pixels is small.
+        epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 do not move.
+            It is far below Adam's (whose ε is outside the root): a texel's gradient of a mean over pixels is small.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
         longest: the longest step of an element in units of η, > 0; None for no limit.
     """
@@ -57,9 +58,9 @@ class MetaAdam:
             checks.number("MetaAdam", "longest", self.longest, above=0.0)
 
     @property
-    def requires(self) -> frozenset[str]:
+    def requires(self) -> Capabilities:
         """A gradient and its variance."""
-        return frozenset({GRADIENT, VARIANCE})
+        return Capabilities(Gradient, Variance)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> MetaAdamState:
         """See `Optimizer.init`."""
@@ -68,11 +69,11 @@ class MetaAdam:
     def update(self, estimate: Estimate, state: MetaAdamState, parameters: Tree) -> tuple[Tree, MetaAdamState]:
         """See `Optimizer.update`. Lazy on Dr.Jit."""
         del parameters
-        assert estimate.variance is not None
+        variance = estimate.require("MetaAdam", Variance).values
         factor = rates.factor("MetaAdam", self.schedule, state.step)
         steps: Tree = {}
         for key, gradient in estimate.gradient.items():
             rate = arrays.scalar(-state.learning_rates[key] * factor, gradient)
-            step = gradient / arrays.sqrt(estimate.variance[key] + self.epsilon)
+            step = gradient / arrays.sqrt(variance[key] + self.epsilon)
             steps[key] = rate * (step if self.longest is None else arrays.clip(step, -self.longest, self.longest))
         return steps, replace(state, step=state.step + 1)

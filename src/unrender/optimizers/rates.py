@@ -1,4 +1,4 @@
-"""Each parameter's learning rate, and what the schedule makes of it."""
+"""Learning rates per parameter, and their schedule."""
 
 from __future__ import annotations
 

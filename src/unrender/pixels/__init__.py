@@ -1,4 +1,4 @@
-"""Which pixels a step looks at."""
+"""Which pixels a step renders: all, or a mini-batch."""
 
 from unrender.pixels.adaptive import Adaptive
 from unrender.pixels.all import All

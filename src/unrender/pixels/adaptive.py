@@ -1,4 +1,5 @@
-"""Pixels drawn where the gradient's variance is: "Image-space Adaptive Sampling for Fast Inverse Rendering" (SIGGRAPH 2025)."""
+"""Pixel mini-batches drawn where the variance of the gradient is: "Image-space Adaptive Sampling for Fast Inverse Rendering"
+(SIGGRAPH 2025)."""
 
 from __future__ import annotations
 
@@ -9,42 +10,45 @@ import numpy as np
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
-from unrender.pixels.guided import Clean, GuidedSampler, GuidedSamplerState, MapDenoiser, Maps
+from unrender.pixels.guided import Denoise, GuidedSampler, GuidedSamplerState, Maps
+from unrender.pixels.map_denoising import MapDenoiser
 from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
 from unrender.problem.problem import Problem
+
+__all__ = ["Adaptive"]
 
 
 @dataclass(frozen=True)
 class Adaptive:
     """p_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²]), Eq. 12, summed over colours: of all probabilities, those whose gradient has
-    the smallest variance, summed over the parameters, when the two factors come from independent paths.
+    the least variance, summed over the parameters, when the two factors come from independent paths.
 
-    Both factors are estimated from a few paths in each cell of pixels; the second by one pass in forward mode with random ±1 tangents
-    (`Renderer.tangent_moment`). Parameters with a preconditioner count as u, where x = S u, since that is where the descent takes place.
-    Estimates, denoised or not, only steer: the gradient is unbiased for whatever probabilities they give.
+    Both factors are estimated from a few paths per tile of pixels; the second by one pass in forward mode with random ±1 tangents
+    (`Renderer.tangent_moment`). Parameters with a preconditioner count as u, where x = S u, the coordinates of the descent. The
+    gradient is unbiased for any positive probabilities, so errors of these estimates change its variance only.
 
-    With `levels` = D > 0 the probabilities of D + 1 resolutions are averaged (Eq. 18), each compared with references averaged over
-    blocks of 2^d × 2^d cells, which draws more pixels to what varies within a block. (The paper's blocks are of pixels; the two
-    are the same where there are as many cells as pixels.) The paper has D = 4, against plain things that outweigh textured ones in a sum of
-    plain variances; relative ones need it less, and without levels the variance is smaller: `Adaptive(count, levels=4, relative=False)`
-    is the paper's.
+    With `levels` = D > 0 the probabilities of D + 1 resolutions are averaged (Eq. 18). Each coarser one compares renders with references
+    averaged over blocks of 2^d × 2^d tiles, which draws more pixels where the reference varies within a block. (The paper's blocks are
+    of pixels; the two are the same where there are as many tiles as pixels.) The paper has D = 4, because in a sum of plain variances
+    uniform regions can outweigh textured ones; relative variances need it less, and without levels the variance is smaller:
+    `Adaptive(count, levels=4, relative=False)` is the paper's.
 
     Args:
         count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
         levels: D, >= 0.
-        refresh: steps between estimates, >= 1.
-        samples: paths of an estimate, >= 1, which also says how fine the cells are: one path in each, or several where cells are
-            pixels. None for a third of `count`, but 4096 at least (or twice `count`), for each 20 steps that it serves: a few hundredths
-            of what the steps cost.
-        uniform: share of the draws that every pixel has equally, in (0, 1].
-        stratified: spread the draws evenly over the probabilities (`tiles.InverseCdfTable.draw`); otherwise
-            they are independent, as in the paper.
+        refresh: steps between importance-map updates, >= 1.
+        samples: paths of an update, >= 1, which also sets how fine the tiles are: one path in each, or several where tiles are
+            pixels. None for a third of `count`, but 4096 at least (or twice `count`), for each 20 steps between updates: a few
+            hundredths of the cost of the steps.
+        uniform: fraction of the draws that is uniform over all pixels, in (0, 1].
+        stratified: stratify the draws over the distribution (`tiles.InverseCdfTable.draw`); otherwise they are independent, as in the
+            paper.
         relative: weigh each parameter element's variance by one over its mean squared gradient, which is what Adam divides by: noise counts
-            in units of its steps, and the mean over each parameter's elements is what is summed. The sum of plain variances, the
-            paper's, looks most at what has the largest gradients.
-        denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "none", or "auto": optix on a GPU, oidn where
-            it is installed, else variation.
+            in units of Adam's steps, and the mean over each parameter's elements is summed. The sum of plain variances, the paper's,
+            is dominated by the parameters with the largest gradients.
+        denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "none", or "auto": optix on a GPU, oidn
+            where it is installed, else variation.
     """
 
     count: int
@@ -61,19 +65,7 @@ class Adaptive:
 
     @property
     def _sampler(self) -> GuidedSampler:
-        return GuidedSampler(
-            "Adaptive",
-            self.count,
-            self.refresh,
-            self.samples,
-            self.uniform,
-            self.stratified,
-            self.denoiser,
-            levels=self.levels,
-            moments=True,
-            make=_maps,
-            density=_density,
-        )
+        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels))
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
@@ -87,23 +79,32 @@ class Adaptive:
         return self._sampler.draw(problem, parameters, state, key)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Keep the mean square of the gradient's elements, where variances are `relative`."""
+        """Update the mean square of the gradient's elements, where variances are `relative`."""
         return self._sampler.observe(problem, state, gradient) if self.relative else state
 
 
-def _maps(seen: PixelStatistics) -> Maps:
-    assert seen.moments is not None
-    return (seen.moments, *seen.squares)
+@dataclass(frozen=True)
+class _GradientVariance:
+    """The importance of Eq. 12, averaged over levels by Eq. 18."""
 
+    levels: int
+    needs_second_moment: bool = True
 
-def _density(tiles: Tiles, maps: Maps, clean: Clean) -> np.ndarray:
-    """The sum over the levels of their probabilities (Eq. 18). Coarser levels average noise away by themselves."""
-    moments, *squares = maps
-    fine = clean(moments), clean(squares[0])
-    total = np.zeros(len(moments))
-    for level, square in enumerate(squares):
-        product = fine[0] * fine[1] if level == 0 else tiles.coarser(square, level) * tiles.coarser(moments, level)
-        density = np.sqrt(np.maximum(product, 0).sum(axis=1))
-        share = float((density * tiles.sizes).sum())
-        total += density / share if share > 0 else 0.0
-    return total
+    def maps(self, statistics: PixelStatistics) -> Maps:
+        """Second moment of the parameter derivatives, then per level that of the loss derivative."""
+        return (statistics.second_moment, *statistics.squares)
+
+    def density(self, tiles: Tiles, maps: Maps, denoise: Denoise) -> np.ndarray:
+        """The sum over the levels of their probabilities (Eq. 18). Coarser levels are means over blocks and need no denoising."""
+        second_moment, *squares = maps
+        finest = denoise(second_moment), denoise(squares[0])
+        total = np.zeros(len(second_moment))
+        for level, square in enumerate(squares):
+            if level == 0:
+                product = finest[0] * finest[1]
+            else:
+                product = tiles.coarsen(square, level) * tiles.coarsen(second_moment, level)
+            density = np.sqrt(np.maximum(product, 0).sum(axis=1))
+            mass = float((density * tiles.sizes).sum())
+            total += density / mass if mass > 0 else 0.0
+        return total

@@ -9,15 +9,17 @@ from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.problem.problem import Problem
 
+__all__ = ["All", "AllState"]
+
 
 @dataclass(frozen=True)
 class AllState:
-    """Nothing is kept."""
+    """Empty: there is no state."""
 
 
 @dataclass(frozen=True)
 class All:
-    """Look at the whole film of each view at each step."""
+    """Every step renders all pixels of all views."""
 
     def init(self, problem: Problem, parameters: Tree) -> AllState:
         """See `PixelSampler.init`."""
@@ -30,6 +32,6 @@ class All:
         return MiniBatch(None), state
 
     def observe(self, problem: Problem, state: AllState, gradient: Tree) -> AllState:
-        """Nothing to learn from."""
+        """Unchanged: the gradient is not used."""
         del problem, gradient
         return state

@@ -1,4 +1,4 @@
-"""What a pixel sampler is: it says which pixels a step looks at, and with which weights."""
+"""The protocol of pixel samplers, which choose the pixels that a step renders, and their weights."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from unrender.core.trees import Tree
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
+__all__ = ["MiniBatch", "PixelSampler", "check_loss"]
+
 
 @dataclass(frozen=True)
 class MiniBatch:
-    """What one step looks at.
+    """The pixels of one step.
 
     Attributes:
-        draw: the pixels; None for all of every view.
-        samples: paths traced to find them.
-        probability: per view how likely its pixels are, relative to equal probabilities: a map (rows, columns), coarser than
-            the film; empty where all are alike.
+        sample: the pixels; None for all pixels of all views.
+        samples: paths traced to estimate their probabilities.
+        probability: per view, the probability of its pixels relative to uniform sampling: a map (rows, columns), coarser than
+            the film; empty where it is uniform.
     """
 
-    draw: PixelSample | None
+    sample: PixelSample | None
     samples: int = 0
     probability: dict[int, np.ndarray] = field(default_factory=dict)
 
@@ -33,12 +35,12 @@ class MiniBatch:
 class PixelSampler(Protocol):
     """Immutable; all that changes is in the state.
 
-    A draw spans the pixels of all views at once. Whatever its probabilities, sums over it are unbiased: they are above zero for every
-    pixel, and known exactly.
+    A mini-batch is drawn from the pixels of all views at once. Weighted sums over it are unbiased, since its probabilities are positive
+    for every pixel and known exactly.
     """
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """The state before the first step. Raises `InputError` where pixels are drawn and the problem's loss is not one per pixel."""
+        """The state before the first step. Raises `InputError` for mini-batches of a problem whose loss is not pixelwise."""
         ...
 
     def draw(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[MiniBatch, Any]:
@@ -46,7 +48,7 @@ class PixelSampler(Protocol):
         ...
 
     def observe(self, problem: Problem, state: Any, gradient: Tree) -> Any:
-        """The state after a step whose gradient was this one, before preconditioning."""
+        """The state after a step with this gradient, before preconditioning."""
         ...
 
 
@@ -54,6 +56,6 @@ def check_loss(problem: Problem) -> None:
     """Raise `InputError` where the loss of a pixel depends on others."""
     if not problem.loss.pixelwise:
         raise InputError(
-            f"pixels: {type(problem.loss).__name__} looks at whole pictures, so pixels cannot be drawn one by one; "
+            f"pixels: {type(problem.loss).__name__} is of whole images, so it takes no pixel mini-batches; "
             "use unrender.pixels.All()"
         )

@@ -1,4 +1,4 @@
-"""Pixels drawn in proportion to the size of the loss derivative: the scheme before the adaptive one (Su and Gkioulekas 2024)."""
+"""Pixel mini-batches drawn in proportion to the magnitude of the loss derivative (Su and Gkioulekas 2024)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ import numpy as np
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
-from unrender.pixels.guided import Clean, GuidedSampler, GuidedSamplerState, MapDenoiser, Maps
+from unrender.pixels.guided import Denoise, GuidedSampler, GuidedSamplerState, Maps
+from unrender.pixels.map_denoising import MapDenoiser
+from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
 from unrender.problem.problem import Problem
+
+__all__ = ["LossProportional"]
 
 
 @dataclass(frozen=True)
 class LossProportional:
-    """p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`): how much a pixel counts, but not how noisy or how telling it is.
+    """p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`): neither noise nor the derivatives of a pixel by the parameters count.
 
     Args:
         count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.
@@ -34,19 +38,7 @@ class LossProportional:
 
     @property
     def _sampler(self) -> GuidedSampler:
-        return GuidedSampler(
-            "LossProportional",
-            self.count,
-            self.refresh,
-            self.samples,
-            self.uniform,
-            self.stratified,
-            self.denoiser,
-            levels=0,
-            moments=False,
-            make=lambda seen: (seen.sizes[0],),
-            density=_density,
-        )
+        return GuidedSampler("LossProportional", self, _LossDerivative())
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
@@ -60,11 +52,23 @@ class LossProportional:
         return self._sampler.draw(problem, parameters, state, key)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Nothing to learn from."""
+        """Unchanged: the gradient is not used."""
         del problem, gradient
         return state
 
 
-def _density(tiles: Tiles, maps: Maps, clean: Clean) -> np.ndarray:
-    del tiles
-    return clean(maps[0]).sum(axis=1)
+@dataclass(frozen=True)
+class _LossDerivative:
+    """The importance of Eq. 5."""
+
+    levels: int = 0
+    needs_second_moment: bool = False
+
+    def maps(self, statistics: PixelStatistics) -> Maps:
+        """The mean magnitude of the loss derivative."""
+        return (statistics.magnitudes[0],)
+
+    def density(self, tiles: Tiles, maps: Maps, denoise: Denoise) -> np.ndarray:
+        """Summed over the channels."""
+        del tiles
+        return denoise(maps[0]).sum(axis=1)

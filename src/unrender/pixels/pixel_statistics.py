@@ -1,4 +1,5 @@
-"""What pixels bring to the gradient's variance, estimated from few paths on cells of pixels (Stage 1 of the method's algorithm)."""
+"""Per-tile statistics of the loss derivative and of the squared parameter derivatives of pixels, from a few paths (Stage 1 of the
+method's algorithm)."""
 
 from __future__ import annotations
 
@@ -16,41 +17,43 @@ from unrender.pixels.tiles import InverseCdfTable, Tiles
 from unrender.problem.batches import PixelBatch
 from unrender.problem.problem import Problem
 
+__all__ = ["PixelStatistics", "estimate_statistics", "random_signs", "reference_means", "scales"]
+
 ROUNDS = 16
-"""Sign patterns of an estimate at most: the squares of single derivatives are what is left when their products average out."""
+"""Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
 
 
 _FLOOR, _LEAST = 0.1, 1e-30
-"""Of an element's energy: in shares of its parameter's typical one, and at all."""
+"""Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
 
 
 @dataclass(frozen=True)
 class PixelStatistics:
-    """What a few paths in each cell tell; every map (cells, 3), float64, means over the cell's pixels.
+    """Statistics from a few paths per tile; every map (tiles, 3), float64, means over the tile's pixels.
 
     Attributes:
-        sizes: per level, E|∂L/∂I|.
+        magnitudes: per level, E|∂L/∂I|.
         squares: per level, E[(∂L/∂I)²].
-        moments: Σ_k E[(∂I/∂θ_k)²]; None where not asked for.
+        second_moment: Σ_k E[(∂I/∂θ_k)²]; (0, 3) where no tangents were given.
         samples: paths traced.
     """
 
-    sizes: tuple[np.ndarray, ...]
+    magnitudes: tuple[np.ndarray, ...]
     squares: tuple[np.ndarray, ...]
-    moments: np.ndarray | None
+    second_moment: np.ndarray
     samples: int
 
 
 def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
-    """The mean reference of each cell, float32 (cells, 3)."""
+    """The mean reference of each tile, float32 (tiles, 3)."""
     found = []
     for view, grid in zip(problem.views, tiles.grids, strict=True):
-        picture = np.asarray(view.reference)
+        image = np.asarray(view.reference)
         rows, columns = np.arange(grid.rows) * grid.side, np.arange(grid.columns) * grid.side
-        sums = np.add.reduceat(np.add.reduceat(picture, rows, axis=0), columns, axis=1)
+        sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
         sizes = np.outer(
-            np.diff([*rows, picture.shape[0]]),
-            np.diff([*columns, picture.shape[1]]),
+            np.diff([*rows, image.shape[0]]),
+            np.diff([*columns, image.shape[1]]),
         )
         found.append(sums / sizes[..., None])
     return tiles.join(found).astype(np.float32)
@@ -66,17 +69,17 @@ def estimate_statistics(
     references: list[Array],
     scales: Tree,
 ) -> PixelStatistics:
-    """Trace `spp` paths in each cell, each through a pixel of its own.
+    """Trace `spp` paths in each tile, each through a random pixel of it.
 
     Args:
-        problem, parameters: where.
-        cells: of all views.
-        spots: a table of these cells.
-        spp: paths per cell, >= 1.
+        problem, parameters: what to render.
+        tiles: of all views.
+        uniform_table: of these tiles, every pixel equally likely.
+        spp: paths per tile, >= 1.
         key: of the random numbers.
-        references: per level from 1 on, what the cell's paths are compared with there, (cells, 3); at level 0 it is the pixel's own.
-        scales: of the tangents, in the coordinates of the descent; empty to carry none. They are carried in up to `ROUNDS` rounds, each
-            with signs of its own, since all paths of a launch share them.
+        references: per level from 1 on, the reference that the tile's paths are compared with, (tiles, 3); level 0 uses the pixels' own.
+        scales: of the tangents, in the coordinates of the descent; empty for no tangents. They are propagated in up to `ROUNDS` rounds,
+            each with signs of its own, since all paths of a launch share them.
     """
     rounds = max(n for n in range(1, min(spp, ROUNDS) + 1) if spp % n == 0) if scales else 1
     parts = [
@@ -92,7 +95,7 @@ def estimate_statistics(
     return PixelStatistics(
         tuple(means(level, np.abs) for level in levels),
         tuple(means(level, np.square) for level in levels),
-        means(-1, np.asarray) if scales else None,
+        means(-1, np.asarray) if scales else np.empty((0, 3)),
         len(tiles.views) * spp * (2 if scales else 1),
     )
 
@@ -106,8 +109,8 @@ def _round(
     references: list[Array],
     scales: Tree,
 ) -> list[np.ndarray]:
-    """Per path (cells * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents."""
-    batch = PixelBatch(problem, uniform_table.one_of_each(spp, key.fold(0)))
+    """Per path (tiles * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents."""
+    batch = PixelBatch(problem, uniform_table.draw_per_tile(spp, key.fold(0)))
     session = problem.renderer.prepare(list(parameters), None)
     rendering = session.image(parameters, batch.request(1, key.fold(1).uint32()))
     image = rendering.images[0]
@@ -133,19 +136,19 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
 
 
 def scales(parameters: Tree, second_moment: Tree) -> Tree:
-    """What an element's derivative is multiplied by: one, or, where mean squared gradients are known, one over the root of its own times
-    the elements of its parameter, so that a colour counts as much as a texture.
+    """The factor of each element's derivative: one or, where mean squared gradients are known, one over the root of the element's own
+    times the number of elements of its parameter, so that a colour counts as much as a texture.
 
-    Elements that hardly any path has met yet do not count as much as they might: a tenth of their parameter's typical energy is added,
-    the geometric mean of those met. (The mean would be that of a few elements that saw a rare bright path.)
+    A tenth of the parameter's typical second moment, the geometric mean over elements with a non-zero one, is added as a floor: it
+    bounds the factor of elements that hardly any path has met. (The arithmetic mean would be dominated by a few bright paths.)
     """
     if not second_moment or trees.shapes(second_moment) != trees.shapes(parameters):
         return trees.map(lambda x: x * 0.0 + 1.0, parameters)
 
     def scale(x: Array) -> Array:
-        met = arrays.where(x > 0, x * 0.0 + 1.0, x * 0.0)
-        logarithms = arrays.log(arrays.maximum(x, _LEAST)) * met
-        typical = arrays.exp(arrays.total(logarithms) / arrays.maximum(arrays.total(met), 1.0))
+        nonzero = arrays.where(x > 0, x * 0.0 + 1.0, x * 0.0)
+        logarithms = arrays.log(arrays.maximum(x, _LEAST)) * nonzero
+        typical = arrays.exp(arrays.total(logarithms) / arrays.maximum(arrays.total(nonzero), 1.0))
         return 1.0 / arrays.sqrt((x + typical * _FLOOR + _LEAST) * float(math.prod(arrays.shape(x))))
 
     return trees.map(scale, second_moment)

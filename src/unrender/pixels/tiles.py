@@ -1,7 +1,7 @@
-"""The films of all views, cut into square cells: what probabilities are estimated on, and drawn from.
+"""The films of all views divided into square tiles, on which pixel probabilities are estimated and from which pixels are drawn.
 
-All pixels of a cell are equally likely. Estimating and drawing cost what there are cells, not pixels: the price of a step does
-not depend on how large the pictures are, or how many.
+All pixels of a tile are equally likely. The cost of estimating and drawing grows with the number of tiles, not of pixels, so it does
+not depend on the number and size of the images.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from unrender.core.random import Key
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
-MOST_CELLS = 1 << 24
+__all__ = ["MOST_TILES", "Grid", "InverseCdfTable", "Tiles", "cut"]
+
+MOST_TILES = 1 << 24
 _RANGE = 1 << 32
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The cells of one view, row by row: `rows` × `columns`, `side` pixels wide but for the last of a row or column."""
+    """The tiles of one view, row by row: `rows` × `columns`, `side` pixels wide but for the last of a row or column."""
 
     rows: int
     columns: int
@@ -34,7 +36,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Cells of all views, one view behind the other; every array (cells,), whole numbers.
+    """Tiles of all views, concatenated view by view; every array (tiles,), integers.
 
     Attributes:
         grids: one per view.
@@ -58,7 +60,7 @@ class Tiles:
         return self.widths * self.heights
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
-        """(cells, ...) to one array (rows, columns, ...) per view."""
+        """(tiles, ...) to one array (rows, columns, ...) per view."""
         ends = np.cumsum([grid.rows * grid.columns for grid in self.grids])[:-1]
         parts = np.split(values, ends)
         return [
@@ -70,11 +72,11 @@ class Tiles:
         """The inverse of `split`."""
         return np.concatenate([part.reshape(-1, *part.shape[2:]) for part in maps])
 
-    def coarser(self, values: np.ndarray, level: int) -> np.ndarray:
-        """Means over blocks of 2^level × 2^level cells, weighted by their pixels, given back to each cell of the block.
+    def coarsen(self, values: np.ndarray, level: int) -> np.ndarray:
+        """Means over blocks of 2^level × 2^level tiles, weighted by their numbers of pixels, repeated for each tile of the block.
 
         Args:
-            values: (cells, ...).
+            values: (tiles, ...).
             level: 0 leaves `values` as they are.
         """
         if level == 0:
@@ -92,8 +94,8 @@ class Tiles:
 
 
 def cut(problem: Problem, most: int) -> Tiles:
-    """The finest cells of at most `most` in all, but one per view at least: their sides are equal in all views."""
-    return _cut(tuple(problem.renderer.resolutions()[view.sensor] for view in problem.views), min(most, MOST_CELLS))
+    """The finest tiles of at most `most` in all, but one per view at least; of equal side in all views."""
+    return _cut(tuple(problem.renderer.resolutions()[view.sensor] for view in problem.views), min(most, MOST_TILES))
 
 
 @functools.lru_cache(maxsize=16)
@@ -125,12 +127,12 @@ def _cut(resolutions: tuple[tuple[int, int], ...], most: int) -> Tiles:
 
 @dataclass(frozen=True)
 class InverseCdfTable:
-    """Where draws fall: the unit interval as [0, 2³²), a run of whole numbers for each cell, so that probabilities are exact.
+    """The inverse of the tiles' cumulative distribution, the unit interval as integers in [0, 2³²), so that probabilities are exact.
 
     Attributes:
-        starts: of each cell's run, (cells,), ascending.
-        weights: a pixel's 1 / p, (cells, 1).
-        places: view, x, y, width, height, film width of each cell: (cells,) each.
+        starts: the cumulative distribution before each tile, (tiles,), ascending.
+        weights: 1 / p of a pixel of the tile, (tiles, 1).
+        places: view, x, y, width, height, film width of each tile: (tiles,) each.
     """
 
     starts: Array
@@ -139,10 +141,10 @@ class InverseCdfTable:
 
     @classmethod
     def of(cls, tiles: Tiles, probabilities: np.ndarray, array: Callable[[np.ndarray], Array]) -> InverseCdfTable:
-        """Of the cells' probabilities (cells,), all above 0; rounded to multiples of 2⁻³², never to 0.
+        """From the tiles' probabilities (tiles,), all above 0; rounded to multiples of 2⁻³², never to 0.
 
         Args:
-            cells: where.
+            tiles: to draw from.
             probabilities: of any positive sum.
             array: makes the renderer's arrays.
         """
@@ -167,25 +169,25 @@ class InverseCdfTable:
         Args:
             count: how many.
             key: of the random numbers.
-            stratified: one draw from each of `count` equal parts of the unit interval, turned by a common random offset; each draw
-                has the table's probabilities all the same, but they spread evenly. Otherwise all are independent.
+            stratified: one draw from each of `count` equal strata of the unit interval, with a common random offset modulo 1: the
+                marginal distribution of each draw is the table's. Otherwise all are independent.
         """
         number = _stratified(self.weights, count, key) if stratified else _independent(self.weights, count, key)
-        cell = arrays.searchsorted(self.starts, number)
-        return self._within(cell, arrays.gather_rows(self.weights, cell) / count, key)
+        tile = arrays.searchsorted(self.starts, number)
+        return self._draw_within(tile, arrays.gather_rows(self.weights, tile) / count, key)
 
-    def one_of_each(self, count: int, key: Key) -> PixelSample:
-        """`count` pixels of every cell, side by side; weights of 1."""
-        cell = arrays.arange(self.weights, arrays.shape(self.weights)[0] * count) // count
-        return self._within(cell, arrays.gather_rows(self.weights * 0 + 1, cell), key)
+    def draw_per_tile(self, count: int, key: Key) -> PixelSample:
+        """`count` pixels of every tile, consecutive; weights of 1."""
+        tile = arrays.arange(self.weights, arrays.shape(self.weights)[0] * count) // count
+        return self._draw_within(tile, arrays.gather_rows(self.weights * 0 + 1, tile), key)
 
-    def _within(self, cell: Array, weights: Array, key: Key) -> PixelSample:
-        view, x, y, width, height, film = (arrays.gather(place, cell) for place in self.places)
+    def _draw_within(self, tile: Array, weights: Array, key: Key) -> PixelSample:
+        view, x, y, width, height, film = (arrays.gather(place, tile) for place in self.places)
         column = x + arrays.random_below(width, self.weights, key.fold(2).uint32())
         row = y + arrays.random_below(height, self.weights, key.fold(3).uint32())
-        draw = PixelSample(view, row * film + column, weights)
-        arrays.evaluate(draw.views, draw.pixels, draw.weights)
-        return draw
+        sample = PixelSample(view, row * film + column, weights)
+        arrays.evaluate(sample.views, sample.pixels, sample.weights)
+        return sample
 
 
 def _independent(like: Array, count: int, key: Key) -> Array:
@@ -195,5 +197,5 @@ def _independent(like: Array, count: int, key: Key) -> Array:
 
 def _stratified(like: Array, count: int, key: Key) -> Array:
     stride = _RANGE // count
-    within = arrays.random_integers(like, key.fold(0).uint32(), count, stride)
-    return arrays.arange(like, count) * stride + within + arrays.integer(key.fold(1).uint32(), like)
+    jitter = arrays.random_integers(like, key.fold(0).uint32(), count, stride)
+    return arrays.arange(like, count) * stride + jitter + arrays.integer(key.fold(1).uint32(), like)

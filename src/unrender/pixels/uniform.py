@@ -1,4 +1,4 @@
-"""Pixels drawn with equal probabilities: plain mini-batches."""
+"""Pixel mini-batches with equal probabilities."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.tiles import InverseCdfTable, cut
 from unrender.problem.problem import Problem
 
+__all__ = ["Uniform", "UniformState"]
+
 
 @dataclass(frozen=True)
 class UniformState:
-    """State between steps: the table of draws, which stays as it is."""
+    """State between steps: the table that pixels are drawn from, which is constant."""
 
     table: InverseCdfTable
 
@@ -25,7 +27,7 @@ class Uniform:
 
     Args:
         count: pixels a step, >= 1, drawn with replacement.
-        stratified: spread the draws evenly over the views (`tiles.InverseCdfTable.draw`); otherwise they are independent.
+        stratified: stratify the draws over all pixels (`tiles.InverseCdfTable.draw`); otherwise they are independent.
     """
 
     count: int
@@ -47,6 +49,6 @@ class Uniform:
         return MiniBatch(state.table.draw(self.count, key, self.stratified)), state
 
     def observe(self, problem: Problem, state: UniformState, gradient: Tree) -> UniformState:
-        """Nothing to learn from."""
+        """Unchanged: the gradient is not used."""
         del problem, gradient
         return state

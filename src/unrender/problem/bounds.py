@@ -1,4 +1,4 @@
-"""Keeping parameters inside their bounds without stalling the descent."""
+"""Projection of parameters onto their bounds."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 
 MARGIN = 1e-4
-"""Parameters stop this share of their range before a bound (of 1 where the range is open). At a reflectance of exactly 0 no
-light arrives through a surface and its gradient is 0 for ever; a lobe of probability exactly 0 is never sampled again."""
+"""Distance from a bound at which parameters are clamped, as a fraction of their range (of 1 where it is open). At a reflectance of
+exactly 0 no light arrives through a surface and its gradient is 0 for ever; a lobe of probability exactly 0 is never sampled again."""
 
 
 def project(x: Array, low: float | None, high: float | None) -> Array:

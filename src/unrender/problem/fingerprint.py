@@ -1,4 +1,4 @@
-"""What tells whether a problem is still the one it was, part by part, so that the difference can be shown."""
+"""Hashes of a problem, part by part: two problems can be compared, and their differences named."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDict
 
 
 def fingerprint(problem: Problem) -> dict[str, str]:
-    """{part of the problem: what it is, in words or as the SHA-256 of its numbers}.
+    """{part of the problem: its text, or the SHA-256 of its numbers}.
 
     Parts: the loss, the longest path, each unknown with its start, each view, the numbers of the scene (but for the unknown ones) by
-    object, and, for a scene in XML, every file that it is made of. Taken once per problem: a run changes the scene.
+    object, and, for a scene in XML, every file that it is made of. Computed once per problem and cached.
     """
     if problem not in _known:
         _known[problem] = _take(problem)

@@ -1,4 +1,4 @@
-"""The reference pictures of all views, looked up pixel by pixel."""
+"""Values and weights of single pixels of the references of all views."""
 
 from __future__ import annotations
 
@@ -14,34 +14,33 @@ from unrender.core.arrays import Array
 from unrender.problem.view import View
 
 ON_DEVICE = 1 << 29
-"""Bytes of reference pictures that are copied to the device; more than these stay in host memory."""
+"""Bytes of references up to which they are copied to the device; larger sets stay in host memory."""
 
 
 class References:
     """Values and weights of single pixels of the references.
 
-    Small sets of pictures are copied to the renderer's device once. Large ones stay where they are, in host memory: only the pixels asked
-    for travel.
+    Small sets are copied to the renderer's device once. Large ones stay in host memory, and only the requested pixels are copied.
 
     Args:
         views: with references (H, W, 3), masks (H, W) or None.
         array: makes the renderer's arrays.
-        on_device: bytes up to which the pictures are copied to the device.
+        on_device: bytes up to which the references are copied to the device.
     """
 
     def __init__(self, views: Sequence[View], array: Callable[[np.ndarray], Array], on_device: int = ON_DEVICE):
         self._views = views
         self._array = array
-        self._pictures = [np.asarray(view.reference).reshape(-1, 3) for view in views]
+        self._references = [np.asarray(view.reference).reshape(-1, 3) for view in views]
         self._masks = [None if view.mask is None else np.asarray(view.mask).reshape(-1, 1) for view in views]
         self._factors = [
-            view.weight / math.prod(picture.shape) for view, picture in zip(views, self._pictures, strict=True)
+            view.weight / math.prod(reference.shape) for view, reference in zip(views, self._references, strict=True)
         ]
-        self.in_host_memory = sum(picture.nbytes for picture in self._pictures) > on_device
+        self.in_host_memory = sum(reference.nbytes for reference in self._references) > on_device
 
     @cached_property
     def sensors(self) -> Array:
-        """The sensor of each view, whole numbers."""
+        """The sensor of each view, integers."""
         return arrays.like_integers(np.array([view.sensor for view in self._views]), self._array(np.zeros(1)))
 
     def at(self, views: Array, pixels: Array) -> tuple[Array, Array]:
@@ -49,18 +48,18 @@ class References:
 
         Args:
             views: index of each pixel's view, (N,).
-            pixels: flat index within its film, (N,).
+            pixels: row-major index within its film, (N,).
         """
         if self.in_host_memory:
             return self._from_host(arrays.numpy(views), arrays.numpy(pixels))
         row = self.rows(views, pixels)
         factors = arrays.gather_rows(self._view_factors, views)
-        if self._flat_mask is not None:
-            factors = factors * arrays.gather_rows(self._flat_mask, row)
-        return arrays.gather_rows(self._flat, row), factors
+        if self._all_masks is not None:
+            factors = factors * arrays.gather_rows(self._all_masks, row)
+        return arrays.gather_rows(self._all_references, row), factors
 
     def rows(self, views: Array, pixels: Array) -> Array:
-        """The place of these pixels among those of all views, one view behind the other, (N,)."""
+        """The index of these pixels in the concatenation of all views, (N,)."""
         return arrays.gather(self._starts, views) + pixels
 
     def _from_host(self, views: np.ndarray, pixels: np.ndarray) -> tuple[Array, Array]:
@@ -68,25 +67,25 @@ class References:
         factors = np.empty((len(pixels), 1), np.float32)
         for view in np.unique(views):
             here = views == view
-            values[here] = self._pictures[view][pixels[here]]
+            values[here] = self._references[view][pixels[here]]
             mask = self._masks[view]
             factors[here] = self._factors[view] * (1.0 if mask is None else mask[pixels[here]])
         return self._array(values), self._array(factors)
 
     @cached_property
-    def _flat(self) -> Array:
-        return self._array(np.concatenate(self._pictures))
+    def _all_references(self) -> Array:
+        return self._array(np.concatenate(self._references))
 
     @cached_property
-    def _flat_mask(self) -> Array | None:
+    def _all_masks(self) -> Array | None:
         if all(mask is None for mask in self._masks):
             return None
-        pairs = zip(self._masks, self._pictures, strict=True)
+        pairs = zip(self._masks, self._references, strict=True)
         return self._array(np.concatenate([np.ones((len(p), 1)) if m is None else m for m, p in pairs]))
 
     @cached_property
     def _starts(self) -> Any:
-        sizes = [len(picture) for picture in self._pictures]
+        sizes = [len(reference) for reference in self._references]
         return arrays.like_integers(np.cumsum([0, *sizes[:-1]]), self._array(np.zeros(1)))
 
     @cached_property

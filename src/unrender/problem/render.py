@@ -1,4 +1,4 @@
-"""Pictures of a problem's views as NumPy arrays: to look at, to report, to compare."""
+"""Images of a problem's views as NumPy arrays, for display, reports and comparison."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from unrender.core import arrays
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, UnrenderError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
 
-_LANES = 1 << 21
-"""Paths per pass: what fits a small machine's memory."""
+__all__ = ["as_tree", "render", "render_pair"]
+
+_PATHS_PER_PASS = 1 << 21
+"""Paths per pass, within the memory of a small machine."""
 
 
 def render(
@@ -24,7 +26,7 @@ def render(
     spp: int = 64,
     seed: int = 0,
 ) -> np.ndarray:
-    """Render one view, in as many passes as memory asks for. Unbiased; box filter.
+    """Render one view, in as many passes as memory requires. Unbiased; box filter.
 
     Args:
         problem: whose scene.
@@ -45,7 +47,7 @@ def render(
     session = problem.renderer.prepare(list(point), None, derivatives=False)
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
-    per_pass = max(1, min(spp, _LANES // (height * width)))
+    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width)))
     total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
     while done < spp:
         take = min(per_pass, spp - done)
@@ -65,7 +67,7 @@ def render_pair(
     """Both images of view 0, on one set of paths traced in the current state. Each unbiased; box filter.
 
     Args:
-        problem: whose scene; its parameters must be ones that `space="path"` carries.
+        problem: whose scene; its parameters must share paths (`ParameterInfo.shares_paths`).
         current, previous: {key: array} of all the problem's parameters.
         spp: samples per pixel, >= 1.
         seed: of the random numbers.
@@ -77,8 +79,10 @@ def render_pair(
     session = problem.renderer.prepare(list(points[0]), "path")
     request = SampleRequest(problem.views[0].sensor, spp, Key(seed).uint32())
     rendering = session.image_pair(*points, request, "path")
-    assert rendering.previous is not None
-    return arrays.numpy(rendering.images[0]), arrays.numpy(rendering.previous[0])
+    current_image, previous_image = rendering.images, rendering.previous
+    if previous_image is None:
+        raise UnrenderError("render_pair: the renderer returned one image of the two")
+    return arrays.numpy(current_image[0]), arrays.numpy(previous_image[0])
 
 
 def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:

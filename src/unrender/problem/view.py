@@ -1,4 +1,4 @@
-"""One picture of the scene."""
+"""One reference image of the scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class View:
-    """A reference picture and the sensor that sees the scene as it did.
+    """A reference image and the sensor that it was taken with.
 
     Args:
         reference: file, or array (H, W, 3), linear RGB. 8-bit files are taken as sRGB and linearised.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
-from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.core.random import Key
 from unrender.optimizers.base import Optimizer
 from unrender.problem.bounds import project
@@ -274,13 +274,7 @@ def estimate(
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))
-    return replace(
-        found,
-        gradient=trees.numpy(found.gradient),
-        variance=None if found.variance is None else trees.numpy(found.variance),
-        hessian=None if found.hessian is None else arrays.numpy(found.hessian),
-        info=_as_numpy(found.info),
-    )
+    return replace(as_numpy(found), info=_as_numpy(found.info))
 
 
 def describe(estimator: Estimator) -> str:
@@ -313,7 +307,7 @@ def check_budget(steps: int | None, seconds: float | None) -> None:
         raise InputError(f"optimize: seconds must be positive and finite, got {seconds!r}")
 
 
-def _list(names: frozenset[str]) -> str:
+def _list(names: Set[str]) -> str:
     return ", ".join(f'"{name}"' for name in sorted(names)) or "nothing"
 
 

@@ -219,7 +219,8 @@ def _(state: MetaState, upsampler: Upsampler) -> MetaState:
         )
 
     elements = {key: element(key, given) for key, given in state.elements.items()}
-    return MetaState(before, elements, carried(state.image, upsampler), carried(state.pixels, upsampler))
+    image, pixels = carried(state.image, upsampler), carried(state.pixels, upsampler)
+    return replace(state, parameters=before, elements=elements, image=image, pixels=pixels)
 
 
 def _length(a: Tree, b: Tree) -> float:

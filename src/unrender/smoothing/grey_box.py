@@ -17,16 +17,18 @@ dimensions of φ by `unrender.smoothed`. No matrix of n × n, or of weights × w
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from unrender import smoothing as smoothed
+from unrender.core import checks, conjugate_gradients
 from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.estimators.base import Estimate
-from unrender.optimizers.newton_cg import NewtonCG
+from unrender.smoothing.function import estimate_gradient, estimate_hvp
+from unrender.smoothing.joint import JointDerivatives, joint
+from unrender.smoothing.options import SamplingOptions
+from unrender.smoothing.sampling import Function
 
 # Not a dependency of the library, and absent where types are checked without the extra.
 try:
@@ -34,7 +36,9 @@ try:
 except ImportError as error:
     raise InputError(f"unrender.grey_box needs PyTorch ({error}): pip install torch") from error
 
-_Call = Callable[[smoothed.Function], Any]
+__all__ = ["loss", "newton_cg_step"]
+
+_Call = Callable[[Function], Any]
 
 
 def loss(
@@ -48,17 +52,17 @@ def loss(
     baseline: bool = True,
     low_discrepancy: bool = False,
     epsilon: float = 0.1,
-    together: bool = False,
+    joint: bool = False,
 ) -> torch.Tensor:
     """f(φ), with the derivatives of S f(φ): differentiable twice by torch.
 
-    The value is f at φ itself, not smoothed: it costs one evaluation, has no noise of its own, and tells how good φ is. So finite
+    The value is f at φ itself, not smoothed: it costs one evaluation, has no noise of its own, and measures how good φ is. So finite
     differences of the value are not what the derivatives estimate. Those are unbiased for ∇ S f; products with ∇² S f have the bias of
     their central difference (`smoothed.hvp`).
 
     First order is estimated at once, in the one call of f that also gives the value, where φ requires a gradient and grads are enabled.
-    Every product with the Hessian is one further call. All take the same draws, so that the products that conjugate gradients ask for
-    go with each other and with the gradient; items draw independently of each other. If f is noisy itself, let it use the
+    Every product with the Hessian is one further call. All take the same draws, so that the products of conjugate gradients
+    are consistent with each other and with the gradient; items draw independently of each other. If f is noisy itself, let it use the
     same random numbers in every call of a step.
 
     Args:
@@ -71,8 +75,8 @@ def loss(
             `aggregate`, for each of the n elements.
         seed: of the draws; a new one for each step.
         aggregate, antithetic, baseline, low_discrepancy, epsilon: see `smoothed.gradient` and `smoothed.hvp`.
-        together: gradient and products from the same evaluations (`smoothed.together`): products cost no call of f and have no bias, and
-            `aggregate`, `antithetic`, `baseline` and `epsilon` count for nothing.
+        joint: gradient and products from the same evaluations (`smoothed.joint`): products cost no call of f and have no bias, and
+            `aggregate`, `antithetic`, `baseline` and `epsilon` have no effect.
 
     Returns:
         () for φ of (n,), (K,) for (K, n), of φ's type and on its device.
@@ -85,8 +89,8 @@ def loss(
         raise InputError(f"grey_box.loss: phi must be a floating-point tensor (n,) or (K, n), got {given}")
     if not torch.isfinite(phi).all():
         raise InputError("grey_box.loss: phi has elements that are not finite: the network before it has diverged")
-    options = {"aggregate": aggregate, "antithetic": antithetic, "low_discrepancy": low_discrepancy}
-    box = _BlackBox(f, phi.ndim == 2, sigma, samples, seed, baseline, epsilon, options, together)
+    options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, epsilon=epsilon)
+    box = _BlackBox(f, phi.ndim == 2, sigma, options, joint)
     # On the host before it enters the black box: torch then calls f on the thread that called torch.
     rows = torch.atleast_2d(phi).to("cpu", torch.float64)
     if torch.is_grad_enabled() and phi.requires_grad:
@@ -121,7 +125,8 @@ def newton_cg_step(
     Raises:
         InputError: a loss that is no scalar or does not depend on the weights, derivatives that are not finite, options out of range.
     """
-    rule = NewtonCG(trust_radius=trust_radius, iterations=iterations)
+    checks.number("NewtonCG", "trust_radius", trust_radius, above=0.0)
+    checks.integer("NewtonCG", "iterations", iterations, at_least=1)
     weights = [weight for weight in parameters if weight.requires_grad]
     value = loss_fn()
     if not isinstance(value, torch.Tensor) or value.ndim != 0:
@@ -129,23 +134,25 @@ def newton_cg_step(
         raise InputError(f"grey_box.newton_cg_step: loss_fn must return a scalar tensor, say a mean, got {given}")
     if not weights or not value.requires_grad:
         raise InputError("grey_box.newton_cg_step: the loss depends on no weight that requires a gradient")
-    gradient = _flat(torch.autograd.grad(value, weights, create_graph=True, materialize_grads=True))
+    gradient = _ravel(torch.autograd.grad(value, weights, create_graph=True, materialize_grads=True))
     _check_finite("gradient", gradient)
 
-    def product(v: Any) -> dict[str, np.ndarray]:
+    def product(v: np.ndarray) -> np.ndarray:
         if not gradient.requires_grad:  # a loss that is linear in the weights
-            return {"weights": np.zeros(gradient.numel())}
-        found = _flat(
-            torch.autograd.grad(
-                gradient, weights, torch.from_numpy(v["weights"]), retain_graph=True, materialize_grads=True
-            )
+            return np.zeros(gradient.numel())
+        found = _ravel(
+            torch.autograd.grad(gradient, weights, torch.from_numpy(v), retain_graph=True, materialize_grads=True)
         )
         _check_finite("product with the Hessian", found)
-        return {"weights": found.numpy()}
+        return found.numpy()
 
-    tree = {"weights": gradient.detach().numpy()}
-    steps, _ = rule.update(Estimate(value.item(), tree, hvp=product), rule.init(tree), tree)
-    step = torch.from_numpy(steps["weights"])
+    step = conjugate_gradients.solve(gradient.detach().numpy(), product, trust_radius, iterations)
+    _apply_step(torch.from_numpy(step), weights, optimizer)
+    return value.item()
+
+
+def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: torch.optim.Optimizer | None) -> None:
+    """Add the step, all weights flattened in one vector, or give its opposite to the optimizer as the gradient."""
     with torch.no_grad():
         for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
             move = part.reshape(weight.shape).to(weight)
@@ -156,10 +163,9 @@ def newton_cg_step(
     if optimizer is not None:
         optimizer.step()
         optimizer.zero_grad()
-    return value.item()
 
 
-def _flat(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
+def _ravel(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
     """All elements in one vector on the host, double precision, differentiable."""
     return torch.cat([x.reshape(-1).to("cpu", torch.float64) for x in tensors])
 
@@ -171,88 +177,75 @@ def _check_finite(name: str, vector: torch.Tensor) -> None:
 
 @dataclass(frozen=True)
 class _BlackBox:
-    """f with how it is smoothed: values (K,), gradients (K, n) and Hessian-vector products (K, n) of K items, each by one call of f."""
+    """f and how it is smoothed: values (K,), gradients (K, n) and Hessian-vector products (K, n) of K items, each by one call of f."""
 
     f: Callable[..., Any]
     batched: bool
     sigma: Any
-    samples: int
-    seed: int
-    baseline: bool
-    epsilon: float
-    options: dict[str, bool]
-    together: bool = False
-    found: list[smoothed.JointDerivatives] = field(default_factory=list)
-    """Of each item, since `first_order`, with `together`."""
+    options: SamplingOptions
+    joint: bool = False
+    derivatives: list[JointDerivatives] = field(default_factory=list)
+    """Of each item, from the last `first_order`, with `joint`."""
 
     def values(self, phi: np.ndarray) -> np.ndarray:
         return self._evaluate(phi, np.arange(len(phi)))
 
     def first_order(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self.together:
-            return self._all_orders(phi)
+        if self.joint:
+            return self._joint_first_order(phi)
 
         def call(item: int) -> _Call:
-            theta, seed = phi[item], self._seed(item)
+            def value_and_gradient(f: Function) -> tuple[float, np.ndarray]:
+                gradient, _ = estimate_gradient(f, phi[item], self.sigma, self._item_options(item))
+                return f(phi[item][None])[0], gradient
 
-            def both(f: smoothed.Function) -> tuple[float, np.ndarray]:
-                gradient, _ = smoothed.gradient(
-                    f, theta, self.sigma, self.samples, seed, baseline=self.baseline, **self.options
-                )
-                return f(theta[None])[0], gradient
+            return value_and_gradient
 
-            return both
-
-        values, gradients = zip(*self._at_once([call(item) for item in range(len(phi))]), strict=True)
+        values, gradients = zip(*self._batched_calls([call(item) for item in range(len(phi))]), strict=True)
         return np.array(values), np.array(gradients)
 
-    def _all_orders(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _joint_first_order(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         def call(item: int) -> _Call:
-            point = (phi[item], self.sigma, self.samples, self._seed(item), self.options["low_discrepancy"])
-            return lambda f: smoothed.together(f, *point)
+            options = self._item_options(item)
+            point = (phi[item], self.sigma, options.samples, options.seed, options.low_discrepancy)
+            return lambda f: joint(f, *point)
 
-        self.found[:] = self._at_once([call(item) for item in range(len(phi))])
-        return np.array([one.value for one in self.found]), np.array([one.gradient()[0] for one in self.found])
+        self.derivatives[:] = self._batched_calls([call(item) for item in range(len(phi))])
+        return np.array([one.value for one in self.derivatives]), np.array(
+            [one.gradient()[0] for one in self.derivatives]
+        )
 
     def product(self, phi: np.ndarray, v: np.ndarray) -> np.ndarray:
-        if self.together:
-            return np.array([found.hvp(direction)[0] for found, direction in zip(self.found, v, strict=True)])
+        if self.joint:
+            return np.array([one.hvp(direction)[0] for one, direction in zip(self.derivatives, v, strict=True)])
 
         def call(item: int) -> _Call:
             # Twice the samples: as many draws at each side of the difference as the gradient has, and by the seed the same ones.
-            return lambda f: smoothed.hvp(
-                f,
-                phi[item],
-                v[item],
-                self.sigma,
-                2 * self.samples,
-                self._seed(item),
-                epsilon=self.epsilon,
-                **self.options,
-            )[0]
+            options = replace(self._item_options(item), samples=2 * self.options.samples)
+            return lambda f: estimate_hvp(f, phi[item], v[item], self.sigma, options)[0]
 
-        return np.array(self._at_once([call(item) for item in range(len(phi))]))
+        return np.array(self._batched_calls([call(item) for item in range(len(phi))]))
 
-    def _seed(self, item: int) -> int:
-        return Key(self.seed).fold(item).uint32()
+    def _item_options(self, item: int) -> SamplingOptions:
+        return replace(self.options, seed=Key(self.options.seed).fold(item).uint32())
 
-    def _at_once(self, calls: Sequence[_Call]) -> list[Any]:
-        """What each item's call returns, all their evaluations gathered in one of f.
+    def _batched_calls(self, calls: Sequence[_Call]) -> list[Any]:
+        """The return value of each item's call, with all their evaluations in one call of f.
 
-        Where an estimator evaluates depends on its draws alone and not on values, so each is run twice: to hear what it asks for, and
-        with the answers. That costs little beside rendering, which is much cheaper together.
+        Where an estimator evaluates depends on its draws alone and not on values, so each is run twice: to record the points, and
+        with the values. That costs little beside rendering, which is much cheaper in one batch.
         """
-        asked: list[list[np.ndarray]] = []
+        recorded: list[list[np.ndarray]] = []
         for call in calls:
             points: list[np.ndarray] = []
 
-            def listen(x: np.ndarray, points: list[np.ndarray] = points) -> np.ndarray:
+            def record(x: np.ndarray, points: list[np.ndarray] = points) -> np.ndarray:
                 points.append(x)
                 return np.zeros(len(x))
 
-            call(listen)
-            asked.append(points)
-        parts = [(item, x) for item, points in enumerate(asked) for x in points]
+            call(record)
+            recorded.append(points)
+        parts = [(item, x) for item, points in enumerate(recorded) for x in points]
         answers = iter(())
         if parts:  # none, where v is zero
             items = np.repeat([item for item, _ in parts], [len(x) for _, x in parts])
@@ -290,7 +283,7 @@ class _Loss(torch.autograd.Function):
 
 
 class _Gradient(torch.autograd.Function):
-    """φ (K, n) to ∇ S f(φ) (K, n), which is at hand; its derivative is the Hessian, which is symmetric: Hᵀ v = H v."""
+    """φ (K, n) to ∇ S f(φ) (K, n), already estimated; its derivative is the Hessian, which is symmetric: Hᵀ v = H v."""
 
     @staticmethod
     def forward(ctx: Any, phi: torch.Tensor, gradient: torch.Tensor, box: _BlackBox) -> torch.Tensor:
@@ -305,7 +298,7 @@ class _Gradient(torch.autograd.Function):
 
 
 class _Product(torch.autograd.Function):
-    """φ and v (K, n) to ∇² S f(φ) v (K, n). Without a derivative, which must not pass for zero."""
+    """φ and v (K, n) to ∇² S f(φ) v (K, n). Its derivative is an error, so that it is not taken for zero."""
 
     @staticmethod
     def forward(ctx: Any, phi: torch.Tensor, v: torch.Tensor, box: _BlackBox) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """Derivatives of a Gaussian as convolution kernels, the densities that sample them, and how (Wang et al.,
 "Stochastic Gradient Estimation for Higher-order Differentiable Rendering", section 3).
 
-Everything is in units of the smoothing's width: z = τ / σ, per dimension, so that S f(θ) = E[f(θ − σ z)] for standard normal z. With
+Everything is in units of σ: z = τ / σ, per dimension, so that S f(θ) = E[f(θ − σ z)] for standard normal z. With
 φ(z) the standard normal density of n dimensions,
 
     ∂ᵢ S f(θ)  = ∫ gᵢ(z) φ(z) f(θ − σ z) dz,     gᵢ  = −zᵢ / σᵢ                                            (Eq. 17)
@@ -124,7 +124,7 @@ def joint_ratio(z: np.ndarray) -> np.ndarray:
 
 
 def joint_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Draws from it; the arguments are those of `gradient_mixture`."""
+    """Draws from the mixture of both aggregates; the arguments are those of `gradient_mixture`."""
     first = chosen < 0.5
     rest = np.where(first, 2 * chosen, 2 * chosen - 1)
     return np.where(first[:, None], gradient_mixture(rest, u, normal), hessian_mixture(rest, u, normal))

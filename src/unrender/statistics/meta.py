@@ -1,4 +1,4 @@
-"""Meta-estimation: a gradient that is carried from step to step, with its own variance (Balint et al. 2023, sections 3 and 4).
+"""Meta-estimation: a gradient estimate updated from step to step, with its own variance (Balint et al. 2023, sections 3 and 4).
 
 F_i is a *proportional* estimate of the quantity at step i, ΔF_i a *finite-difference* estimate of its change since step i − 1,
 independent of F_i. The meta-estimate is their combination of least variance with all that came before,
@@ -16,13 +16,13 @@ variance are those of a control variate (`control_weight.py`) with Cov[F, H] = V
 
 Where this departs from the paper's text: the running means are divided by the sum of their weights, as Adam does, since Eqs 9 and
 13 say nothing of their start; and an element whose samples have all been zero so far, such as a texel that no path has met, counts
-its zeros: α follows its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight
+its zeros: α is at its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight
 of 0 it would start anew from that sample, and be i times too large. Where M is not zero though no sample of F was seen to be (a
-difference met the element first, or the summed samples before the observed ones), Var M is at least M² / n after n steps: it
-would be thought exact otherwise.
+difference was non-zero first, or the summed samples before the observed ones), Var M is at least M² / n after n steps, where it
+would be 0 otherwise.
 
-Bias. α knows F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero, strongest at the start and
-never quite gone, since the present sample keeps its share 1 − β_F of Var F (section 6 of the paper, "sample reuse"). With statistics from
+Bias. α depends on F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero, strongest at the start and
+never quite gone, since the present sample has the weight 1 − β_F in Var F (section 6 of the paper, "sample reuse"). With statistics from
 other samples (`observed`), on parameters that do not depend on the samples, every M_i is unbiased.
 """
 
@@ -36,10 +36,10 @@ from unrender.statistics.control_weight import control_variate_variance, control
 from unrender.statistics.recursion import advance
 
 BETA_PROPORTIONAL = 0.99
-"""β_F: large, since Var F is stable and should hardly know any one sample."""
+"""β_F: large, since Var F is stable and should hardly depend on any one sample."""
 
 BETA_DIFFERENCE = 0.9
-"""β_Δ: small, since the decoupled variance of ΔF is quiet and follows the scene."""
+"""β_Δ: small, since the decoupled variance of ΔF has little noise and follows the scene."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class State:
-    """What is carried from step to step. Every array has the shape given to `init`, but for the count of steps
+    """State between steps. Every array has the shape given to `init`, but for the count of steps
     and the moments' weights, which are numbers.
 
     Attributes:
@@ -74,7 +74,7 @@ class State:
 
 
 def init(like: Array) -> State:
-    """Nothing seen yet. `like` gives shape and kind of the samples."""
+    """Before the first sample. `like` gives shape and type of the samples."""
     zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
     empty = Moments(zeros, zeros, zero)
     return State(zeros, zeros, zeros, empty, empty, zero)
@@ -99,13 +99,13 @@ def update(
         state: from `init` or `update`.
         proportional: F_i.
         difference: ΔF_i = F_i − F_{i-1}; without effect at the first step.
-        step_norm: ‖π_i − π_{i-1}‖₂ over all parameters, a number or a device number. Where it is 0 nothing is learnt of ΔF.
+        step_norm: ‖π_i − π_{i-1}‖₂ over all parameters, a number or a device number. Where it is 0 the statistics of ΔF are not updated.
         beta_proportional: β_F of Eq. 9, in [0, 1).
         beta_difference: β_Δ of Eq. 13, in [0, 1).
         clip: hold α below Eq. 17.
         centred: take variances about the mean in place of mean squares. For comparison (Fig. 5): unreliable.
         decouple: divide differences by the step before averaging (Eq. 13). For comparison.
-        observed: (F, ΔF) to learn the variances from in place of those that are summed; independent ones leave M unbiased.
+        observed: (F, ΔF) to estimate the variances from in place of those that are summed; independent ones leave M unbiased.
 
     Returns:
         (M_i, Var M_i, α_i, the next state).
@@ -114,7 +114,7 @@ def update(
     state, var_f, var_d, var_m, started = _observe(
         state, *seen, step_norm, beta_proportional, beta_difference, centred, decouple
     )
-    alpha = _held(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip)
+    alpha = _bounded_alpha(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip)
     gradient = advance(state.gradient, proportional, proportional - difference, alpha)
     return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha, var_f)
 
@@ -137,7 +137,7 @@ def update_coupled(
     Args:
         current: F_i.
         previous: H_i, of the state of step i − 1, from the samples of F_i; without effect at the first step.
-        observed: (F, H) to learn from in their place.
+        observed: (F, H) to estimate the variances from in their place.
 
     The others, and what is returned, are those of `update`.
     """
@@ -146,7 +146,7 @@ def update_coupled(
         state, F, F - H, step_norm, beta_proportional, beta_difference, centred, decouple
     )
     cov = arrays.maximum(var_f - 0.5 * var_d, 0.0)
-    alpha = _held(state, control_weight(cov, var_f, var_m), var_f, started, clip)
+    alpha = _bounded_alpha(state, control_weight(cov, var_f, var_m), var_f, started, clip)
     gradient = advance(state.gradient, current, previous, alpha)
     return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha, var_f)
 
@@ -178,11 +178,11 @@ def _observe(
     centred: bool,
     decouple: bool,
 ) -> tuple[State, Array, Array, Array, Array]:
-    """The state that has seen F and ΔF, Var F, Var ΔF, Var M of the step before, and 1 where there was one, else 0."""
+    """The state with statistics of F and ΔF, Var F, Var ΔF, Var M of the last step, and 1 where there was a last step, else 0."""
     if isinstance(step_norm, (int, float)):
         step_norm = arrays.scalar(float(step_norm), F)
-    unseen = state.proportional.square == 0.0
-    # Two masks: the first step has no difference, and a step of length 0 tells nothing of it.
+    only_zeros = state.proportional.square == 0.0
+    # Two masks: the first step has no difference, and a step of length 0 has no information on it.
     started = arrays.where(state.steps > 0.0, 1.0, 0.0)
     changed = started * arrays.where(step_norm > 0.0, 1.0, 0.0)
     unit = arrays.where(step_norm > 0.0, step_norm, 1.0) if decouple else step_norm * 0.0 + 1.0
@@ -193,13 +193,13 @@ def _observe(
     scale_f = 1.0 / weight_f
     scale_d = arrays.where(weight_d > 0.0, 1.0, 0.0) / arrays.where(weight_d > 0.0, weight_d, 1.0)
     length = step_norm * step_norm if decouple else changed * 1.0
-    # Numbers must be in memory before they meet arrays: Dr.Jit stretches an unevaluated number in place to the array's size.
+    # Numbers must be in memory before they meet arrays: Dr.Jit resizes an unevaluated number in place to the array's size.
     arrays.evaluate(started, unit, past, gain_f, gain_d, weight_f, weight_d, scale_f, scale_d, length)
     proportional = _average(state.proportional, F, gain_f, weight_f)
     changes = _average(state.difference, difference / unit, gain_d, weight_d)
     var_f = _variance(proportional, scale_f, centred)
     var_d = _variance(changes, scale_d, centred) * length
-    var_m = arrays.where(unseen, arrays.maximum(var_f / past, state.variance), state.variance)
+    var_m = arrays.where(only_zeros, arrays.maximum(var_f / past, state.variance), state.variance)
     return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m, started
 
 
@@ -217,11 +217,13 @@ def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     if not centred:
         return square
     about = square - mean * mean
-    return arrays.where(about > 1e-4 * square, about, 0.0)  # less is what single precision leaves of equal samples
+    return arrays.where(
+        about > 1e-4 * square, about, 0.0
+    )  # below is rounding error of equal samples in single precision
 
 
-def _held(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) -> Array:
-    """α of this step: 0 at the first; within Eq. 17 where nothing but zeros was seen, and everywhere with `clip`."""
+def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) -> Array:
+    """α of this step: 0 at the first; bounded by Eq. 17 where all samples were zero, and everywhere with `clip`."""
     bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
     alpha = arrays.where(var_f > 0.0, alpha, bound)
     return (arrays.minimum(alpha, bound) if clip else alpha) * started
@@ -232,7 +234,7 @@ def _next(
 ) -> tuple[Array, Array, Array, State]:
     steps = state.steps + 1.0
     arrays.evaluate(steps)
-    least = gradient * gradient / steps
-    variance = arrays.where(var_f > 0.0, variance, arrays.maximum(variance, least))
+    floor = gradient * gradient / steps
+    variance = arrays.where(var_f > 0.0, variance, arrays.maximum(variance, floor))
     after = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=steps)
     return gradient, variance, alpha, after

@@ -1,4 +1,4 @@
-"""The recursion that carries an estimate from one state of the scene to the next, written once."""
+"""The recursion of control variates from one state of the scene to the next."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def advance(memory: Array, current: Array, previous: Array, weight: Array) -> Ar
     earlier samples is not quite independent of M_{n-1}.
 
     Args:
-        memory: M_{n-1}, the estimate for the previous state. Elements that are not finite are forgotten: M_n = F there.
+        memory: M_{n-1}, the estimate for the previous state. Elements that are not finite are reset: M_n = F there.
         current: F, the current state's estimate.
         previous: H, the previous state's estimate from the samples of F.
-        weight: w in [0, 1]: 0 forgets the past, 1 trusts it fully. An array or a number.
+        weight: w in [0, 1]: with 0 the past has no influence. An array or a number.
     """
     difference = memory - previous
     return current + weight * arrays.where(arrays.is_finite(difference), difference, 0.0)

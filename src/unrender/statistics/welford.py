@@ -35,7 +35,7 @@ from unrender.core.arrays import Array
 
 @dataclass(frozen=True)
 class State:
-    """What has been seen of a stream of pairs (x, y).
+    """Running statistics of a stream of pairs (x, y).
 
     The three weights are device numbers, not Python's: they change from step to step and must not become literals of
     a kernel.
@@ -58,7 +58,7 @@ class State:
 
 
 def init(like: Array) -> State:
-    """Nothing seen yet. `like` gives shape and kind of the samples."""
+    """Before the first sample. `like` gives shape and type of the samples."""
     zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
     return State(zeros, zeros, zeros, zero, zero, zero)
 

@@ -1,4 +1,4 @@
-"""What a parameter starts from: a number, a colour, a picture, a grid or an array becomes an array of its shape."""
+"""Initial and true values of parameters: a number, a colour, an image, a grid or an array becomes an array of the parameter's shape."""
 
 from __future__ import annotations
 

@@ -1,0 +1,115 @@
+"""What an estimate can carry beside loss and gradient, one type each: estimators provide these types, optimizers require them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from unrender.core.arrays import Array
+from unrender.core.trees import Tree
+
+__all__ = [
+    "Capabilities",
+    "Capability",
+    "Gradient",
+    "Hessian",
+    "HessianProduct",
+    "LossFunction",
+    "Smoothing",
+    "Variance",
+]
+
+
+@dataclass(frozen=True)
+class Capability:
+    """One quantity that an estimator computes. Subclasses name it and hold its value.
+
+    Attributes:
+        name: what messages and `Estimator.provides` call it.
+    """
+
+    name: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class Gradient(Capability):
+    """`Estimate.gradient` has an entry for every parameter. For `provides` and `requires` only: the value is a field of `Estimate`."""
+
+    name: ClassVar[str] = "gradient"
+
+
+@dataclass(frozen=True)
+class Variance(Capability):
+    """The variance of the gradient.
+
+    Attributes:
+        values: {key: array}, of the gradient's keys and shapes, >= 0.
+    """
+
+    name: ClassVar[str] = "variance"
+    values: Tree
+
+
+@dataclass(frozen=True)
+class Hessian(Capability):
+    """The Hessian of the loss.
+
+    Attributes:
+        matrix: (n, n) over all parameters flattened in key order.
+    """
+
+    name: ClassVar[str] = "hessian"
+    matrix: Array
+
+
+@dataclass(frozen=True)
+class HessianProduct(Capability):
+    """Products of the Hessian of the loss with vectors.
+
+    Attributes:
+        apply: from a tree v of the parameters' keys and shapes to H v.
+    """
+
+    name: ClassVar[str] = "hvp"
+    apply: Callable[[Tree], Tree]
+
+
+@dataclass(frozen=True)
+class LossFunction(Capability):
+    """The loss at any points, all evaluated with this step's random numbers.
+
+    Attributes:
+        evaluate: from points (B, n), all parameters flattened in key order, to losses (B,); NumPy arrays.
+    """
+
+    name: ClassVar[str] = "losses"
+    evaluate: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Smoothing(Capability):
+    """The derivatives are those of the loss smoothed by a Gaussian over the parameters. Trust regions are in units of its σ.
+
+    Attributes:
+        sigma: {key: standard deviation in units of the parameter}, > 0.
+    """
+
+    name: ClassVar[str] = "sigma"
+    sigma: Mapping[str, float]
+
+
+class Capabilities(frozenset[str]):
+    """A set of capability types, for `Estimator.provides` and `Optimizer.requires`. Reads as the set of their names.
+
+    `Capabilities(Gradient, Variance)` equals `{"gradient", "variance"}`.
+    """
+
+    types: frozenset[type[Capability]]
+
+    def __new__(cls, *types: type[Capability]) -> Capabilities:
+        made = super().__new__(cls, (kind.name for kind in types))
+        made.types = frozenset(types)
+        return made

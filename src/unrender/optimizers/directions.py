@@ -1,0 +1,101 @@
+"""How a search direction becomes a step: what `Newton`, `NewtonCG` and `LBFGS` share.
+
+They choose a direction on the host, in the coordinates u = x / scale; the step then is a multiple of the direction, or what an inner
+Adam makes of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from unrender.core import arrays, checks, vectors
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Smoothing
+from unrender.optimizers import rates
+from unrender.optimizers.adam import Adam, AdamState
+from unrender.schedules.functions import Schedule
+
+__all__ = ["DirectionOptions", "NewtonState", "apply_direction", "check_options", "coordinate_scales", "init_state"]
+
+
+@dataclass(frozen=True)
+class NewtonState:
+    """State between steps.
+
+    Attributes:
+        step: steps made so far.
+        learning_rates: of each parameter: its scale.
+        adam: of the inner Adam, in double precision on the host; None without one.
+    """
+
+    step: int
+    learning_rates: dict[str, float]
+    adam: AdamState | None = None
+
+
+class DirectionOptions(Protocol):
+    """The options that the methods share; `Newton` documents them."""
+
+    @property
+    def learning_rate(self) -> float: ...
+
+    @property
+    def step_scale(self) -> float: ...
+
+    @property
+    def inner_optimizer(self) -> Adam | None: ...
+
+    @property
+    def schedule(self) -> Schedule | None: ...
+
+
+def check_options(owner: str, options: DirectionOptions) -> None:
+    """Raise `InputError` for an option out of range or of the wrong type."""
+    rates.check(owner, options.learning_rate, options.schedule)
+    if checks.number(owner, "step_scale", options.step_scale, above=0.0) > 1.0:
+        raise InputError(f"{owner}: step_scale must be at most 1, got {options.step_scale!r}")
+    if options.inner_optimizer is not None and not isinstance(options.inner_optimizer, Adam):
+        raise InputError(f"{owner}: inner_optimizer must be an Adam or None, got {options.inner_optimizer!r}")
+
+
+def init_state(
+    owner: str, options: DirectionOptions, parameters: Tree, learning_rates: Mapping[str, float] | None
+) -> NewtonState:
+    """The state before the first step. Raises `InputError` for a learning rate that is not positive, or of an unknown parameter."""
+    own = rates.per_parameter(owner, parameters, options.learning_rate, learning_rates)
+    adam = None
+    if options.inner_optimizer is not None:
+        zeros = {key: np.zeros(arrays.shape(x)) for key, x in parameters.items()}
+        adam = options.inner_optimizer.init(zeros, learning_rates)
+    return NewtonState(0, own, adam)
+
+
+def coordinate_scales(estimate: Estimate, state: NewtonState, parameters: Tree) -> np.ndarray:
+    """The unit of each element's coordinate u, (n,): its learning rate, times the σ of smoothed derivatives."""
+    smoothing = estimate.get(Smoothing)
+    scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}
+    return vectors.repeat_per_element(scales, parameters)
+
+
+def apply_direction(
+    owner: str, options: DirectionOptions, direction: np.ndarray, state: NewtonState, parameters: Tree
+) -> tuple[Tree, NewtonState]:
+    """The step along a direction (n,), in units of the parameters, and the next state.
+
+    A direction that is not finite counts as zero.
+    """
+    if not np.isfinite(direction).all():
+        direction = np.zeros_like(direction)
+    step, adam = options.step_scale * direction, state.adam
+    if options.inner_optimizer is not None and adam is not None:
+        opposite = vectors.unravel(-direction, adam.first_moment)
+        steps, adam = options.inner_optimizer.update(Estimate(0.0, opposite), adam, opposite)
+        step = vectors.ravel(steps)
+    factor = rates.factor(owner, options.schedule, state.step)
+    return vectors.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)

@@ -1,0 +1,59 @@
+"""Denoising of the maps that an importance map is made of."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from unrender.evaluation import denoising
+from unrender.pixels.tiles import Tiles
+
+__all__ = ["MAP_DENOISERS", "MapDenoiser", "denoise_map", "denoise_side_by_side"]
+
+MapDenoiser = Literal["auto", "oidn", "optix", "variation", "none"]
+MAP_DENOISERS: tuple[MapDenoiser, ...] = ("auto", "oidn", "optix", "variation", "none")
+
+_MARGIN = 4
+"""Tiles of padding around each map where several are denoised in one image."""
+
+
+def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser) -> np.ndarray:
+    """A map (tiles, 3) denoised, the tiles of each view as an image; unchanged by "none"."""
+    if by == "none":
+        return values
+    if by == "auto" and denoising.variant.current() != denoising.variant.CUDA:
+        by = "oidn" if importlib.util.find_spec("pyoidn") else "variation"
+    maps = tiles.split(values)
+    denoised: list[np.ndarray] = [np.empty(0)] * len(maps)
+    for shape in {part.shape for part in maps}:
+        alike = [index for index, part in enumerate(maps) if part.shape == shape]
+        found = denoise_side_by_side(
+            np.stack([maps[index] for index in alike]), lambda x: denoising.denoise(x, by=by, fast=True)
+        )
+        for index, part in zip(alike, found, strict=True):
+            denoised[index] = part
+    return tiles.join(denoised).astype(np.float64)
+
+
+def denoise_side_by_side(maps: np.ndarray, denoise: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """`denoise` applied to maps (n, rows, columns, 3) side by side in one image, since each call has a fixed cost.
+
+    Mirrored margins keep the filter from mixing neighbouring maps.
+    """
+    count, rows, columns, _ = maps.shape
+    across = math.ceil(math.sqrt(count))
+    down = math.ceil(count / across)
+    margin = min(_MARGIN, rows, columns) if count > 1 else 0
+    padded = np.pad(maps, [(0, 0), (margin, margin), (margin, margin), (0, 0)], mode="symmetric")
+    padded = np.concatenate([padded, np.zeros((across * down - count, *padded.shape[1:]))])
+    height, width = padded.shape[1:3]
+    image = padded.reshape(down, across, height, width, 3).swapaxes(1, 2).reshape(down * height, across * width, 3)
+    scale = float(image.max()) or 1.0
+    denoised = (
+        denoise(image / scale).reshape(down, height, across, width, 3).swapaxes(1, 2).reshape(-1, height, width, 3)
+    )
+    return denoised[:count, margin : margin + rows, margin : margin + columns] * scale

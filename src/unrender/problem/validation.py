@@ -1,0 +1,303 @@
+"""What the user gives to a `Problem`, checked and read: parameters, views, truth, bounds, the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.io import images, parameter_values, scene_files
+from unrender.losses import Loss
+from unrender.preconditioners.base import Preconditioner
+from unrender.problem import coarse_to_fine
+from unrender.problem.coarse_to_fine import CoarseToFine
+from unrender.problem.errors import FieldError
+from unrender.problem.parameter import Parameter
+from unrender.problem.view import View
+from unrender.rendering.renderer import ParameterInfo, Renderer
+
+__all__ = [
+    "Bounds",
+    "CheckedParameter",
+    "check_loss",
+    "check_max_depth",
+    "check_parameter",
+    "check_sequence",
+    "check_truth",
+    "check_view",
+    "open_renderer",
+]
+
+Bounds = tuple[float | None, float | None]
+
+
+@runtime_checkable
+class _Renderer(Renderer, Protocol): ...
+
+
+@runtime_checkable
+class _Preconditioner(Preconditioner, Protocol): ...
+
+
+@runtime_checkable
+class _Loss(Loss, Protocol): ...
+
+
+@dataclass(frozen=True)
+class CheckedParameter:
+    """A parameter with its defaults filled in.
+
+    Attributes:
+        key: of the scene.
+        bounds: (low, high); None is open.
+        learning_rate: None for the optimizer's.
+        preconditioner: None for none.
+        coarse_to_fine: None where its resolution is constant.
+        initial: float32, inside the bounds, of the scene's shape.
+        notices: one line for each change made to the input.
+    """
+
+    key: str
+    bounds: Bounds
+    learning_rate: float | None
+    preconditioner: Preconditioner | None
+    coarse_to_fine: CoarseToFine | None
+    initial: np.ndarray
+    notices: tuple[str, ...]
+
+
+def check_max_depth(max_depth: Any) -> int:
+    """Raise `FieldError` for what is no longest path length."""
+    if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {max_depth!r}")
+    return max_depth
+
+
+def check_loss(loss: Any) -> Loss:
+    """Raise `FieldError` for what is no loss."""
+    if isinstance(loss, type) or not isinstance(loss, _Loss):
+        raise FieldError(("loss",), f"expected one of unrender.losses, such as L2(), got {loss!r}")
+    return loss
+
+
+def check_parameter(
+    index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
+) -> CheckedParameter:
+    """The parameter with its defaults. Raises `FieldError` for the field that is wrong.
+
+    Args:
+        index: of the parameter in the problem, for messages.
+        parameter: as given.
+        known: the scene's parameters.
+        renderer: gives the scene's own value where there is no initial one.
+    """
+    key = parameter.key
+    if not isinstance(key, str) or key not in known:
+        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{_near_key(str(key), known)}")
+    info = known[key]
+    if not info.differentiable and not info.perturbable:
+        raise FieldError(("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}")
+
+    def wrong(field: str, what: str | Exception) -> FieldError:
+        return FieldError(("parameters", index, field), str(what), f"parameter {key}: {field}")
+
+    try:
+        bounds = _bounds(parameter.bounds, info)
+    except InputError as error:
+        raise wrong("bounds", error) from error
+    rate = parameter.learning_rate
+    if rate is not None and (not _is_number(rate) or rate <= 0):
+        raise wrong("learning_rate", f"expected a number above 0, got {rate!r}")
+    try:
+        preconditioner = _preconditioner(parameter, info)
+    except InputError as error:
+        raise wrong("preconditioner", error) from error
+    try:
+        schedule = _coarse_to_fine(parameter, info)
+    except InputError as error:
+        raise wrong("coarse_to_fine", error) from error
+    try:
+        start, notice = _initial(parameter, info, renderer)
+    except InputError as error:
+        raise wrong("initial", error) from error
+    initial, clipped = _clip_to_bounds(start, bounds)
+    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
+    own_rate = None if rate is None else float(rate)
+    return CheckedParameter(key, bounds, own_rate, preconditioner, schedule, initial, tuple(notices))
+
+
+def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner | None:
+    preconditioner = parameter.preconditioner
+    if preconditioner is None:
+        return None
+    if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
+        raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
+    try:
+        preconditioner.check(parameter.key, info.shape)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{parameter.key}: preconditioner ")) from error
+    return preconditioner
+
+
+def _coarse_to_fine(parameter: Parameter, info: ParameterInfo) -> CoarseToFine | None:
+    if parameter.coarse_to_fine is None:
+        return None
+    schedule = coarse_to_fine.of(parameter.coarse_to_fine)
+    if not info.resizable:
+        raise InputError("its resolution is fixed; expected the data of a bitmap texture or a grid volume")
+    schedule.check(info.shape)
+    if parameter.preconditioner is not None:
+        parameter.preconditioner.check(parameter.key, schedule.shape(info.shape, 0))
+    return schedule
+
+
+def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> tuple[np.ndarray, str]:
+    """The initial value, float32, and what was changed to make it fit, "" for nothing."""
+    if parameter.initial is not None:
+        return parameter_values.fill(parameter.initial, info.shape)
+    start = arrays.numpy(renderer.values([parameter.key])[parameter.key]).astype(np.float32)
+    if not np.isfinite(start).all():
+        raise InputError("the scene's own value is not finite; give another")
+    return start, ""
+
+
+def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
+    """`start` inside the bounds, and how many values changed, "" for none."""
+    low, high = bounds
+    inside = np.clip(start, low, high) if (low, high) != (None, None) else start
+    moved = int(np.sum(inside != start))
+    notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]" if moved else ""
+    return inside.astype(np.float32), notice
+
+
+def check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
+    """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
+
+    Args:
+        index: of the view in the problem, for messages.
+        view: as given.
+        resolutions: (height, width) of each sensor's film.
+    """
+    owner = f"view {index}"
+
+    def wrong(field: str, what: str | Exception) -> FieldError:
+        return FieldError(("views", index, field), str(what), f"{owner}: {field}")
+
+    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(resolutions):
+        have = f"0 to {len(resolutions) - 1}" if len(resolutions) > 1 else "0, the only sensor"
+        raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
+    if not _is_number(view.weight) or view.weight <= 0:
+        raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
+    height, width = resolutions[view.sensor]
+    try:
+        image = images.read(view.reference)
+        _check_size(image.values, height, width, view.sensor)
+    except InputError as error:
+        raise wrong("reference", error) from error
+    notices = [f"{owner}: reference {image.notice}"] if image.notice else []
+    reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
+    mask = None
+    if view.mask is not None:
+        try:
+            mask = images.read(view.mask, linearise=False).values
+            _check_size(mask, height, width, view.sensor)
+            mask = mask.mean(axis=2)
+            if mask.min() < 0 or mask.max() > 1:
+                raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
+            if not mask.any():
+                raise InputError("it is 0 everywhere: no pixel would count")
+        except InputError as error:
+            raise wrong("mask", error) from error
+    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
+
+
+def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> tuple[np.ndarray, str]:
+    """The true value of a parameter, float32, and what was changed to make it fit, "" for nothing. Raises `FieldError`."""
+    if key not in shapes:
+        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, shapes)}")
+    try:
+        return parameter_values.fill(value, shapes[key])
+    except InputError as error:
+        raise FieldError(("truth", key), str(error)) from error
+
+
+def open_renderer(scene: Any, max_depth: int) -> Renderer:
+    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, or itself. Raises `FieldError`."""
+    if isinstance(scene, _Renderer) and not isinstance(scene, type):
+        return scene
+    if not isinstance(scene, (str, Path, dict)) and not callable(scene):
+        got = type(scene).__name__
+        raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
+    from unrender.backend.variant import ensure
+
+    try:
+        if isinstance(scene, (str, Path)) and Path(scene).is_file() and Path(scene).suffix.lower() == ".xml":
+            scene_files.of(Path(scene))  # refuses what Mitsuba would include from elsewhere
+    except InputError as error:
+        raise FieldError(("scene",), str(error).removeprefix("scene ")) from error
+    ensure()
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+
+    try:
+        return MitsubaRenderer(scene, max_depth)
+    except InputError as error:
+        raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
+
+
+def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
+    """A tuple of at least one `kind`. Raises `FieldError`."""
+    items = (given,) if isinstance(given, kind) else given
+    if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
+        raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(given).__name__}")
+    if not items:
+        raise FieldError((name,), f"expected at least one {kind.__name__}, got none")
+    for index, item in enumerate(items):
+        if not isinstance(item, kind):
+            what = f"expected a {kind.__name__}, got {type(item).__name__}"
+            raise FieldError((name, index), what)
+    return tuple(items)
+
+
+def _bounds(given: Any, info: ParameterInfo) -> Bounds:
+    if given is None:
+        return info.lowest, info.highest
+    if isinstance(given, (str, bytes)) or not isinstance(given, Sequence) or len(given) != 2:
+        raise InputError(f"expected (low, high), either may be None, got {given!r}")
+    for side in given:
+        if side is not None and (isinstance(side, bool) or not isinstance(side, (int, float)) or math.isnan(side)):
+            raise InputError(f"expected two numbers or None, got {side!r}")
+    low, high = (None if side is None else float(side) for side in given)
+    if low == math.inf or high == -math.inf:
+        raise InputError(f"low must be less than high, got {low} and {high}")
+    low, high = None if low == -math.inf else low, None if high == math.inf else high
+    if low is not None and high is not None and low >= high:
+        raise InputError(f"low must be less than high, got {low:g} and {high:g}")
+    return low, high
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)
+
+
+def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> None:
+    if values.shape[:2] != (height, width):
+        raise InputError(
+            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
+            f"but the film of sensor {sensor} is {width}x{height}"
+        )
+
+
+def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
+    able = [name for name, info in known.items() if info.differentiable or info.perturbable]
+    # Mitsuba may call an owner by its shape where people think of its material: the rest of the key tells as much.
+    alike = [name for name in able if name.endswith("." + key.partition(".")[2])] if "." in key else []
+    if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, able) or did_you_mean(key, known):
+        return near
+    return f"; it has {', '.join(able[:6])}{' and others' if len(able) > 6 else ''}" if able else ""

@@ -1,0 +1,134 @@
+"""Draws from the smoothing kernels, evaluations of the function at them, and the mean with its standard error."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy import special
+from scipy.stats import qmc
+
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.smoothing.options import SamplingOptions
+
+__all__ = ["Function", "SmoothedFunction"]
+
+Function = Callable[[np.ndarray], np.ndarray]
+"""(B, n) to (B,)."""
+
+_REPLICATES = 8
+"""Independent scramblings of a low-discrepancy sequence, over which its standard error is measured."""
+
+
+class SmoothedFunction:
+    """f convolved with a Gaussian of standard deviation σ, at one point θ: checked arguments, draws, evaluations, statistics.
+
+    Args:
+        name: of the public function, for messages.
+        f: (B, n) to (B,).
+        theta: (n,), finite.
+        sigma: > 0, a number or (n,).
+        options: how to draw.
+        sides: evaluations of f per sample point.
+
+    Raises:
+        InputError: σ not positive, shapes that do not fit, too few samples.
+    """
+
+    def __init__(self, name: str, f: Function, theta: Any, sigma: Any, options: SamplingOptions, sides: int = 1):
+        self.owner, self.f, self.seed = f"smoothed.{name}", f, options.seed
+        self.theta = np.array(theta, np.float64)
+        if self.theta.ndim != 1 or self.theta.size == 0 or not np.isfinite(self.theta).all():
+            raise InputError(f"{self.owner}: theta must be a finite vector (n,), got shape {self.theta.shape}")
+        self.n = self.theta.size
+        self.sigma = self.vector("sigma", sigma)
+        if not (self.sigma > 0).all():
+            raise InputError(f"{self.owner}: sigma must be above 0, got {sigma!r}")
+        self.antithetic, self.low_discrepancy = options.antithetic, options.low_discrepancy
+        least = 16 if self.low_discrepancy else 4
+        per_draw = (2 if self.antithetic else 1) * sides
+        self.draws = checks.integer(self.owner, "samples", options.samples, at_least=least * sides) // per_draw
+
+    def vector(self, name: str, given: Any) -> np.ndarray:
+        """A finite vector (n,) from a number or a vector."""
+        found = np.array(given, np.float64)
+        if found.shape not in ((), (self.n,)) or not np.isfinite(found).all():
+            raise InputError(f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {given!r}")
+        return np.broadcast_to(found, (self.n,)).copy()
+
+    def draw(self, sampler: Callable[..., np.ndarray], stream: int = 0) -> np.ndarray:
+        """(draws, n): `sampler` of uniform choices (B,), uniform numbers (B, n) and standard normals (B, n)."""
+        if not self.low_discrepancy:
+            rng = np.random.default_rng([self.seed, stream])
+            count = self.draws
+            return sampler(
+                rng.random(count), _open_interval(rng.random((count, self.n))), rng.standard_normal((count, self.n))
+            )
+        parts = []
+        for replicate in range(_REPLICATES):
+            rng = np.random.default_rng([self.seed, stream, replicate])
+            # SciPy warns of counts that are no power of 2, whose balance is slightly worse.
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                points = qmc.Sobol(self.n + 1, scramble=True, rng=rng).random(max(self.draws // _REPLICATES, 1))
+            u = _open_interval(points[:, 1:])
+            parts.append(sampler(points[:, 0], u, special.ndtri(u)))
+        return np.concatenate(parts)
+
+    def odd(self, z: np.ndarray, offset: float, theta: np.ndarray | None = None) -> np.ndarray:
+        """The factor of an odd kernel, (B,): f(θ − σ z), with antithetic draws half its difference to f(θ + σ z)."""
+        center = self.theta if theta is None else theta
+        if not self.antithetic:
+            return self.evaluate(center - self.sigma * z) - offset
+        behind, ahead = self.pairs(z, center)
+        return 0.5 * (behind - ahead)
+
+    def even(self, z: np.ndarray, offset: float) -> np.ndarray:
+        """The factor of an even kernel, (B,): f(θ − σ z), with antithetic draws its mean with f(θ + σ z)."""
+        if not self.antithetic:
+            return self.evaluate(self.theta - self.sigma * z) - offset
+        behind, ahead = self.pairs(z)
+        return 0.5 * (behind + ahead) - offset
+
+    def pairs(self, z: np.ndarray, theta: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """f(θ − σ z) and f(θ + σ z), (B,) each, by one call of f."""
+        center = self.theta if theta is None else theta
+        both = self.evaluate(np.concatenate([center - self.sigma * z, center + self.sigma * z]))
+        return both[: len(z)], both[len(z) :]
+
+    def leave_one_out_sum(self, values: np.ndarray) -> np.ndarray:
+        """Per draw, the sum of `values` (B,) over all draws that are independent of it."""
+        if not self.low_discrepancy:
+            return values.sum() - values
+        own = values.reshape(_REPLICATES, -1).sum(axis=1)
+        return np.repeat(values.sum() - own, len(values) // _REPLICATES)
+
+    def value_at_theta(self) -> float:
+        """f(θ), not smoothed."""
+        return float(self.evaluate(self.theta[None])[0])
+
+    def evaluate(self, points: np.ndarray) -> np.ndarray:
+        """f at points (B, n). Raises `InputError` for values of another shape than (B,), or not finite."""
+        values = np.asarray(self.f(points), np.float64)
+        if values.shape != (len(points),):
+            raise InputError(
+                f"{self.owner}: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
+            )
+        if not np.isfinite(values).all():
+            worst = points[~np.isfinite(values)][0]
+            raise InputError(f"{self.owner}: f is not finite at {np.array2string(worst, threshold=8, precision=4)}")
+        return values
+
+    def mean_and_error(self, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean over draws (B, ...) and its standard error; with low discrepancy, from the means of the scramblings."""
+        if self.low_discrepancy:
+            draws = draws.reshape(_REPLICATES, -1, *draws.shape[1:]).mean(axis=1)
+        return draws.mean(axis=0), draws.std(axis=0, ddof=1) / np.sqrt(len(draws))
+
+
+def _open_interval(u: np.ndarray) -> np.ndarray:
+    """Uniform numbers clipped away from 0 and 1."""
+    return np.clip(u, 2.0**-53, 1 - 2.0**-53)
