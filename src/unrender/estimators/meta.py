@@ -9,6 +9,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
@@ -40,6 +41,7 @@ class MetaState:
     pixels: Any = None
 
 
+@register
 @dataclass(frozen=True)
 class MetaEstimator:
     """M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i: Eq. 7 of Balint et al. 2023, per element of each parameter.

@@ -8,6 +8,7 @@ from typing import Any
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, Estimate
 from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
@@ -33,6 +34,7 @@ class PathGradientState:
     batches: int = 0
 
 
+@register
 @dataclass(frozen=True)
 class PathGradient:
     """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).

@@ -12,6 +12,7 @@ from unrender import smoothing as smoothed
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, HESSIAN, HVP, LOSSES, VARIANCE, Estimate
@@ -34,6 +35,7 @@ class SmoothedState:
     age: float = 0.0
 
 
+@register
 @dataclass(frozen=True)
 class SmoothedDerivatives:
     """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of deviation σ.

@@ -10,6 +10,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.evaluation import denoising
 from unrender.evaluation.denoising import Denoiser
@@ -20,6 +21,7 @@ from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
 
+@register
 @dataclass(frozen=True)
 class Denoised:
     """What another image estimator makes, denoised before the loss sees it. Biased.

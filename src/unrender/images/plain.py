@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame
@@ -18,6 +19,7 @@ class PlainState:
     """Nothing is kept."""
 
 
+@register
 @dataclass(frozen=True)
 class Plain:
     """One independent rendering per step. Unbiased."""

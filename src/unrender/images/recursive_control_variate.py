@@ -13,6 +13,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame, PixelBatch, WholeView
@@ -67,6 +68,7 @@ class RecursiveControlVariateState:
     snapshot: Snapshot | None = None
 
 
+@register
 @dataclass(frozen=True)
 class RecursiveControlVariate:
     """⟨F_n⟩_CV = ⟨F_n⟩_n + w_n (⟨F_{n-1}⟩_CV − ⟨F_{n-1}⟩_n), Eq. 6, per view, pixel and colour channel.

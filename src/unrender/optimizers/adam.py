@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
@@ -32,6 +33,7 @@ class AdamState:
     begun: int = 0
 
 
+@register
 @dataclass(frozen=True)
 class Adam:
     """Steps −η m̂ / (√v̂ + ε): the debiased mean of the gradient over the root of its debiased mean square, per

@@ -13,6 +13,7 @@ import numpy as np
 
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import LOSSES, Estimate
 from unrender.optimizers import rates
@@ -47,6 +48,7 @@ class CMAESState:
     _search: ClassVar[_Search | None] = None
 
 
+@register
 @dataclass(frozen=True)
 class CMAES:
     """One generation of CMA-ES a step: points around a mean are drawn from a Gaussian, their losses ranked, and mean and covariance moved

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
 from unrender.optimizers import rates
@@ -25,6 +26,7 @@ class MetaAdamState:
     learning_rates: dict[str, float]
 
 
+@register
 @dataclass(frozen=True)
 class MetaAdam:
     """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator itself gives.

@@ -14,6 +14,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, vectors
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, HESSIAN, Estimate
 from unrender.optimizers import rates
@@ -38,6 +39,7 @@ class NewtonState:
     adam: AdamState | None = None
 
 
+@register
 @dataclass(frozen=True)
 class Newton:
     """Steps −γ H̃⁻¹ g (Eq. 3) with a positive definite H̃, within a trust region.

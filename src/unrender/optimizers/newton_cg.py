@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import checks, vectors
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, HVP, LOSSES, Estimate
 from unrender.optimizers.adam import Adam
@@ -16,6 +17,7 @@ from unrender.optimizers.newton import NewtonState, begin, check, finish, scales
 from unrender.schedules.functions import Schedule
 
 
+@register
 @dataclass(frozen=True)
 class NewtonCG:
     """A step that solves H s = −g by conjugate gradients (Fletcher and Reeves), truncated at a trust radius.

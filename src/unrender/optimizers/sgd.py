@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
@@ -27,6 +28,7 @@ class SGDState:
     velocity: Tree
 
 
+@register
 @dataclass(frozen=True)
 class SGD:
     """Steps −η u with the velocity u ← μ u + g (Polyak's heavy ball).

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.problem.problem import Problem
@@ -15,6 +16,7 @@ class AllState:
     """Nothing is kept."""
 
 
+@register
 @dataclass(frozen=True)
 class All:
     """Look at the whole film of each view at each step."""

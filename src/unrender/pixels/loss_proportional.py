@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.pixels.guided import Clean, GuidedSampler, GuidedSamplerState, MapDenoiser, Maps
@@ -14,6 +15,7 @@ from unrender.pixels.tiles import Tiles
 from unrender.problem.problem import Problem
 
 
+@register
 @dataclass(frozen=True)
 class LossProportional:
     """p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`): how much a pixel counts, but not how noisy or how telling it is.

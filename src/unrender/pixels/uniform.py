@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from unrender.core import checks
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.tiles import InverseCdfTable, cut
@@ -19,6 +20,7 @@ class UniformState:
     table: InverseCdfTable
 
 
+@register
 @dataclass(frozen=True)
 class Uniform:
     """Every pixel of every view is equally likely.
