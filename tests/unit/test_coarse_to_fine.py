@@ -180,7 +180,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         assert image.views is past.views
     if name == "adaptive":
         np.testing.assert_allclose(
-            new.pixels.energy[KEY], by_hand(old.pixels.energy[KEY], multiresolution.SQUARES), rtol=1e-10
+            new.pixels.second_moment[KEY], by_hand(old.pixels.second_moment[KEY], multiresolution.SQUARES), rtol=1e-10
         )
         assert new.pixels.maps is old.pixels.maps
     if isinstance(new, MetaState):
