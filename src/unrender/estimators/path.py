@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from unrender.core import arrays
@@ -17,6 +17,7 @@ from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler, upsampled
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,10 @@ class PathGradientState:
     image: Any
     pixels: Any
     batches: int = 0
+
+    def upsampled(self, upsampler: Upsampler) -> PathGradientState:
+        """See `Upsamplable`: the states of image estimator and pixel sampler are carried."""
+        return replace(self, image=upsampled(self.image, upsampler), pixels=upsampled(self.pixels, upsampler))
 
 
 @register

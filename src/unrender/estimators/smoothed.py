@@ -18,6 +18,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, HESSIAN, HVP, LOSSES, VARIANCE, Estimate
 from unrender.estimators.loss_values import BlackBox
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
 _Derivatives = tuple[tuple[np.ndarray, np.ndarray], Callable[[], np.ndarray], Callable[[np.ndarray], np.ndarray]]
@@ -33,6 +34,16 @@ class SmoothedState:
     """
 
     age: float = 0.0
+
+    def upsampled(self, upsampler: Upsampler) -> SmoothedState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
+
+    def restarted(self, fresh: SmoothedState) -> SmoothedState:
+        """See `Restartable`: the schedule of σ goes on."""
+        del fresh
+        return self
 
 
 @register

@@ -11,12 +11,18 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
 
 
 @dataclass(frozen=True)
 class PlainState:
     """Nothing is kept."""
+
+    def upsampled(self, upsampler: Upsampler) -> PlainState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
 
 @register

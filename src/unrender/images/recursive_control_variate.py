@@ -18,6 +18,7 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
@@ -66,6 +67,10 @@ class RecursiveControlVariateState:
     parameters: Tree | None = None
     views: tuple[ViewMemory, ...] = ()
     snapshot: Snapshot | None = None
+
+    def upsampled(self, upsampler: Upsampler) -> RecursiveControlVariateState:
+        """See `Upsamplable`: the previous parameters are interpolated, images stay."""
+        return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
 
 @register

@@ -11,6 +11,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
+from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -31,6 +32,15 @@ class AdamState:
     first_moment: Tree
     second_moment: Tree
     begun: int = 0
+
+    def upsampled(self, upsampler: Upsampler) -> AdamState:
+        """See `Upsamplable`: the moments are interpolated."""
+        first, second = upsampler.tree(self.first_moment, 1.0), upsampler.tree(self.second_moment, SQUARES)
+        return replace(self, first_moment=first, second_moment=second)
+
+    def restarted(self, fresh: AdamState) -> AdamState:
+        """See `Restartable`: the schedule goes on, the moments begin at this step."""
+        return replace(fresh, step=self.step, begun=self.step)
 
 
 @register

@@ -10,6 +10,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, VARIANCE, Estimate
 from unrender.optimizers import rates
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -24,6 +25,15 @@ class MetaAdamState:
 
     step: int
     learning_rates: dict[str, float]
+
+    def upsampled(self, upsampler: Upsampler) -> MetaAdamState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
+
+    def restarted(self, fresh: MetaAdamState) -> MetaAdamState:
+        """See `Restartable`: the schedule goes on."""
+        return replace(fresh, step=self.step)
 
 
 @register

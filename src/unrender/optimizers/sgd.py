@@ -10,6 +10,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import GRADIENT, Estimate
 from unrender.optimizers import rates
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -26,6 +27,14 @@ class SGDState:
     step: int
     learning_rates: dict[str, float]
     velocity: Tree
+
+    def upsampled(self, upsampler: Upsampler) -> SGDState:
+        """See `Upsamplable`: the velocity is interpolated."""
+        return replace(self, velocity=upsampler.tree(self.velocity, 1.0))
+
+    def restarted(self, fresh: SGDState) -> SGDState:
+        """See `Restartable`: the schedule goes on."""
+        return replace(fresh, step=self.step)
 
 
 @register

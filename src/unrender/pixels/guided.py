@@ -19,6 +19,7 @@ from unrender.pixels import pixel_statistics
 from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import SQUARES, Upsampler
 
 MapDenoiser = Literal["auto", "oidn", "optix", "variation", "none"]
 _MARGIN = 4
@@ -64,6 +65,10 @@ class GuidedSamplerState:
     references: np.ndarray
     refreshes: int = 0
     second_moment: Tree = field(default_factory=dict)
+
+    def upsampled(self, upsampler: Upsampler) -> GuidedSamplerState:
+        """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
+        return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.tiles import InverseCdfTable, cut
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,11 @@ class UniformState:
     """State between steps: the table of draws, which stays as it is."""
 
     table: InverseCdfTable
+
+    def upsampled(self, upsampler: Upsampler) -> UniformState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
 
 @register
