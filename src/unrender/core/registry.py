@@ -90,10 +90,6 @@ KINDS: dict[str, Kind] = {
             "gallery problem", "unrender.gallery", "unrender.gallery.specification.Specification",
             "scene parameters", "problem", in_tables=False,
         ),
-        _kind(
-            "renderer", "unrender.rendering.numpy", "unrender.rendering.renderer.Renderer",
-            "parameters values resolutions", in_tables=False,
-        ),
     )
 }  # fmt: skip
 """Every kind of component by name."""
