@@ -23,6 +23,7 @@ import logging
 import math
 import pkgutil
 import re
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -278,12 +279,12 @@ def _load_entry_points() -> None:
             return
         _loaded.add(GROUP)
         for point in importlib.metadata.entry_points(group=GROUP):
-            before = dict(_components)
             try:
                 point.load()
             except (Exception, SystemExit) as error:  # whatever a module of others raises
-                _components.clear()
-                _components.update(before)
+                # Those of a module whose import failed; other modules that it imported stay, and so do theirs.
+                for key in [key for key, each in _components.items() if each.made_by.__module__ not in sys.modules]:
+                    del _components[key]
                 words = " ".join(str(error).split())[:200]
                 _log.warning(
                     "entry point %s = %s of %s is left out: %s: %s",
