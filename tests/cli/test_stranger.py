@@ -110,7 +110,20 @@ class StrangerMethod(Options):
         return Recalling(ur.PathGradient(spp=self.spp)), Pacing(schedule=ur.schedules.Cosine(500))
 '''  # fmt: skip
 BROKEN = "raise ImportError('this library is missing\\nand more')\n"
-RUN = ["run", "exponential", "--method", "stranger", "-p", "loss=Quartic", "--steps", STEPS, "--threads", 1, "--seed", 3]
+RUN = [
+    "run",
+    "exponential",
+    "--method",
+    "stranger",
+    "-p",
+    "loss=Quartic",
+    "--steps",
+    STEPS,
+    "--threads",
+    1,
+    "--seed",
+    3,
+]
 
 
 def install(folder: Path, name: str, text: str) -> None:

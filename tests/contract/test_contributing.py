@@ -16,7 +16,9 @@ import unrender
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
-FILES = {name: text for text, name in re.findall(r"^```python\n(# (\w+)\.py\n.*?)^```$", TEXT, re.DOTALL | re.MULTILINE)}
+FILES = {
+    name: text for text, name in re.findall(r"^```python\n(# (\w+)\.py\n.*?)^```$", TEXT, re.DOTALL | re.MULTILINE)
+}
 REGISTERED = {
     "loss": "Charbonnier",
     "schedule": "InverseTime",

@@ -80,7 +80,9 @@ def test_every_public_component_is_registered(kind: str) -> None:
         exported = vars(importlib.import_module(told.package))
         public = {name for name in exported["__all__"] if hasattr(exported[name], "__dataclass_fields__")}
         assert public <= set(found)
-    assert {"PathGradient", "MetaEstimator", "SmoothedDerivatives", "LossValues"} <= set(registry.components("estimator"))
+    assert {"PathGradient", "MetaEstimator", "SmoothedDerivatives", "LossValues"} <= set(
+        registry.components("estimator")
+    )
 
 
 @pytest.mark.parametrize("name", sorted(set(TABLES) - {"Perceptual"}))  # whose default fetches a network's weights
@@ -295,7 +297,9 @@ class CheckedToo(Checked):
 
 def test_states_of_registered_modules_come_back_and_no_others() -> None:
     packed = pack(Remembered(np.arange(3)))
-    with pytest.raises(InputError, match=r"Remembered' is no state .* nor of a registered component; install the package"):
+    with pytest.raises(
+        InputError, match=r"Remembered' is no state .* nor of a registered component; install the package"
+    ):
         unpack(packed)
     np.testing.assert_array_equal(unpack(packed, [{"estimator": (Remembered(1),)}]).numbers, np.arange(3))
     ur.register(Cubic)

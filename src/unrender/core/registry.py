@@ -169,7 +169,9 @@ def components(kind: str) -> dict[str, type]:
 
 def table_components() -> dict[str, type]:
     """{name: class} of every component that a table {type = "Name", ...} can make, of all kinds."""
-    return {name: made_by for kind in KINDS.values() if kind.in_tables for name, made_by in components(kind.name).items()}
+    return {
+        name: made_by for kind in KINDS.values() if kind.in_tables for name, made_by in components(kind.name).items()
+    }
 
 
 def find(kind: str, name: str) -> type:
@@ -290,4 +292,3 @@ def _load_entry_points() -> None:
                     "entry point %s = %s of %s is left out: %s: %s",
                     point.name, point.value, GROUP, type(error).__name__, words,
                 )  # fmt: skip
-

@@ -104,7 +104,9 @@ def _component(given: Any, kind: str | None, folder: Path | None, depth: int) ->
 def _build(made_by: type[_T], name: str, given: Mapping[str, Any], folder: Path | None, depth: int) -> _T:
     found = {field.name: field for field in dataclasses.fields(made_by) if field.init}  # pyright: ignore[reportArgumentType]
     none = given.get(_NONE, [])
-    if _NONE not in found and (not isinstance(none, list) or any(not isinstance(key, str) or key not in found for key in none)):
+    if _NONE not in found and (
+        not isinstance(none, list) or any(not isinstance(key, str) or key not in found for key in none)
+    ):
         raise InputError(f"none: expected a list of fields of {name}, got {repr(none)[:80]}")
     arguments: dict[str, Any] = {} if _NONE in found else dict.fromkeys(none)
     hints = _hints(made_by)
