@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import write
 
 import unrender as ur
-from unrender.methods.catalogue import method
+from unrender.methods import method
 from unrender.runs.folder import writer
 from unrender.runs.folder.writer import RunWriter
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         smoothing as smoothed,
     )
     from unrender.core.random import Key
+    from unrender.core.registry import register
     from unrender.estimators.base import Estimate
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
@@ -89,6 +90,7 @@ _HOMES = {
     "export": "exporting.scene_folder",
     "optimize": "runs.loop",
     "read_grid": "io.volumes",
+    "register": "core.registry",
     "render": "problem.render",
     "render_pair": "problem.render",
     "resume": "runs.reopen",
@@ -129,6 +131,7 @@ __all__ = [
     "pixels",
     "preconditioners",
     "read_grid",
+    "register",
     "render",
     "render_pair",
     "report",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from unrender import gallery
-from unrender.methods.catalogue import METHODS
+from unrender.methods import methods
 
 COMMANDS = ("run", "compare", "report", "gallery", "methods", "doctor")
 
@@ -33,7 +33,7 @@ def test_version(unrender):
 def test_methods_lists_every_option_of_every_method(unrender):
     answer = unrender("methods")
     assert answer.status == 0
-    for method in METHODS.values():
+    for method in methods().values():
         alone = unrender("methods", method.name)
         assert alone.out in answer.out
         assert method.summary in alone.out

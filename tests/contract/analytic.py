@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
+from unrender.core import registry
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
 SHAPE = (4, 4)
@@ -39,3 +40,9 @@ def exact_gradient(found: ur.Problem, parameters: dict[str, np.ndarray]) -> dict
         result[key] = np.asarray(flat)[start : start + value.size].reshape(value.shape)
         start += value.size
     return result
+
+
+def others(kind: str) -> dict[str, type]:
+    """{name: class} of the registered components of a kind that other packages, installed here, have added."""
+    known = registry.components(kind)
+    return {name: made_by for name, made_by in known.items() if not made_by.__module__.startswith("unrender.")}

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import exact_gradient, problem
+from analytic import exact_gradient, others, problem
 from scipy import stats
 
 import unrender as ur
+from unrender.core import registry
 from unrender.core.random import Key
 from unrender.images.base import ImageEstimate
 from unrender.problem.batches import WholeView
@@ -66,6 +67,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
         coupled=True, spp=2, image=Denoised(CV(), by="variation")
     ),
 }
+ESTIMATORS |= others("estimator")
 # What the docstrings say of bias: a weight that knows its samples pulls toward zero.
 BIASED = {
     "meta, adaptive pixels",
@@ -79,6 +81,7 @@ BIASED = {
 # A black box's loss is that of noisy images: a test of its own.
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
 BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
+BIASED |= set(others("estimator"))
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
@@ -91,6 +94,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     ),
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
 }
+OPTIMIZERS |= others("optimizer")
 FITTING = [
     (estimator, optimizer)
     for estimator, optimizer in itertools.product(ESTIMATORS, OPTIMIZERS)
@@ -98,6 +102,11 @@ FITTING = [
     and "denoised"
     not in estimator  # pictures without structure are noise to a denoiser: tests/unit/test_denoised.py has others
 ]
+
+
+@pytest.mark.parametrize(("kind", "made"), [("estimator", ESTIMATORS), ("optimizer", OPTIMIZERS)])
+def test_every_registered_one_is_here(kind: str, made: dict[str, Callable[[], Any]]) -> None:
+    assert {type(make()) for make in made.values()} == set(registry.components(kind).values())
 
 
 @pytest.mark.parametrize(("estimator", "optimizer"), FITTING)

@@ -20,6 +20,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
+from unrender.problem.upsampling import SQUARES
 from unrender.runs import loop, multiresolution
 
 TRUTH = np.random.default_rng(2).uniform(0.2, 0.8, (16, 12, 1))
@@ -169,9 +170,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         np.testing.assert_allclose(new.velocity[KEY], by_hand(old.velocity[KEY], 1), rtol=1e-10)
     elif "meta" not in type(new).__name__.lower():
         np.testing.assert_allclose(new.first_moment[KEY], by_hand(old.first_moment[KEY], 1), rtol=1e-10, atol=1e-18)
-        np.testing.assert_allclose(
-            new.second_moment[KEY], by_hand(old.second_moment[KEY], multiresolution.SQUARES), rtol=1e-10
-        )
+        np.testing.assert_allclose(new.second_moment[KEY], by_hand(old.second_moment[KEY], SQUARES), rtol=1e-10)
         assert new.begun == 0
     old, new = before.estimator, memory.estimator
     image, past = new.image, old.image
@@ -180,7 +179,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         assert image.views is past.views
     if name == "adaptive":
         np.testing.assert_allclose(
-            new.pixels.energy[KEY], by_hand(old.pixels.energy[KEY], multiresolution.SQUARES), rtol=1e-10
+            new.pixels.second_moment[KEY], by_hand(old.pixels.second_moment[KEY], SQUARES), rtol=1e-10
         )
         assert new.pixels.maps is old.pixels.maps
     if isinstance(new, MetaState):
@@ -199,9 +198,9 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         ratio = lengths[0] / lengths[1]
         assert 0.3 < ratio < 0.9
         for part, power, factor in (
-            ("gradient", 1, 1), ("variance", multiresolution.SQUARES, 1), ("alpha", 0, 1),
-            ("proportional.mean", 1, 1), ("proportional.square", multiresolution.SQUARES, 1),
-            ("difference.mean", 1, ratio), ("difference.square", multiresolution.SQUARES, ratio**2),
+            ("gradient", 1, 1), ("variance", SQUARES, 1), ("alpha", 0, 1),
+            ("proportional.mean", 1, 1), ("proportional.square", SQUARES, 1),
+            ("difference.mean", 1, ratio), ("difference.square", SQUARES, ratio**2),
         ):  # fmt: skip
             values = [a, b]
             for word in part.split("."):

@@ -5,10 +5,15 @@ import numpy as np
 import pytest
 
 from unrender import losses
-from unrender.core import arrays
+from unrender.core import arrays, registry
 from unrender.core.errors import InputError
 
 ALL = [losses.L1(), losses.L2(), losses.RelativeL2(), losses.RelativeL2(0.5), losses.Huber(), losses.Huber(2.0)]
+ALL += [
+    made_by()
+    for made_by in registry.components("loss").values()
+    if made_by not in {type(loss) for loss in ALL} | {losses.Perceptual}
+]
 REFERENCE = np.array([0.0, 0.2, 1.0, 3.0])
 
 

@@ -13,11 +13,11 @@ from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images import Plain, RecursiveControlVariate
-from unrender.methods.catalogue import METHODS, method, parse_schedule
+from unrender.methods.base import method, methods, parse_schedule
 from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", methods())
 def test_every_method_starts_with_its_defaults_and_documents_them(name: str):
     made = method(name)
     estimator, optimizer = made.start()

@@ -12,8 +12,8 @@ import pytest
 
 import unrender as ur
 from unrender import losses
+from unrender.core import tables
 from unrender.losses import perceptual
-from unrender.problem import components
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
 torch: Any = pytest.importorskip("torch")
@@ -263,7 +263,7 @@ def test_without_pytorch_or_torchvision_one_line_says_so(monkeypatch: pytest.Mon
 
 
 def test_a_problem_file_names_it(weights: Path, tmp_path: Path) -> None:
-    made = components.make(components.LOSSES, {"type": "Perceptual", "weights": str(weights), "layers": ["relu1_2"]})
+    made = tables.component({"type": "Perceptual", "weights": str(weights), "layers": ["relu1_2"]}, "loss")
     assert made == losses.Perceptual(str(weights), ("relu1_2",))
     (tmp_path / "scene.xml").write_text(
         '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.optimizers.adam import AdamState
 from unrender.problem.fingerprint import differences, fingerprint
-from unrender.runs import component_tables
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
 from unrender.runs.reopen import problem_of
 
@@ -311,7 +311,7 @@ def test_components_become_tables_and_come_back() -> None:
         ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate()),
         ur.preconditioners.LargeSteps(3.0, wrap=(False, True)),
     ):  # fmt: skip
-        assert component_tables.component(json.loads(json.dumps(component_tables.table(component))), "x") == component
+        assert tables.component(json.loads(json.dumps(tables.table(component)))) == component
 
 
 # ---------------------------------------------------------------------- states

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from common import write
 
 import unrender as ur
-from unrender.methods.catalogue import method
+from unrender.methods import method
 
 HERE = Path(__file__).resolve().parent
 METHODS = ("plain", "rcv", "meta", "coupled")

@@ -19,7 +19,7 @@ from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import Plan, execute, introduce
 from unrender.core.errors import InputError
 from unrender.evaluation.metrics import has_flip
-from unrender.methods.catalogue import METHODS, Method, method
+from unrender.methods import Method, method
 from unrender.report import words
 from unrender.report.equal_time import Comparison, Spread
 
@@ -114,7 +114,7 @@ def compare(
 
 def _chosen(names: str | None) -> list[Method]:
     if names is None:
-        return [METHODS["plain"], METHODS["rcv"]]
+        return [method("plain"), method("rcv")]
     chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
     if not chosen:
         raise InputError("--methods: expected at least one name")

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from unrender.cli.progress import Progress
-from unrender.methods.catalogue import Method
+from unrender.methods import Method
 from unrender.problem.problem import Problem
 from unrender.runs.live import Live
 from unrender.runs.loop import RunAnnotations, optimize

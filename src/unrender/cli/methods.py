@@ -9,13 +9,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.methods.catalogue import METHODS, Method, method
+from unrender.methods import Method, method
+from unrender.methods import methods as registered
 
 
 def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None) -> None:
     """List the methods, their options and defaults."""
     console = Console(highlight=False)
-    for one in [method(name)] if name else METHODS.values():
+    for one in [method(name)] if name else registered().values():
         console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
         console.print(_options(one))
         console.print()

@@ -15,7 +15,7 @@ from unrender.cli import arguments
 from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
 from unrender.cli.execute import Plan, execute, introduce, summarise
 from unrender.core.errors import InputError
-from unrender.methods.catalogue import method
+from unrender.methods import method
 from unrender.problem.problem import Problem
 from unrender.runs.result import Result
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from unrender.core import arrays, checks, vectors
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
@@ -24,6 +25,7 @@ class LossState:
     """Empty: there is no state."""
 
 
+@register
 @dataclass(frozen=True)
 class LossValues:
     """The loss at any points, and no derivative: for searches such as `optimizers.CMAES`.

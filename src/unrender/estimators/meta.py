@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Variance
@@ -18,6 +20,7 @@ from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import SQUARES, Upsampler, upsampled
 from unrender.rendering.renderer import Space
 from unrender.statistics import meta
 
@@ -45,7 +48,41 @@ class MetaState:
     pixels: Any = None
     step: int = 0
 
+    def upsampled(self, upsampler: Upsampler) -> MetaState:
+        """See `Upsamplable`: gradients, their moments and the previous parameters are interpolated."""
+        image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
+        if self.parameters is None:
+            return replace(self, image=image, pixels=pixels)
+        before = upsampler.tree(self.parameters)
+        # Differences are kept per unit of a step's length, and the same step is longer where it has more elements.
+        old = _distance(self.parameters, upsampler.parameters)
+        new = _distance(before, upsampler.tree(upsampler.parameters))
+        ratio = old / new if new > 0 else 1.0
 
+        def moments(key: str, given: meta.Moments, factor: float) -> meta.Moments:
+            mean = upsampler.array(key, given.mean, 1.0, factor)
+            return meta.Moments(mean, upsampler.array(key, given.square, SQUARES, factor * factor), given.weight)
+
+        def element(key: str, given: meta.State) -> meta.State:
+            return meta.State(
+                gradient=upsampler.array(key, given.gradient, 1.0),
+                variance=upsampler.array(key, given.variance, SQUARES),
+                alpha=upsampler.array(key, given.alpha),
+                proportional=moments(key, given.proportional, 1.0),
+                difference=moments(key, given.difference, ratio),
+                steps=given.steps,
+            )
+
+        elements = {key: element(key, given) for key, given in self.elements.items()}
+        return replace(self, parameters=before, elements=elements, image=image, pixels=pixels)
+
+
+def _distance(a: Tree, b: Tree) -> float:
+    """The Euclidean distance of two trees."""
+    return math.sqrt(sum(arrays.number(arrays.total((a[key] - b[key]) * (a[key] - b[key]))) for key in a))
+
+
+@register
 @dataclass(frozen=True)
 class MetaEstimator:
     """M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i: Eq. 7 of Balint et al. 2023, per element of each parameter.

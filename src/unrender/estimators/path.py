@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
@@ -17,6 +18,7 @@ from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler, upsampled
 
 __all__ = ["PathGradient", "PathGradientState"]
 
@@ -35,7 +37,12 @@ class PathGradientState:
     pixels: Any
     batches: int = 0
 
+    def upsampled(self, upsampler: Upsampler) -> PathGradientState:
+        """See `Upsamplable`: the states of image estimator and pixel sampler are carried."""
+        return replace(self, image=upsampled(self.image, upsampler), pixels=upsampled(self.pixels, upsampler))
 
+
+@register
 @dataclass(frozen=True)
 class PathGradient:
     """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).

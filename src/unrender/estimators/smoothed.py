@@ -12,6 +12,7 @@ from unrender import smoothing as smoothed
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -27,6 +28,7 @@ from unrender.estimators.capabilities import (
 )
 from unrender.estimators.loss_values import BlackBox
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 from unrender.smoothing.function import estimate_gradient, estimate_hessian, estimate_hvp
 from unrender.smoothing.options import SamplingOptions
@@ -44,7 +46,18 @@ class SmoothedState:
 
     age: float = 0.0
 
+    def upsampled(self, upsampler: Upsampler) -> SmoothedState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
+    def restarted(self, fresh: SmoothedState) -> SmoothedState:
+        """See `Restartable`: the schedule of σ goes on."""
+        del fresh
+        return self
+
+
+@register
 @dataclass(frozen=True)
 class SmoothedDerivatives:
     """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of deviation σ.

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
@@ -19,6 +20,7 @@ from unrender.problem.parameter import Parameter
 _LEAVES = 7
 
 
+@register(name="ajar", position=6)
 @dataclass(frozen=True)
 class Ajar:
     """The paint of a wall and the textures of a potted plant, in a room lit through a door ajar.

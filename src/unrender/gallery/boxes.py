@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts, staging
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -46,6 +47,7 @@ _FIVE = (
 _ONE = (_Square((0.85, 0.5, 0.1), (0.7, 0.6), (-0.9, -0.7)),)
 
 
+@register(name="box2", position=15)
 @dataclass(frozen=True)
 class Box2:
     """Where one square lies: two numbers, from a start that does not overlap the place sought.
@@ -68,6 +70,7 @@ class Box2:
         return _parameters(_ONE, 0.2)
 
 
+@register(name="box10", position=16)
 @dataclass(frozen=True)
 class Box10:
     """Where five squares lie: ten numbers, from starts that do not overlap the places sought.

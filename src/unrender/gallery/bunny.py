@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, mesh_files, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 
 
+@register(name="bunny", position=19)
 @dataclass(frozen=True)
 class Bunny:
     """Where an animal stands and which way it looks: three numbers, from a start that overlaps the reference.

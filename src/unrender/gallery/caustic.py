@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -24,6 +25,7 @@ _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75
 """x and z of their middles, and tint."""
 
 
+@register(name="caustic", position=12)
 @dataclass(frozen=True)
 class Caustic:
     """The texture of a floor that two lamps light through balls of glass, in caustics.

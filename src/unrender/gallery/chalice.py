@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
@@ -19,6 +20,7 @@ from unrender.problem.parameter import Parameter
 _LIGHTS = ((-1.4, 2.6, 1.6), (1.5, 2.2, 1.2), (0.2, 2.9, 2.2), (-1.9, 1.2, 0.4), (2.0, 1.0, 0.2), (0.0, 2.4, -1.2))
 
 
+@register(name="chalice", position=7)
 @dataclass(frozen=True)
 class Chalice:
     """The roughness map of a metal chalice under small sharp lights.

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -16,6 +17,7 @@ from unrender.rendering.numpy.exponential import RATE, ExponentialRenderer
 _MEAN, _START = 2.0, 1.5
 
 
+@register(name="exponential", position=13)
 @dataclass(frozen=True)
 class Exponential:
     """The rate of an exponential distribution, from its mean: one number, no renderer.

@@ -1,4 +1,4 @@
-"""What a gallery problem may be asked for: the typed fields of its recipe, and their checks."""
+"""What a gallery problem may be asked for: the typed fields of its specification, and their checks."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from unrender.core import checks
+from unrender.core import checks, registry, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.losses import Loss
-from unrender.problem.components import LOSSES, make
+
+__all__ = ["LOSS", "Option", "fill", "integer", "max_depth", "of", "reference_spp", "resolution", "texture_resolution"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def texture_resolution(default: int) -> Any:
 
 def reference_spp(default: int) -> Any:
     """The field `reference_spp`."""
-    return integer(default, "samples per pixel of the reference pictures")
+    return integer(default, "samples per pixel of the reference images")
 
 
 def max_depth(default: int, at_least: int) -> Any:
@@ -64,29 +65,27 @@ def max_depth(default: int, at_least: int) -> Any:
 
 
 def _check_loss(owner: str, name: str, value: Any) -> Loss:
-    if isinstance(value, tuple(LOSSES.values())):
+    known = registry.component_of(type(value))
+    if known is not None and known.kind == "loss":
         return value
     if not isinstance(value, (str, Mapping)):
         raise InputError(f"{owner}: {name} must be one of unrender.losses or its name, got {value!r}")
-    try:
-        return make(LOSSES, value)
-    except InputError as error:
-        raise InputError(f"{owner}: {name}: {error}") from error
+    return tables.component(value, "loss", f"{owner}: {name}")
 
 
-LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber or Perceptual", "check": _check_loss}
+LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber, Perceptual or another registered loss", "check": _check_loss}
 """The metadata of the field `loss`."""
 
 
 def of(specification: type) -> list[Option]:
-    """The options that a recipe has, in its order."""
+    """The options that a specification has, in its order."""
     return [
         Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(specification)
     ]
 
 
 def fill(name: str, specification: type, given: Mapping[str, Any]) -> Any:
-    """The recipe with these options, the others at their defaults.
+    """The specification with these options, the others at their defaults.
 
     Raises `InputError` for one that is unknown (with the nearest known one) or out of its range.
     """

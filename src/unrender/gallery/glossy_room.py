@@ -13,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -28,6 +29,7 @@ _LIGHTS = [
 _TINTS = [(35.0, 31.0, 28.0), (28.0, 31.0, 35.0), (35.0, 35.0, 35.0)]
 
 
+@register(name="glossy-room", position=2)
 @dataclass(frozen=True)
 class GlossyRoom:
     """Base colour, roughness and metallic maps of a metal tile and a gilded ball, from their highlights.

@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
 from unrender.losses import L1, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
 
+@register(name="indirect-room", position=1)
 @dataclass(frozen=True)
 class IndirectRoom:
     """A photograph on the back wall of a room that is lit only by light bounced off its ceiling.

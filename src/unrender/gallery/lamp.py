@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.problem.parameter import Parameter
@@ -19,6 +20,7 @@ _BULB = np.array([0.86, 1.68, -0.25])
 """The middle of the bulb."""
 
 
+@register(name="lamp", position=4)
 @dataclass(frozen=True)
 class Lamp:
     """The radiance of a hanging lamp and the mural that it lights, together.

@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -27,6 +28,7 @@ _LAMPS = {
 """Place and radiance: at either side of the things, so that their backs are lit too, and near the camera, seen in the mirror."""
 
 
+@register(name="mirror-trio", position=8)
 @dataclass(frozen=True)
 class MirrorTrio:
     """The roughness of a mirror behind three diffuse objects, from a picture of which it fills a part.

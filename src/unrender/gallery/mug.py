@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -22,6 +23,7 @@ _HIDDEN = np.radians(158.0)
 """Where it is at the start."""
 
 
+@register(name="mug", position=17)
 @dataclass(frozen=True)
 class Mug:
     """How far a cup is turned: one angle, its handle hidden behind it at the start.

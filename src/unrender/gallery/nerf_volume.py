@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts, staging, volumes
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
@@ -16,6 +17,7 @@ from unrender.problem.view import View
 from unrender.rendering.mitsuba.scene_loading import load
 
 
+@register(name="nerf-volume", position=25)
 @dataclass(frozen=True)
 class NerfVolume:
     """A toy of coloured balls and blocks, seen from all around, fitted by a volume that emits and absorbs.

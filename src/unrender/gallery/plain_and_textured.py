@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
 
+@register(name="plain-and-textured", position=10)
 @dataclass(frozen=True)
 class PlainAndTextured:
     """The colour of a bin and the texture of a cushion in a box of a room, found together.

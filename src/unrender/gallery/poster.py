@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 
 
+@register(name="poster", position=20)
 @dataclass(frozen=True)
 class Poster:
     """The grey texture of a poster that a lamp lights directly.

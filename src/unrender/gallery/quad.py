@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -17,6 +18,7 @@ _MATRIX = np.array([[5.0, 3.75], [3.75, 5.0]])
 _START = (1.5, 1.0)
 
 
+@register(name="quad", position=14)
 @dataclass(frozen=True)
 class Quad:
     """The minimum of 5 x₀² + 5 x₁² + 7.5 x₀ x₁, a narrow smooth valley: no renderer, no noise.

@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts, staging
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
@@ -25,6 +26,7 @@ _REACH = 0.6
 """How far the shadow may be from the middle of the picture in x and in z."""
 
 
+@register(name="shadow", position=18)
 @dataclass(frozen=True)
 class Shadow:
     """Where a ball outside the picture is: two numbers, from its shadow, which starts beside the one sought.

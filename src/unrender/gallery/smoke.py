@@ -12,11 +12,13 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, textures, volumes
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
 
+@register(name="smoke", position=24)
 @dataclass(frozen=True)
 class Smoke:
     """Density and colour of a cloud of smoke under a bright sky, seen from all around.

@@ -1,8 +1,8 @@
-"""From a recipe, which describes a scene and what to forget of it, to a problem with references and truth."""
+"""From a specification, the true scene and the parameters to recover, to a problem with references and truth."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 import numpy as np
@@ -16,11 +16,13 @@ from unrender.problem.view import View
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
 
+__all__ = ["ProblemSource", "Specification", "build_problem", "reference"]
+
 _LANES = 1 << 21
-"""Paths per pass of a reference: what fits a small machine's memory."""
+"""Paths per pass of a reference: as many as fit a small machine's memory."""
 
 _REFERENCE = Key(seed=0x9A11E47)
-"""Where the references' random numbers come from: no run that counts its seeds from 0 shares them."""
+"""The source of the references' seeds: none of a run whose seeds count from 0."""
 
 
 class Specification(Protocol):
@@ -43,24 +45,33 @@ class Specification(Protocol):
 
     @property
     def loss(self) -> Loss:
-        """Between picture and reference."""
+        """Between rendered and reference images."""
         ...
 
     def scene(self) -> dict[str, Any]:
-        """The true scene as a Mitsuba dictionary, made anew at each call. Called once a variant is set."""
+        """The true scene as a Mitsuba dictionary, a new one at each call. Called after a variant is set."""
         ...
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """What is to be recovered, and from where."""
+        """The unknown parameters with their initial values."""
+        ...
+
+
+@runtime_checkable
+class ProblemSource(Protocol):
+    """A gallery problem that makes its problem itself: one without a renderer, or with references of another scene."""
+
+    def problem(self, name: str) -> Problem:
+        """The problem with these options and this name."""
         ...
 
 
 def build_problem(name: str, specification: Specification) -> Problem:
-    """The problem: truth read off the scene, one view per sensor, references by Mitsuba's own integrators.
+    """The problem: truth from the scene, one view per sensor, references by Mitsuba's own integrators.
 
     Args:
-        name: the problem's.
-        recipe: with its options.
+        name: of the problem.
+        specification: with its options.
     """
     ensure()
     renderer = MitsubaRenderer(specification.scene, specification.max_depth)
@@ -75,9 +86,9 @@ def build_problem(name: str, specification: Specification) -> Problem:
 
 
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
-    """A picture by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
+    """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    Takes as many passes as memory asks for. Equal arguments give equal pictures.
+    As many passes as memory requires. Equal arguments give equal images.
     """
     integrator = mi.load_dict({"type": "volpath" if media(scene) else "path", "max_depth": max_depth})
     width, height = scene.sensors()[sensor].film().crop_size()

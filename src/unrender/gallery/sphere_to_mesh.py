@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, mesh_files, meshes, parts, staging, textures
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
@@ -23,6 +24,7 @@ _RADIUS = 0.7
 """Of the sphere; the body fits into a ball of radius 1 or so."""
 
 
+@register(name="sphere-to-mesh", position=21)
 @dataclass(frozen=True)
 class SphereToMesh:
     """The shape of a body seen from all around, by moving every vertex of a sphere.

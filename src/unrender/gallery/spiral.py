@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.problem.parameter import Parameter
@@ -18,6 +19,7 @@ from unrender.problem.parameter import Parameter
 _TURNS = 2.5
 
 
+@register(name="spiral", position=5)
 @dataclass(frozen=True)
 class Spiral:
     """Base colour, metalness and roughness of a glossy spiral ribbon, all at once, by indirect light.

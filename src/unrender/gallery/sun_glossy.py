@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -20,6 +21,7 @@ _SUN = np.array([0.5, 0.55, 0.67]) / np.linalg.norm([0.5, 0.55, 0.67])
 """Direction to the sun."""
 
 
+@register(name="sun-glossy", position=9)
 @dataclass(frozen=True)
 class SunGlossy:
     """The painted albedo of a glossy doll under a sky with a small bright sun, seen from all around.

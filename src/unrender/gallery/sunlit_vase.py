@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
@@ -20,6 +21,7 @@ _SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
 _SUN_RADIUS = np.radians(2.5)
 
 
+@register(name="sunlit-vase", position=3)
 @dataclass(frozen=True)
 class SunlitVase:
     """The painted glaze of a vase under a sky with a small bright sun, seen from all around.

@@ -9,11 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
 
+@register(name="tea", position=23)
 @dataclass(frozen=True)
 class Tea:
     """Extinction and albedo of the tea in a ball of glass, in a room lit only by light bounced off its ceiling.

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from unrender.core.registry import register
 from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
 
+@register(name="three-bodies", position=22)
 @dataclass(frozen=True)
 class ThreeBodies:
     """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.

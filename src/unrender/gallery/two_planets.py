@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -28,6 +29,7 @@ _DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
 _SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
 
 
+@register(name="two-planets", position=11)
 @dataclass(frozen=True)
 class TwoPlanets:
     """The textures of two planets, one within glass, each starting with the other's.

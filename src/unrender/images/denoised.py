@@ -10,6 +10,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.evaluation import denoising
 from unrender.evaluation.denoising import Denoiser
@@ -22,6 +23,7 @@ from unrender.rendering.renderer import Space
 __all__ = ["Denoised"]
 
 
+@register
 @dataclass(frozen=True)
 class Denoised:
     """The image of another estimator, denoised before the loss is evaluated. Biased.

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
 
 __all__ = ["Plain", "PlainState"]
@@ -19,7 +21,13 @@ __all__ = ["Plain", "PlainState"]
 class PlainState:
     """Empty: there is no state."""
 
+    def upsampled(self, upsampler: Upsampler) -> PlainState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
+
+@register
 @dataclass(frozen=True)
 class Plain:
     """One independent rendering per step. Unbiased."""

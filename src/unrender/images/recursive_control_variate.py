@@ -13,10 +13,12 @@ from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Rendering, Space
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
@@ -70,7 +72,12 @@ class RecursiveControlVariateState:
     snapshot: Snapshot | None = None
     step: int = 0
 
+    def upsampled(self, upsampler: Upsampler) -> RecursiveControlVariateState:
+        """See `Upsamplable`: the previous parameters are interpolated, images stay."""
+        return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
+
+@register
 @dataclass(frozen=True)
 class RecursiveControlVariate:
     """⟨F_n⟩_CV = ⟨F_n⟩_n + w_n (⟨F_{n-1}⟩_CV − ⟨F_{n-1}⟩_n), Eq. 6, per view, pixel and colour channel.

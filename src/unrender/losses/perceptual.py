@@ -17,6 +17,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
@@ -31,6 +32,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of the pictures that the network was trained on, in sRGB."""
 
 
+@register(position=5)
 @dataclass(frozen=True)
 class Perceptual:
     """strength · mean over `layers` of mean (φₗ(I) − φₗ(R))², for VGG-16's features φₗ of images as sRGB shows them.

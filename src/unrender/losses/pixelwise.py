@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.registry import register
 
 
+@register(position=1)
 @dataclass(frozen=True)
 class L1:
     """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
@@ -31,6 +33,7 @@ class L1:
         return arrays.sign(image - reference)
 
 
+@register(position=2)
 @dataclass(frozen=True)
 class L2:
     """(I − R)²."""
@@ -55,6 +58,7 @@ class L2:
         return 2.0 * (image - reference)
 
 
+@register(position=3)
 @dataclass(frozen=True)
 class RelativeL2:
     """(I − R)² / (R² + ε): dark pixels count as much as bright ones.
@@ -92,6 +96,7 @@ class RelativeL2:
         return 2.0 * (image - reference) / (reference * reference + self.epsilon)
 
 
+@register(position=4)
 @dataclass(frozen=True)
 class Huber:
     """(I − R)²/2 within δ of the reference, δ (|I − R| − δ/2) beyond: the derivative is I − R clamped to [−δ, δ].

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
+from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -32,7 +34,17 @@ class AdamState:
     second_moment: Tree
     begun: int = 0
 
+    def upsampled(self, upsampler: Upsampler) -> AdamState:
+        """See `Upsamplable`: the moments are interpolated."""
+        first, second = upsampler.tree(self.first_moment, 1.0), upsampler.tree(self.second_moment, SQUARES)
+        return replace(self, first_moment=first, second_moment=second)
 
+    def restarted(self, fresh: AdamState) -> AdamState:
+        """See `Restartable`: the schedule goes on, the moments begin at this step."""
+        return replace(fresh, step=self.step, begun=self.step)
+
+
+@register
 @dataclass(frozen=True)
 class Adam:
     """Steps −η m̂ / (√v̂ + ε): the debiased mean of the gradient over the root of its debiased mean square, per

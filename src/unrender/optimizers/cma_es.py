@@ -13,6 +13,7 @@ import numpy as np
 
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
@@ -48,6 +49,7 @@ class CMAESState:
     _search: ClassVar[_Search | None] = None
 
 
+@register
 @dataclass(frozen=True)
 class CMAES:
     """One generation of CMA-ES a step: points are drawn from a Gaussian around a mean, their losses ranked, and mean and covariance moved

@@ -7,7 +7,7 @@ Adam makes of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Smoothing
 from unrender.optimizers import rates
 from unrender.optimizers.adam import Adam, AdamState
+from unrender.problem.upsampling import NotCarried, Upsampler
 from unrender.schedules.functions import Schedule
 
 __all__ = ["DirectionOptions", "NewtonState", "apply_direction", "check_options", "coordinate_scales", "init_state"]
@@ -37,6 +38,18 @@ class NewtonState:
     step: int
     learning_rates: dict[str, float]
     adam: AdamState | None = None
+
+    def upsampled(self, upsampler: Upsampler) -> NewtonState:
+        """See `Upsamplable`. Raises `NotCarried` with an inner Adam, whose moments are on the host."""
+        del upsampler
+        if self.adam is not None:
+            raise NotCarried("Newton's Adam")
+        return self
+
+    def restarted(self, fresh: NewtonState) -> NewtonState:
+        """See `Restartable`: the schedule goes on."""
+        adam = None if self.adam is None or fresh.adam is None else self.adam.restarted(fresh.adam)
+        return replace(fresh, step=self.step, adam=adam)
 
 
 class DirectionOptions(Protocol):

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import LbfgsInvHessProduct
 
 from unrender.core import arrays, checks, vectors
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
@@ -48,6 +49,7 @@ class LBFGSState:
     count: int = 0
 
 
+@register
 @dataclass(frozen=True)
 class LBFGS:
     """Steps −γ B g, no longer than a trust radius: B is BFGS's estimate of H⁻¹ from the last steps s and the changes y of the gradient

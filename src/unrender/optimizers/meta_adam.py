@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.optimizers import rates
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -25,7 +27,17 @@ class MetaAdamState:
     step: int
     learning_rates: dict[str, float]
 
+    def upsampled(self, upsampler: Upsampler) -> MetaAdamState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
+    def restarted(self, fresh: MetaAdamState) -> MetaAdamState:
+        """See `Restartable`: the schedule goes on."""
+        return replace(fresh, step=self.step)
+
+
+@register
 @dataclass(frozen=True)
 class MetaAdam:
     """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator provides.

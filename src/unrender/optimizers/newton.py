@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import arrays, checks, vectors
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian
@@ -26,6 +27,7 @@ __all__ = ["Newton", "NewtonState"]
 _SECULAR_ITERATIONS = 60
 
 
+@register
 @dataclass(frozen=True)
 class Newton:
     """Steps −γ H̃⁻¹ g (Eq. 3) with a positive definite H̃, within a trust region.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import checks, conjugate_gradients, vectors
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, HessianProduct, LossFunction
@@ -24,6 +25,7 @@ from unrender.schedules.functions import Schedule
 __all__ = ["NewtonCG"]
 
 
+@register
 @dataclass(frozen=True)
 class NewtonCG:
     """A step that solves H s = −g by conjugate gradients (Fletcher and Reeves), truncated at a trust radius.

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
+from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
 
@@ -27,7 +29,16 @@ class SGDState:
     learning_rates: dict[str, float]
     velocity: Tree
 
+    def upsampled(self, upsampler: Upsampler) -> SGDState:
+        """See `Upsamplable`: the velocity is interpolated."""
+        return replace(self, velocity=upsampler.tree(self.velocity, 1.0))
 
+    def restarted(self, fresh: SGDState) -> SGDState:
+        """See `Restartable`: the schedule goes on."""
+        return replace(fresh, step=self.step)
+
+
+@register
 @dataclass(frozen=True)
 class SGD:
     """Steps −η u with the velocity u ← μ u + g (Polyak's heavy ball).

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.pixels.guided import Denoise, GuidedSampler, GuidedSamplerState, Maps
@@ -19,6 +20,7 @@ from unrender.problem.problem import Problem
 __all__ = ["Adaptive"]
 
 
+@register
 @dataclass(frozen=True)
 class Adaptive:
     """p_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²]), Eq. 12, summed over colours: of all probabilities, those whose gradient has

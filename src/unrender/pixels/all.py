@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 
 __all__ = ["All", "AllState"]
 
@@ -16,7 +18,13 @@ __all__ = ["All", "AllState"]
 class AllState:
     """Empty: there is no state."""
 
+    def upsampled(self, upsampler: Upsampler) -> AllState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
+
+@register
 @dataclass(frozen=True)
 class All:
     """Every step renders all pixels of all views."""

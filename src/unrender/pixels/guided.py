@@ -17,6 +17,7 @@ from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_map
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import SQUARES, Upsampler
 
 __all__ = ["Denoise", "GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
 
@@ -61,6 +62,10 @@ class GuidedSamplerState:
     references: np.ndarray
     refreshes: int = 0
     second_moment: Tree = field(default_factory=dict)
+
+    def upsampled(self, upsampler: Upsampler) -> GuidedSamplerState:
+        """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
+        return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
 class GuidedOptions(Protocol):

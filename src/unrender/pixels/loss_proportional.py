@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
 from unrender.pixels.guided import Denoise, GuidedSampler, GuidedSamplerState, Maps
@@ -18,6 +19,7 @@ from unrender.problem.problem import Problem
 __all__ = ["LossProportional"]
 
 
+@register
 @dataclass(frozen=True)
 class LossProportional:
     """p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`): neither noise nor the derivatives of a pixel by the parameters count.

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 from unrender.core import checks
 from unrender.core.random import Key
+from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch, check_loss
 from unrender.pixels.tiles import InverseCdfTable, cut
 from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
 
 __all__ = ["Uniform", "UniformState"]
 
@@ -20,7 +22,13 @@ class UniformState:
 
     table: InverseCdfTable
 
+    def upsampled(self, upsampler: Upsampler) -> UniformState:
+        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        del upsampler
+        return self
 
+
+@register
 @dataclass(frozen=True)
 class Uniform:
     """Every pixel of every view is equally likely.

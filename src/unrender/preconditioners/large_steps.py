@@ -12,9 +12,11 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.preconditioners import grid
 
 
+@register
 @dataclass(frozen=True)
 class LargeSteps:
     """S = (I + λ L)^-1 with the graph Laplacian L of the texture's grid, each channel by itself.

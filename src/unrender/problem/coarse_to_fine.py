@@ -8,10 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unrender.core import checks
+from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.io import resampling
-from unrender.problem import components
+
+__all__ = ["CoarseToFine", "of"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class CoarseToFine:
     (`resampling.upsample`), which shows the same up to the kinks of linear interpolation.
 
     What optimizer, estimator and pixel sampler remember is either carried through a change or starts anew (`states`), see
-    `unrender.runs.multiresolution`. Learning rates and their schedules go on in any case.
+    `unrender.problem.upsampling`. Learning rates and their schedules go on in any case.
 
     Args:
         steps: before which of the run's steps the resolution grows, counted from 0: ascending, each at least 1.
@@ -89,4 +90,4 @@ def of(given: Any) -> CoarseToFine:
     if isinstance(given, CoarseToFine):
         return given
     table = dict(given) if isinstance(given, Mapping) else {"steps": given}
-    return components.make({"CoarseToFine": CoarseToFine}, {"type": "CoarseToFine", **table})
+    return tables.build(CoarseToFine, table)

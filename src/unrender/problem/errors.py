@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from unrender.core.errors import InputError
 
+__all__ = ["FieldError", "Place", "dotted"]
+
 Place = tuple[str | int, ...]
 """The way to a field, e.g. ("parameters", 0, "bounds")."""
 

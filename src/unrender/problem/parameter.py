@@ -12,6 +12,8 @@ import numpy as np
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.coarse_to_fine import CoarseToFine
 
+__all__ = ["Parameter"]
+
 
 @dataclass(frozen=True)
 class Parameter:

@@ -31,15 +31,18 @@ from typing import Any
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
+from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import files, toml_lines
 from unrender.io.toml_lines import tomllib
-from unrender.problem import coarse_to_fine, components
+from unrender.problem import coarse_to_fine
 from unrender.problem.errors import FieldError, Place, dotted
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
+
+__all__ = ["read"]
 
 _Number = StrictFloat | StrictInt
 
@@ -134,7 +137,7 @@ def _parse(file: Path, text: str) -> dict[str, Any]:
 def _build(model: _Problem, file: Path) -> Problem:
     folder = file.parent
     try:
-        loss = components.make(components.LOSSES, _located(model.loss, folder))
+        loss = tables.component(model.loss, "loss", folder=folder)
     except InputError as error:
         raise FieldError(("loss",), str(error)) from error
     return Problem(
@@ -155,7 +158,7 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
     preconditioner = None
     if model.preconditioner is not None:
         try:
-            preconditioner = components.make(components.PRECONDITIONERS, model.preconditioner)
+            preconditioner = tables.component(model.preconditioner, "preconditioner", folder=folder)
         except InputError as error:
             raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
     way = None
@@ -165,13 +168,6 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     return Parameter(model.key, _value(model.initial, folder), model.bounds, model.learning_rate, preconditioner, way)
-
-
-def _located(description: str | dict[str, Any], folder: Path) -> str | dict[str, Any]:
-    """A component's description, its file of weights relative to the problem's."""
-    if isinstance(description, dict) and isinstance(description.get("weights"), str):
-        return {**description, "weights": str(folder / description["weights"])}
-    return description
 
 
 def _value(value: Any, folder: Path) -> Any:

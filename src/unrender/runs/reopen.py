@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from unrender.io import files
 from unrender import gallery
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
+from unrender.io import files, toml_lines
 from unrender.optimizers.base import Optimizer
-from unrender.io import toml_lines
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
-from unrender.runs.folder import record
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder import record
 from unrender.runs.result import Result
-from unrender.runs.resume import resume_run, load_run
+from unrender.runs.resume import load_run, resume_run
+
+__all__ = ["problem_of", "resume"]
 
 _LONGEST = 1 << 24
 
@@ -42,7 +43,7 @@ def resume(
         steps, seconds: a budget in place of the run's, counted from its start.
         force: go on though problem, versions or scene files are not as they were.
         callbacks: listeners.
-        estimator, optimizer: those that method.toml cannot say, such as ones of your own.
+        estimator, optimizer: in place of those of method.toml; needed for components that are not registered (`unrender.register`).
 
     Raises:
         InputError: no run folder, a malformed one, one in use; finished and no larger budget; something changed since, which the message
@@ -63,13 +64,13 @@ def problem_of(directory: str | Path) -> Problem:
     folder = Path(directory)
     origin = record.read(folder).problem.origin
     path = folder / serialization.FILE
-    serialize = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
-    if "gallery" in serialize:
-        name, options = serialize["gallery"], serialize.get("options", {})
-        if not isinstance(name, str) or not isinstance(options, dict) or set(serialize) - {"gallery", "options"}:
-            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(serialize)[:80]}')
+    document = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
+    if "gallery" in document:
+        name, options = document["gallery"], document.get("options", {})
+        if not isinstance(name, str) or not isinstance(options, dict) or set(document) - {"gallery", "options"}:
+            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(document)[:80]}')
         return gallery.problem(name, **options)
-    if "scene" not in serialize:
+    if "scene" not in document:
         raise InputError(
             f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
             "unrender.export((problem, result.parameters), out)"

@@ -146,7 +146,7 @@ def _check_room(folder: Path, method: Method, found: Checkpoint | None) -> None:
 
 def _unpacked(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
     """The snapshot in a checkpoint, which must have the form of one of this run's."""
-    kept = unpack(found.packed)
+    kept = unpack(found.packed, [fresh, warm])
     where = f"checkpoint of step {found.manifest.step}"
     if not isinstance(kept, dict) or list(kept) != list(fresh):
         raise InputError(f"{where}: expected the state of a run, got {repr(kept)[:60]}")

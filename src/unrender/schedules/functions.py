@@ -12,6 +12,7 @@ from typing import Protocol
 
 from unrender.core import checks
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 
 
 class Schedule(Protocol):
@@ -22,6 +23,7 @@ class Schedule(Protocol):
         ...
 
 
+@register(position=1)
 @dataclass(frozen=True)
 class Constant:
     """The same factor at every step.
@@ -39,6 +41,7 @@ class Constant:
         return self.factor
 
 
+@register(position=2)
 @dataclass(frozen=True)
 class Exponential:
     """2^(−step / half_life), and never below `floor`.
@@ -59,6 +62,7 @@ class Exponential:
         return max(self.floor, 0.5 ** (step / self.half_life))
 
 
+@register(position=3)
 @dataclass(frozen=True)
 class Cosine:
     """Half a cosine from 1 at step 0 down to `floor` at step `steps`, and `floor` ever after.
@@ -80,6 +84,7 @@ class Cosine:
         return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
+@register(position=4)
 @dataclass(frozen=True)
 class Steps:
     """Multiplied by `factor` once every `every` steps.
@@ -100,6 +105,7 @@ class Steps:
         return float(self.factor) ** (step // self.every)
 
 
+@register(position=5)
 @dataclass(frozen=True)
 class Warmup:
     """A linear rise over the first `steps` steps, 1/steps, 2/steps … 1, then another schedule, which starts at its

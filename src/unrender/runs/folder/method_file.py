@@ -1,4 +1,4 @@
-"""method.toml: what a run is made of beside its problem, in words, and those parts made again from the words."""
+"""method.toml: the estimator, the optimizer and the options of a run, and the two components made again from their tables."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import drjit as dr
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.io import files
+from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
+from unrender.io import files, toml_lines
 from unrender.optimizers.base import Optimizer
-from unrender.io import toml_lines
-from unrender.runs import component_tables
 from unrender.runs.run import Run
+
+__all__ = ["Method", "Parts", "parts", "read", "serialize"]
 
 _LONGEST = 1 << 20
 _Positive = Annotated[StrictInt, Field(ge=1)]
@@ -33,7 +34,7 @@ class Method(BaseModel):
         seed: of the run.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
         threads: that the run had.
-        estimator, optimizer: tables, see `component_tables.py`; words where they cannot be said.
+        estimator, optimizer: tables, see `core.tables`; the reason, as text, where they cannot be stored.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -58,7 +59,7 @@ class Parts:
 
 
 def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int | None) -> dict[str, Any]:
-    """What method.toml says of a run."""
+    """The contents of method.toml for a run."""
     found = {
         "name": name,
         "steps": run.steps,
@@ -85,24 +86,24 @@ def read(path: Path) -> Method:
 
 
 def parts(method: Method, path: Path, estimator: Estimator | None, optimizer: Optimizer | None) -> Parts:
-    """The components that method.toml says, or those given in their place. Raises `InputError`."""
+    """The components that method.toml describes, or those given in their place. Raises `InputError`."""
 
     def made(name: str, given: Any, words: Mapping[str, Any] | str) -> Any:
         if given is not None:
             return given
         if isinstance(words, str):
             raise InputError(f"{path}: {name}: {words}; hand it in: unrender.resume(..., {name}=...)")
-        return component_tables.component(words, f"{path}: {name}")
+        return tables.component(words, where=f"{path}: {name}")
 
     found = Parts(made("estimator", estimator, method.estimator), made("optimizer", optimizer, method.optimizer))
     for name, value, asked in (("estimator", found.estimator, "estimate"), ("optimizer", found.optimizer, "update")):
         if not callable(getattr(value, asked, None)):
-            raise InputError(f"{path}: {name}: {type(value).__name__} is none")
+            raise InputError(f"{path}: {name}: {type(value).__name__} is no {name}")
     return found
 
 
 def _table(component: Any) -> dict[str, Any] | str:
     try:
-        return component_tables.table(component)
-    except component_tables.NotStorable as error:
+        return tables.table(component)
+    except tables.NotStorable as error:
         return f"it cannot be made again from a file ({error})"

@@ -1,7 +1,8 @@
 """States as flat tensors and a skeleton of JSON, and back: what lets a checkpoint write any state without knowing it.
 
-A state is a frozen dataclass of this package, or a dictionary, tuple, list, number, text or array, nested as it likes. An array that
-occurs twice is stored once, and is one object again when it is read: components may tell the present from the past by identity.
+A state is a frozen dataclass of this package or of a module that registered a component (`unrender.register`), or a dictionary, tuple,
+list, number, text or array, nested to any depth. An array that occurs twice is stored once, and is one object again when it is read:
+components may tell the present from the past by identity.
 """
 
 from __future__ import annotations
@@ -9,15 +10,17 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, registry
 from unrender.core.errors import InputError
+
+__all__ = ["Packed", "check_alike", "pack", "unpack"]
 
 _PACKAGE = __name__.partition(".")[0]
 _DEEPEST = 64
@@ -49,15 +52,20 @@ def pack(state: Any) -> Packed:
     return Packed(packer.node(state), packer.tensors)
 
 
-def unpack(packed: Packed) -> Any:
+def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
     """Put a state together again.
 
-    Classes are looked up among the frozen dataclasses of this package that are loaded already, and in no other place.
+    A class is looked up among frozen dataclasses that are loaded already: those of this package, those of the modules of registered
+    components, and those that occur in `patterns`. No module is imported because a file names it.
+
+    Args:
+        packed: from `pack`.
+        patterns: states of the same components, where those are of classes that are not registered.
 
     Raises:
         InputError: the skeleton is none, or does not fit the tensors.
     """
-    unpacker = _Unpacker(packed.tensors)
+    unpacker = _Unpacker(packed.tensors, {_path(kind): kind for pattern in patterns for kind in _classes(pattern)})
     try:
         state = unpacker.node(packed.skeleton, 0)
     except (ValueError, TypeError, OverflowError) as error:
@@ -142,7 +150,7 @@ class _Packer:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             kind = type(value)
             fields = {each.name: self.node(getattr(value, each.name)) for each in dataclasses.fields(value)}
-            return {"class": f"{kind.__module__}.{kind.__qualname__}", "fields": fields}
+            return {"class": _path(kind), "fields": fields}
         raise TypeError(f"a state is made of dataclasses, arrays and numbers, got {type(value).__name__}")
 
     def _array(self, original: Any, host: np.ndarray | None, kind: str) -> Any:
@@ -160,6 +168,7 @@ class _Packer:
 @dataclass
 class _Unpacker:
     tensors: dict[str, np.ndarray]
+    classes: Mapping[str, type]
     used: dict[str, tuple[str, Any]] = field(default_factory=dict)
 
     def node(self, node: Any, depth: int) -> Any:
@@ -181,7 +190,7 @@ class _Unpacker:
             case {"dict": list(pairs), **rest} if not rest:
                 return self._dictionary(pairs, depth)
             case {"class": str(name), "fields": dict(fields), **rest} if not rest:
-                kind = _class(name)
+                kind = self.classes.get(name) or _class(name)
                 if set(fields) != {each.name for each in dataclasses.fields(kind)}:
                     raise InputError(f"state: {name}: other fields than it has, {', '.join(fields)[:100]}")
                 return kind(**{key: self.node(part, depth + 1) for key, part in fields.items()})
@@ -218,20 +227,48 @@ class _Unpacker:
         return array
 
 
-def _class(name: str) -> type:
-    """The frozen dataclass of that name, if it is one of this package's that is loaded and only holds what it is given."""
-    module, _, word = name.rpartition(".")
-    home = sys.modules.get(module) if module.startswith(f"{_PACKAGE}.") else None
-    kind = vars(home).get(word) if home is not None else None
-    state = (
+def _path(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _classes(state: Any) -> Iterator[type]:
+    """The frozen dataclasses that a state is made of."""
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        if _is_state(type(state)):
+            yield type(state)
+        for each in dataclasses.fields(state):
+            yield from _classes(getattr(state, each.name))
+    elif isinstance(state, Mapping):
+        for part in state.values():
+            yield from _classes(part)
+    elif isinstance(state, (tuple, list)):
+        for part in state:
+            yield from _classes(part)
+
+
+def _is_state(kind: Any) -> bool:
+    """Whether it is a frozen dataclass that only holds what it is given."""
+    return (
         isinstance(kind, type)
-        and kind.__module__ == module
         and dataclasses.is_dataclass(kind)
-        and "__post_init__" not in vars(kind)
         and kind.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+        and kind.__dataclass_params__.init  # pyright: ignore[reportAttributeAccessIssue]
+        and kind.__new__ is object.__new__
+        and not hasattr(kind, "__post_init__")
     )
-    if not state or not isinstance(kind, type):
-        raise InputError(f"state: {name[:80]!r} is no state of this version of {_PACKAGE}")
+
+
+def _class(name: str) -> type:
+    """The state of that name, if it is of this package or of a registered component's module, and loaded."""
+    module, _, word = name.rpartition(".")
+    ours = module.startswith(f"{_PACKAGE}.")
+    home = sys.modules.get(module) if ours or module in registry.state_modules() else None
+    kind = vars(home).get(word) if home is not None else None
+    if not isinstance(kind, type) or kind.__module__ != module or not _is_state(kind):
+        how = "" if ours else "; install the package that registers its component, or import its module first"
+        raise InputError(
+            f"state: {name[:80]!r} is no state of this version of {_PACKAGE}, nor of a registered component{how}"
+        )
     return kind
 
 

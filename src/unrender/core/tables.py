@@ -1,0 +1,182 @@
+"""Components as tables of a TOML file, and back.
+
+    estimator = { type = "PathGradient", spp = 2, image = { type = "RecursiveControlVariate", space = "path" } }
+
+A component is a registered frozen dataclass (`core.registry`); its table has a type and fields. A field whose annotation is a protocol
+takes components of that kind alone, and a text in place of a table: `loss = "L1"`, `schedule = "cosine(300)"`. TOML has no null: fields
+that are None are left out where that is their default, and else listed under "none".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from unrender.core import registry, short_forms
+from unrender.core.errors import InputError
+from unrender.core.registry import GROUP
+from unrender.core.suggestions import did_you_mean
+
+__all__ = ["NotStorable", "build", "component", "fields", "table"]
+
+_TYPE, _NONE = "type", "none"
+_DEEPEST = 16
+_LONGEST_LIST = 4096
+_T = TypeVar("_T")
+
+
+class NotStorable(Exception):
+    """A component that no table can describe, such as one whose schedule is a function."""
+
+
+def table(component: Any) -> dict[str, Any]:
+    """The table of a component. Raises `NotStorable` with the reason."""
+    kind = type(component)
+    known = registry.component_of(kind)
+    if known is None:
+        raise NotStorable(f"{kind.__name__} is not registered, see unrender.register")
+    return {_TYPE: known.name, **fields(component)}
+
+
+def fields(value: Any) -> dict[str, Any]:
+    """The fields of a dataclass as a table has them. Raises `NotStorable` with the reason."""
+    found: dict[str, Any] = {}
+    none = []
+    for field in dataclasses.fields(value):
+        if not field.init:
+            continue
+        part = getattr(value, field.name)
+        if part is not None:
+            found[field.name] = _plain(part, f"{type(value).__name__}.{field.name}")
+        elif field.default is not None:
+            none.append(field.name)
+    return found | ({_NONE: none} if none else {})
+
+
+def component(given: Any, kind: str | None = None, where: str = "", folder: Path | None = None) -> Any:
+    """The component that a table, or the short text form of its kind, describes.
+
+    Args:
+        given: {"type": name, field: value, ...}; where `kind` is known also "name", or a schedule's short form.
+        kind: of `registry.KINDS`; None takes any that stands in tables.
+        where: what a message begins with.
+        folder: what the relative paths in it start from; None leaves them.
+
+    Raises:
+        InputError: unknown types or fields (with the nearest known one), missing fields, values of the wrong type or out of range.
+    """
+    try:
+        return _component(given, kind, folder, 0)
+    except InputError as error:
+        if not where:
+            raise
+        raise InputError(f"{where}: {error}") from error
+
+
+def build(made_by: type[_T], given: Mapping[str, Any]) -> _T:
+    """A dataclass from a table of its fields. Raises `InputError` as `component` does."""
+    return _build(made_by, made_by.__name__, given, None, 0)
+
+
+def _component(given: Any, kind: str | None, folder: Path | None, depth: int) -> Any:
+    if depth > _DEEPEST:
+        raise InputError("nested too deeply")
+    if kind == "schedule" and isinstance(given, str):
+        return short_forms.parse(given, kind)
+    given = {_TYPE: given} if kind is not None and isinstance(given, str) else given
+    known = registry.table_components() if kind is None else registry.components(kind)
+    if not isinstance(given, Mapping) or not isinstance(given.get(_TYPE), str):
+        example = f'{{ type = "{"Adam" if kind is None else next(iter(known), "Name")}" }}'
+        expected = f"a table such as {example}"
+        expected = expected if kind is None else f"{_one_of(known)}, or {expected}"
+        raise InputError(f"expected {expected}, got {repr(given)[:80]}")
+    name = given[_TYPE]
+    if name not in known:
+        raise InputError(_unknown(name, kind, known))
+    return _build(known[name], name, {key: value for key, value in given.items() if key != _TYPE}, folder, depth)
+
+
+def _build(made_by: type[_T], name: str, given: Mapping[str, Any], folder: Path | None, depth: int) -> _T:
+    found = {field.name: field for field in dataclasses.fields(made_by) if field.init}  # pyright: ignore[reportArgumentType]
+    none = given.get(_NONE, [])
+    if _NONE not in found and (
+        not isinstance(none, list) or any(not isinstance(key, str) or key not in found for key in none)
+    ):
+        raise InputError(f"none: expected a list of fields of {name}, got {repr(none)[:80]}")
+    arguments: dict[str, Any] = {} if _NONE in found else dict.fromkeys(none)
+    hints = _hints(made_by)
+    for key, value in given.items():
+        if key == _NONE and _NONE not in found:
+            continue
+        if key not in found:
+            has = f"it has {', '.join(found)}" if found else "it has none"
+            raise InputError(f"{name} has no option {str(key)[:60]}{did_you_mean(str(key), found) or f'; {has}'}")
+        arguments[key] = _value(value, hints.get(key), key, folder, depth)
+    for key, field in found.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and key not in arguments:
+            raise InputError(f"{name} needs {key}")
+    try:
+        return made_by(**arguments)
+    except InputError:
+        raise
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{name}: a value of the wrong type: {' '.join(str(error).split())[:200]}") from error
+
+
+def _value(value: Any, hint: Any, key: str, folder: Path | None, depth: int) -> Any:
+    """A field's value: a component where its annotation is a protocol of one or the value is a table with a type."""
+    if value is None or registry.component_of(type(value)) is not None:
+        return value
+    choices = (hint, *typing.get_args(hint))
+    kind = next((kind for kind in map(registry.kind_of_protocol, choices) if kind), None)
+    if kind is not None or (isinstance(value, Mapping) and _TYPE in value):
+        try:
+            return _component(value, kind, folder, depth + 1)
+        except InputError as error:
+            raise InputError(f"{key}: {error}") from error
+    if folder is not None and isinstance(value, str) and Path in choices:
+        return str(folder / value)
+    return value
+
+
+def _hints(made_by: type) -> dict[str, Any]:
+    """The annotations of a dataclass; {} where they name what only a type checker imports."""
+    try:
+        return typing.get_type_hints(made_by)
+    except Exception:  # whatever the evaluation of an annotation raises
+        return {}
+
+
+def _one_of(known: Mapping[str, type]) -> str:
+    return " or ".join(f'"{name}"' for name in known) or "a registered component (there is none)"
+
+
+def _unknown(name: str, kind: str | None, known: Mapping[str, type]) -> str:
+    hint = did_you_mean(name, known)
+    how = f'; install the package that registers it (entry-point group "{GROUP}"), or import its module first'
+    if kind is not None:
+        return f'expected {_one_of(known)}, got "{name[:60]}"{hint or how}'
+    return f'unknown type "{name[:60]}"{hint}{how}'
+
+
+def _plain(value: Any, where: str) -> Any:
+    """A value in TOML's types."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return table(value)
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.generic) and value.dtype.kind in "fiub":
+        return value.item()
+    if isinstance(value, Mapping) and all(isinstance(key, str) and key != _TYPE for key in value):
+        return {key: _plain(part, where) for key, part in value.items()}
+    if isinstance(value, (list, tuple)) and len(value) <= _LONGEST_LIST:
+        return [_plain(part, where) for part in value]
+    raise NotStorable(f"{where} is {type(value).__name__}, which no file can describe")

@@ -1,0 +1,67 @@
+"""The gallery's problems by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from unrender.core import registry
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.gallery import fields
+from unrender.gallery.fields import Option
+from unrender.gallery.specification import ProblemSource, build_problem
+from unrender.problem.problem import Problem
+
+__all__ = ["names", "options", "problem", "summary"]
+
+_KIND = "gallery problem"
+
+
+def names() -> list[str]:
+    """The names of all registered problems; the first is the one to begin with."""
+    return list(registry.components(_KIND))
+
+
+def summary(name: str) -> str:
+    """One line: what is to be recovered, and from what. Raises `InputError` for an unknown name."""
+    return (_specification(name).__doc__ or "").split("\n")[0]
+
+
+def options(name: str) -> list[Option]:
+    """What `problem(name, ...)` may be asked for. Raises `InputError` for an unknown name."""
+    return fields.of(_specification(name))
+
+
+def problem(name: str, **options: Any) -> Problem:
+    """A problem made by code, its truth known wherever there is one: its scene, its references (rendered now), where the descent starts.
+
+        problem("indirect-room", resolution=64, texture_resolution=64)
+
+    Args:
+        name: one of `names()`.
+        options: see `options(name)`. All have loss, those that are rendered resolution (pixels along a side),
+            reference_spp and max_depth, and those of unknown textures texture_resolution; the defaults take seconds on two CPU
+            cores, a GPU wants larger ones.
+
+    Returns:
+        the problem. Its references hold noise of their own, which `reference_spp` lowers.
+
+    Raises:
+        InputError: the name or an option is unknown, or an option is out of its range.
+        VariantError: Mitsuba cannot run on this machine.
+    """
+    specification = fields.fill(name, _specification(name), options)
+    if isinstance(specification, ProblemSource):
+        made = specification.problem(name)
+    else:
+        made = build_problem(name, specification)
+    made.origin |= {"gallery": name, "options": options}
+    return made
+
+
+def _specification(name: str) -> type:
+    known = registry.components(_KIND)
+    if not isinstance(name, str) or name not in known:
+        hint = did_you_mean(str(name), known) or f"; it has {', '.join(known)}"
+        raise InputError(f"gallery: no problem {name}{hint}")
+    return known[name]

@@ -1,0 +1,40 @@
+"""Options that several methods have: those of Adam, and of path gradients."""
+
+from __future__ import annotations
+
+from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
+
+from unrender.estimators.base import Estimator
+from unrender.estimators.path import PathGradient
+from unrender.images.base import ImageEstimator
+from unrender.images.denoised import Denoised
+from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+
+__all__ = ["AdamOptions", "PathOptions"]
+
+
+class AdamOptions(Options):
+    """Options of every method that descends with Adam."""
+
+    learning_rate: PositiveFloat = Field(0.01, description="step size of the parameters that have none of their own")
+    beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="Adam's decay of the mean gradient")
+    beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="Adam's decay of the mean squared gradient")
+    schedule: str | None = Field(None, description=SCHEDULE_HELP)
+
+    def optimizer(self) -> Optimizer:
+        """Adam with these options."""
+        return Adam(self.learning_rate, beta_1=self.beta_1, beta_2=self.beta_2, schedule=parse_schedule(self.schedule))
+
+
+class PathOptions(AdamOptions):
+    """Options of every method that follows path gradients."""
+
+    spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
+    adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
+    denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
+
+    def estimator(self, image: ImageEstimator) -> Estimator:
+        """The path gradient of what the loss sees in `image`."""
+        return PathGradient(Denoised(image) if self.denoise else image, spp=self.spp, adjoint_spp=self.adjoint_spp)

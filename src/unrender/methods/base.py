@@ -1,0 +1,117 @@
+"""What a method is, and the methods there are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pydantic
+from pydantic import BaseModel, ConfigDict
+
+from unrender.core import registry, short_forms
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.estimators.base import Estimator
+from unrender.optimizers.base import Optimizer
+from unrender.schedules.functions import Schedule
+
+__all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parse_schedule"]
+
+SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+
+
+class Options(BaseModel):
+    """The options of a method: each field has a description, a default and a range; `build` makes the two parts.
+
+    The first line of a subclass's docstring is its summary. `@unrender.register(name=...)` makes it a method.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        """Estimator and optimizer with these options. Raises `InputError` for options that do not go together."""
+        raise NotImplementedError(f"{type(self).__name__} has no build")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A named way to recover a problem's parameters.
+
+    Attributes:
+        name: as on the command line.
+        options: the class of its options.
+    """
+
+    name: str
+    options: type[Options]
+
+    @property
+    def summary(self) -> str:
+        """One line: what the estimator and the optimizer are."""
+        return (self.options.__doc__ or "").strip().split("\n")[0]
+
+    def configure(self, settings: Mapping[str, Any]) -> Options:
+        """The options with `settings` in place of defaults; text is converted ("4" to 4, "none" to None).
+
+        Raises:
+            InputError: an unknown option (with the nearest known one), or a value of the wrong type or out of range.
+        """
+        fields = self.options.model_fields
+        for name in settings:
+            if name not in fields:
+                hint = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
+                raise InputError(f"method {self.name} has no option {name}{hint}")
+        none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
+        try:
+            return self.options.model_validate({**settings, **none})
+        except pydantic.ValidationError as error:
+            detail = error.errors()[0]
+            name = str(detail["loc"][0])
+            expected = f"expected {self.expected(name)}, got {detail['input']!r}"
+            raise InputError(f"method {self.name}: option {name}: {expected}") from error
+
+    def expected(self, name: str) -> str:
+        """What values an option takes, in words: "a whole number above 0"."""
+        schema = self.options.model_json_schema()["properties"][name]
+        choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
+        return " or ".join(choices)
+
+    def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
+        """Estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
+        options = self.configure(settings or {})
+        try:
+            return options.build()
+        except InputError as error:
+            raise InputError(f"method {self.name}: {error}") from error
+
+
+def methods() -> dict[str, Method]:
+    """Every registered method by name."""
+    return {name: Method(name, options) for name, options in registry.components("method").items()}
+
+
+def method(name: str) -> Method:
+    """The method of that name. Raises `InputError` with the nearest known name."""
+    return Method(name, registry.find("method", name))
+
+
+def parse_schedule(text: str | None) -> Schedule | None:
+    """The schedule that `text` describes: "cosine(300)", "warmup(20) then exponential(100)"; None for none.
+
+    Raises:
+        InputError: an unknown name, or arguments that do not fit.
+    """
+    return None if text is None else short_forms.parse(text, "schedule")
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """A part of a JSON schema."""
+    if "enum" in schema:
+        return " or ".join(schema["enum"])
+    words = {"integer": "a whole number", "number": "a number", "null": "none", "boolean": "true or false"}.get(
+        schema.get("type", ""), "text"
+    )
+    names = {"exclusiveMinimum": "above", "minimum": "of at least", "exclusiveMaximum": "below", "maximum": "up to"}
+    limits = [f"{word} {schema[name]:g}" for name, word in names.items() if name in schema]
+    return f"{words} {' and '.join(limits)}".rstrip()

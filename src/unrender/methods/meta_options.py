@@ -1,0 +1,44 @@
+"""Options that the two forms of meta-estimation share."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, FiniteFloat, PositiveFloat
+
+from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.meta_adam import MetaAdam
+from unrender.statistics import meta
+
+__all__ = ["MetaCommonOptions"]
+
+
+class MetaCommonOptions(Options):
+    """Options of `meta` and of `coupled`."""
+
+    optimizer: Literal["meta-adam", "adam"] = Field(
+        "meta-adam",
+        description="what takes the steps; adam, which takes the gradients for independent, is for comparison",
+    )
+    learning_rate: PositiveFloat = Field(0.002, description="step size of the parameters that have none of their own")
+    schedule: str | None = Field(None, description=SCHEDULE_HELP)
+    space: Literal["auto", "path", "primary"] = Field(
+        "auto", description="what two steps share: paths, random numbers, or paths where all parameters allow it"
+    )
+    beta_proportional: FiniteFloat = Field(
+        meta.BETA_PROPORTIONAL, ge=0, lt=1, description="decay of the mean square of the gradient samples"
+    )
+    beta_difference: FiniteFloat = Field(
+        meta.BETA_DIFFERENCE, ge=0, lt=1, description="decay of the mean square of their differences, per step length"
+    )
+
+    def built_optimizer(self) -> Optimizer:
+        """The optimizer with these options."""
+        kind = MetaAdam if self.optimizer == "meta-adam" else Adam
+        return kind(self.learning_rate, schedule=parse_schedule(self.schedule))
+
+    def shared(self) -> dict[str, Any]:
+        """The arguments that both forms of `MetaEstimator` take."""
+        return {name: getattr(self, name) for name in ("space", "beta_proportional", "beta_difference")}

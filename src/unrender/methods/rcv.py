@@ -1,0 +1,31 @@
+"""`rcv`: recursive control variates (Nicolet et al. 2023)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, FiniteFloat, PositiveInt
+
+from unrender.core.registry import register
+from unrender.estimators.base import Estimator
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.methods.adam_options import PathOptions
+from unrender.optimizers.base import Optimizer
+
+__all__ = ["RecursiveControlVariateMethod"]
+
+
+@register(name="rcv", position=2)
+class RecursiveControlVariateMethod(PathOptions):
+    """recursive control variates: the image keeps what earlier steps rendered (Nicolet et al. 2023), Adam"""
+
+    spp: PositiveInt = Field(2, description="samples per pixel; from 2 on, the adjoint shares their paths")
+    space: Literal["path", "primary"] = Field(
+        "path", description="what two steps share: paths (materials, emitters), or random numbers (any parameter)"
+    )
+    alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
+    beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        """See `Options.build`."""
+        return self.estimator(RecursiveControlVariate(self.space, self.alpha, self.beta)), self.optimizer()

@@ -1,0 +1,83 @@
+"""`smoothed`: derivatives of a smoothed loss (Wang et al.)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import pydantic
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from unrender import optimizers
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.estimators.base import Estimator
+from unrender.estimators.loss_values import LossValues
+from unrender.estimators.smoothed import SmoothedDerivatives
+from unrender.methods.base import Options, parse_schedule
+from unrender.optimizers.base import Optimizer
+
+__all__ = ["SmoothedMethod", "parse_widths"]
+
+_WIDTH = pydantic.TypeAdapter(PositiveFloat)
+
+
+@register(name="smoothed", position=6)
+class SmoothedMethod(Options):
+    """derivatives of a smoothed loss from perturbed renders alone, for poses and plateaus (Wang et al.), Newton-CG"""
+
+    optimizer: Literal["newton-cg", "newton", "lbfgs", "adam", "cma-es"] = Field(
+        "newton-cg",
+        description="what takes the steps; newton forms n x n matrices, adam and lbfgs ask for gradients alone, cma-es for none",
+    )
+    sigma: PositiveFloat | str = Field(
+        0.2,
+        description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
+    )
+    sigma_schedule: str | None = Field("exponential(25, 0.1)", description="sigma over the steps, as for schedule")
+    step: PositiveFloat = Field(
+        0.5,
+        description="as a share of sigma: the longest step; the learning rate, of adam; the first deviation, of cma-es",
+    )
+    samples: int = Field(16, ge=4, description="renders per view and step, for each derivative that has its own")
+    spp: PositiveInt = Field(2, description="samples per pixel of a render")
+    joint: bool = Field(
+        True, description="gradient and curvature from the same renders; else each from its own, as in the paper"
+    )
+    iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        """See `Options.build`."""
+        schedule, sigma = parse_schedule(self.sigma_schedule), parse_widths(self.sigma)
+        common = sigma["*"] if isinstance(sigma, dict) else sigma
+        if self.optimizer == "cma-es":
+            return LossValues(self.spp), optimizers.CMAES(sigma0=self.step * common)
+        order: Any = {"newton-cg": "hvp", "newton": "hessian"}.get(self.optimizer, "gradient")
+        estimator = SmoothedDerivatives(sigma, self.samples, order, joint=self.joint, spp=self.spp, schedule=schedule)
+        made: dict[str, Callable[[], Optimizer]] = {
+            "newton-cg": lambda: optimizers.NewtonCG(trust_radius=self.step, iterations=self.iterations),
+            "newton": lambda: optimizers.Newton(trust_radius=self.step),
+            "lbfgs": lambda: optimizers.LBFGS(trust_radius=self.step),
+            "adam": lambda: optimizers.Adam(self.step * common, schedule=schedule),
+        }
+        return estimator, made[self.optimizer]()
+
+
+def parse_widths(given: float | str) -> float | dict[str, float]:
+    """A width for all parameters, or {key: width, "*": width of the others} from "0.2, mug.rotation.y=0.6".
+
+    Raises:
+        InputError: no width for the others, or what is no number above 0.
+    """
+    if not isinstance(given, str):
+        return given
+    widths: dict[str, float] = {}
+    for part in given.split(","):
+        key, _, number = part.rpartition("=")
+        try:
+            widths[key.strip() or "*"] = _WIDTH.validate_python(number.strip())
+        except pydantic.ValidationError as error:
+            raise InputError(f"sigma: expected a number above 0, got {number.strip()!r}") from error
+    if "*" not in widths:
+        raise InputError(f"sigma: expected a number for all others too, as in 0.2, mug.rotation.y=0.6, got {given!r}")
+    return widths if len(widths) > 1 else widths["*"]
