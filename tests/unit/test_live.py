@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.io.bounded_files import arrays
+from unrender.io.bounded_files import read_float_arrays
 from unrender.io.thumbnails import reduced
 from unrender.runs import live as module
 from unrender.runs.folder.reader import read_record
@@ -32,7 +32,7 @@ def _always(monkeypatch: pytest.MonkeyPatch) -> None:
     """An update at every step."""
     monkeypatch.setattr(module, "_INTERVAL", 0.0)
     monkeypatch.setattr(module, "_SHARE", 1e9)
-    monkeypatch.setattr(module, "_LOOK", 0.0)
+    monkeypatch.setattr(module, "_POLL_SECONDS", 0.0)
 
 
 class Then(ur.Callback):
@@ -238,7 +238,7 @@ def test_a_run_whose_process_died_is_told_from_one_that_goes_on(problem, tmp_pat
 def test_the_live_folder_is_readable_as_a_run_folder_s_parts_are(problem, tmp_path):
     descend(problem, [Live(tmp_path)])
     assert read_record(tmp_path / "live" / "run.json", tmp_path).name == problem.name
-    assert arrays(tmp_path / "live" / "parameters.npz", tmp_path).keys() == set(problem.initial())
+    assert read_float_arrays(tmp_path / "live" / "parameters.npz", tmp_path).keys() == set(problem.initial())
 
 
 def test_reduced_keeps_the_mean_and_the_largest_side():

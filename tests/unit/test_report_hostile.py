@@ -19,7 +19,7 @@ from report_folders import KEY, Page, write_run
 from unrender import report
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
-from unrender.runs.folder import history_reader
+from unrender.runs.folder import history
 from unrender.watch.source import Source
 
 GOOD = np.ones((4, 5, 3), np.float32)
@@ -279,7 +279,7 @@ def test_an_archive_that_unpacks_to_more_than_memory_holds_is_not_unpacked(tmp_p
 def test_a_history_of_more_than_a_gigabyte_is_not_read(tmp_path):
     run = write_run(tmp_path / "run")
     with (run / "history.jsonl").open("r+b") as file:
-        file.truncate(history_reader.LONGEST + 1)  # a hole: it takes no room
+        file.truncate(history.LARGEST + 1)  # a hole: it takes no room
     with pytest.raises(InputError, match="larger than 1 GiB"):
         report.page(run)
 

@@ -16,7 +16,8 @@ from unrender.cli.progress import Progress
 from unrender.methods.catalogue import Method
 from unrender.problem.problem import Problem
 from unrender.runs.live import Live
-from unrender.runs.loop import RunAnnotations, optimize
+from unrender.runs.metadata import RunAnnotations
+from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 
 

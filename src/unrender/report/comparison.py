@@ -69,7 +69,7 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         measures=measures.known(),
         name=first.record.name,
         facts=html.facts(first.record),
-        commands={str(run.path): html.command(run.record) for group in comparison.groups for run in group.runs},
+        commands={str(run.path): run.record.command for group in comparison.groups for run in group.runs},
         views=[panels.view_of_methods(v, {name: run.views[v] for name, run in chosen.items()}) for v in views[:_VIEWS]],
         more_views=max(0, len(views) - _VIEWS),
         maps=[

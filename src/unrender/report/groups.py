@@ -61,7 +61,7 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
             raise InputError(f"{run.path / 'history.jsonl'}: no step was taken, there is nothing to compare")
         for key in run.parameters.keys() ^ first.parameters.keys():
             raise InputError(
-                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.shown(key)}"
+                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.printable(key)}"
             )
         for view in run.views.keys() | first.views.keys():
             sizes = [of.views[view].reference.shape[:2] if view in of.views else None for of in (first, run)]
@@ -79,12 +79,12 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
         for key in run.truth.keys() & first.truth.keys():
             if _apart(run.truth[key], first.truth[key]) > _ALIKE:
                 raise InputError(
-                    f"{run.path}: another problem than {first.path}: {bounded_files.shown(key)} has another true value"
+                    f"{run.path}: another problem than {first.path}: {bounded_files.printable(key)} has another true value"
                 )
     records = [run.record for run in runs]
     for what, values in {
         "problems": [of.name for of in records],
-        "losses, so that losses cannot be compared": [str(of.problem.get("loss", "")) for of in records],
+        "losses, so that losses cannot be compared": [str(of.problem.description.get("loss", "")) for of in records],
         "hardware or variants, so that times cannot be compared": [f"{of.hardware} {of.variant}" for of in records],
         "versions": [str(sorted(of.versions.items())) for of in records],
     }.items():

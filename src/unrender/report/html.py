@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import shlex
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -14,7 +13,7 @@ from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictU
 from markupsafe import Markup
 
 from unrender.report import words
-from unrender.runs.folder.reader import RunRecord
+from unrender.runs.folder.schema import RunRecord
 
 _SCRIPT = "viewer.js"
 
@@ -33,10 +32,6 @@ def source(name: str) -> str:
     return _loader().get_source(_environment(), name)[0]
 
 
-_FOR_RESUMING = ("fingerprint", "origin")
-"""What run.json says of the problem to resuming alone."""
-
-
 def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Nested fields as {"outer.inner": text}, what is empty left out."""
     found: dict[str, str] = {}
@@ -50,22 +45,16 @@ def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return {name: text for name, text in found.items() if text}
 
 
-def command(record: RunRecord) -> str:
-    """The command line of a run as one would type it."""
-    return record.command if isinstance(record.command, str) else shlex.join(record.command)
-
-
 def facts(record: RunRecord) -> dict[str, str]:
     """What a run was made with, {name: value}: problem, settings, seed, hardware, versions."""
-    hardware = record.hardware if isinstance(record.hardware, dict) else {"hardware": record.hardware}
     return flattened(
         {
-            "problem": {"name": record.name, **{k: v for k, v in record.problem.items() if k not in _FOR_RESUMING}},
+            "problem": {"name": record.name, **record.problem.description},
             "method": record.method,
             "settings": record.settings,
             "seed": record.seed,
             "variant": record.variant,
-            "hardware": hardware,
+            "hardware": record.hardware,
             "versions": record.versions,
         }
     )

@@ -33,7 +33,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         "page.html",
         run=run,
         stopped=tables.STOPPED.get(run.record.stopped, run.record.stopped),
-        command=html.command(run.record),
+        command=run.record.command,
         facts=html.facts(run.record),
         tiles=tables.tiles(run),
         views=[panels.view_of_run(view, of) for view, of in shown.items()],

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from unrender import images, losses, optimizers, pixels, preconditioners
+from unrender import images, losses, optimizers, pixels, preconditioners, schedules
 from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
 from unrender.estimators.loss_values import LossValues
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
-from unrender.core.suggestions import did_you_mean
-from unrender import schedules
 
 _TYPE, _NONE = "type", "none"
 _DEEPEST = 16

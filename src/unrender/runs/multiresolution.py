@@ -33,6 +33,7 @@ from typing import Any
 
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
+from unrender.core.trees import Tree
 from unrender.estimators.meta import MetaState
 from unrender.estimators.path import PathGradientState
 from unrender.estimators.smoothed import SmoothedState
@@ -46,10 +47,9 @@ from unrender.pixels.all import AllState
 from unrender.pixels.guided import GuidedSamplerState
 from unrender.pixels.uniform import UniformState
 from unrender.problem.problem import Problem
-from unrender.statistics import meta
 from unrender.runs.noise import GradientNoise
 from unrender.runs.run import Memory, Run
-from unrender.core.trees import Tree
+from unrender.statistics import meta
 
 SQUARES = 2.0
 """The power of 1/n with which mean squares of gradients are carried."""

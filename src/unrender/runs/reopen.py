@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from unrender.io import files
 from unrender import gallery
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
+from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
-from unrender.io import toml_lines
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
-from unrender.runs.folder import record
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder.reader import read_run_record
 from unrender.runs.result import Result
-from unrender.runs.resume import resume_run, load_run
+from unrender.runs.resume import load_run, resume_run
 
 _LONGEST = 1 << 24
 
@@ -61,9 +60,9 @@ def problem_of(directory: str | Path) -> Problem:
         InputError: it was made in Python, or problem.toml is malformed.
     """
     folder = Path(directory)
-    origin = record.read(folder).problem.origin
+    origin = read_run_record(folder).problem.origin
     path = folder / serialization.FILE
-    serialize = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
+    serialize = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
     if "gallery" in serialize:
         name, options = serialize["gallery"], serialize.get("options", {})
         if not isinstance(name, str) or not isinstance(options, dict) or set(serialize) - {"gallery", "options"}:

@@ -152,7 +152,7 @@ def _of_run(snapshot: Snapshot, run: RunFolder | None, gallery: Gallery, view: i
             panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k), paint) for k in maps[:_MAPS]
         ],
         "more_maps": max(0, len(maps) - _MAPS),
-        "command": html.command(run.record),
+        "command": run.record.command,
         "facts": html.facts(run.record),
     }
 

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from unrender.core.errors import InputError
 from unrender.io import files
-from unrender.runs.live import COMMANDS, CONTROL
+from unrender.runs.folder.schema import COMMANDS, CONTROL
 from unrender.watch import board
 from unrender.watch.source import Source
 

@@ -11,11 +11,10 @@ import drjit as dr
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.io import files
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
+from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
-from unrender.io import toml_lines
 from unrender.runs import component_tables
 from unrender.runs.run import Run
 
@@ -75,7 +74,7 @@ def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int 
 
 def read(path: Path) -> Method:
     """Raises `InputError` that names the field."""
-    found = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
+    found = toml_lines.parse(bounded_files.read_text(path, _LONGEST, path.parent), str(path))
     try:
         return Method.model_validate(found)
     except pydantic.ValidationError as error:
