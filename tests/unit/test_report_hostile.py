@@ -212,7 +212,7 @@ HOSTILE: dict[str, tuple[Break, str]] = {
     "a link to itself": (replaced("truth.npz", lambda path: path.symlink_to("truth.npz")), "cannot be read"),
     "a device": (replaced("truth.npz", lambda path: path.symlink_to("/dev/zero")), "leads out of the folder"),
     "a pipe": (replaced("history.jsonl", os.mkfifo), "not a regular file"),
-    "a folder": (replaced("initial.npz", Path.mkdir), "not a regular file"),
+    "a folder": (replaced("initial.npz", Path.mkdir), "a folder, expected a file"),
     # Pictures
     "a picture of nothing": (pictures(reference=GOOD[:0], result=GOOD[:0]), "expected shape"),
     "a probability of another size": (

@@ -244,13 +244,11 @@ def read_arrays(
                 raise InputError(f"{path}: expected an archive of one array, got {len(members)}")
             if sum(member.file_size for member in members) > most_bytes:
                 raise InputError(f"{path}: its arrays are larger than {most_bytes} bytes together")
+            _check_members(members, path)
             found: dict[str, np.ndarray] = {}
             for member in members:
                 key = member.filename.removesuffix(".npy")
                 name = printable(key)
-                _check_member(member, path)
-                if key in found:
-                    raise InputError(f"{path}: {name}: given twice")
                 with archive.open(member) as packed:
                     where = f"{path}: {name}"
                     found[key] = _read_array(packed, member.file_size, where, check, largest or most_bytes)
@@ -332,13 +330,19 @@ def _read_header(file: IO[bytes], where: str) -> tuple[np.dtype, bool, Shape]:
     return kind, match[2] == b"True", shape
 
 
-def _check_member(member: zipfile.ZipInfo, path: Path) -> None:
-    name = member.filename
-    if name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name:
-        raise InputError(f"{path}: {printable(name)}: a name that leads out of the archive")
-    if member.compress_type not in _COMPRESSIONS:
-        method = f"compression {member.compress_type}"
-        raise InputError(f"{path}: {printable(name)}: not an .npz archive that can be read ({method})")
+def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:
+    """Refuse names that lead out of the archive or are given twice, and compressions that NumPy does not write."""
+    seen: set[str] = set()
+    for member in members:
+        name, key = member.filename, member.filename.removesuffix(".npy")
+        if name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name:
+            raise InputError(f"{path}: {printable(name)}: a name that leads out of the archive")
+        if key in seen:
+            raise InputError(f"{path}: {printable(key)}: given twice")
+        if member.compress_type not in _COMPRESSIONS:
+            method = f"compression {member.compress_type}"
+            raise InputError(f"{path}: {printable(key)}: not an .npz archive that can be read ({method})")
+        seen.add(key)
 
 
 def _float_type(kind: np.dtype) -> type:
