@@ -19,7 +19,7 @@ from unrender.io.thumbnails import reduced
 from unrender.runs import live as module
 from unrender.runs.folder.reader import read_record
 from unrender.runs.live import Live
-from unrender.watch.source import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, Source
+from unrender.watch.monitor import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, RunMonitor
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def order(folder: Path, command: str) -> None:
 def test_what_is_written_is_what_the_run_is(problem, tmp_path):
     live = Live(tmp_path / "run", method="plain", command="unrender run exponential")
     seen: list[Any] = []
-    source = Source(tmp_path / "run")
+    source = RunMonitor(tmp_path / "run")
     descend(problem, [live, Then(_4=lambda: seen.append(source.snapshot()))])
     (snapshot,) = seen
     assert snapshot.state == RUNNING
@@ -101,7 +101,7 @@ def test_pictures_are_those_of_the_step(problem, tmp_path):
 
 
 def test_a_pause_holds_the_step_and_is_no_time_of_the_run(problem, tmp_path):
-    source, seen = Source(tmp_path), []
+    source, seen = RunMonitor(tmp_path), []
 
     def resume() -> None:
         while source.snapshot().state != PAUSED:
@@ -166,7 +166,7 @@ def test_a_folder_that_vanishes_is_a_warning_and_is_not_brought_back(problem, tm
 
 def test_a_paused_run_whose_folder_vanishes_goes_on(problem, tmp_path):
     folder = tmp_path / "run"
-    source = Source(folder)
+    source = RunMonitor(folder)
 
     def remove() -> None:
         while source.snapshot().state != PAUSED:
@@ -223,7 +223,7 @@ def test_history_of_its_own_until_somebody_else_writes_one(problem, tmp_path):
 
 
 def test_a_run_whose_process_died_is_told_from_one_that_goes_on(problem, tmp_path):
-    source = Source(tmp_path)
+    source = RunMonitor(tmp_path)
     assert source.snapshot().state == WAITING
     kept: list[str] = []
     path = tmp_path / "live" / "status.json"

@@ -20,7 +20,7 @@ from unrender import report
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 from unrender.runs.folder import history
-from unrender.watch.source import Source
+from unrender.watch.monitor import RunMonitor
 
 GOOD = np.ones((4, 5, 3), np.float32)
 Break = Callable[[Path], Any]
@@ -250,7 +250,7 @@ def test_a_hostile_folder_is_refused_in_one_line(tmp_path, monkeypatch, name):
     assert str(run) in str(raised.value)
     assert len(str(raised.value)) < 600
     assert peak < 200 << 20
-    snapshot = Source(run).snapshot()
+    snapshot = RunMonitor(run).snapshot()
     assert any(str(run) in line for line in snapshot.problems)
     assert sorted(path for path in tmp_path.rglob("*")) == before  # neither a page nor anything else
     assert not Path("owned").exists()

@@ -262,9 +262,7 @@ def read_arrays(
         raise InputError(f"{path}:{field} not an .npz archive that can be read ({_reason(error)})") from error
 
 
-def read_array(
-    path: Path, most_bytes: int = LARGEST_GIVEN, check: Callable[[Shape], None] | None = None
-) -> np.ndarray:
+def read_array(path: Path, most_bytes: int = LARGEST_GIVEN, check: Callable[[Shape], None] | None = None) -> np.ndarray:
     """The array of real numbers in an .npy file; see `read_arrays`."""
     try:
         with open_regular(path) as file:

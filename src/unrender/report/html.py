@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from unrender.report import words
+from unrender.report import formatting
 from unrender.runs.folder.schema import RunRecord
 
 _SCRIPT = "viewer.js"
@@ -29,15 +29,15 @@ def render(template: str, **context: Any) -> bytes:
 
 def source(name: str) -> str:
     """The text of a style sheet or script among the templates."""
-    return _loader().get_source(_environment(), name)[0]
+    return loader().get_source(_environment(), name)[0]
 
 
-def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Nested fields as {"outer.inner": text}, what is empty left out."""
     found: dict[str, str] = {}
     for name, value in fields.items():
         if isinstance(value, Mapping):
-            found.update(flattened(value, f"{prefix}{name}."))
+            found.update(flatten(value, f"{prefix}{name}."))
         elif isinstance(value, list) and all(isinstance(part, str) for part in value):
             found[f"{prefix}{name}"] = ", ".join(value)
         elif value not in (None, ""):
@@ -47,7 +47,7 @@ def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 def facts(record: RunRecord) -> dict[str, str]:
     """What a run was made with, {name: value}: problem, settings, seed, hardware, versions."""
-    return flattened(
+    return flatten(
         {
             "problem": {"name": record.name, **record.problem.description},
             "method": record.method,
@@ -60,24 +60,25 @@ def facts(record: RunRecord) -> dict[str, str]:
     )
 
 
-def environment(*further: BaseLoader) -> Environment:
-    """The templates, and those of `further` loaders; everything that is put into them is escaped."""
+def environment(templates: BaseLoader) -> Environment:
+    """An environment that escapes everything that is put into its templates."""
     found = Environment(
-        loader=ChoiceLoader([*further, _loader()]),
+        loader=templates,
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters.update(number=words.number, duration=words.duration, count=words.count)
+    found.filters.update(number=formatting.number, duration=formatting.duration, count=formatting.count)
     return found
 
 
 @cache
-def _loader() -> PackageLoader:
+def loader() -> PackageLoader:
+    """Of the report's templates."""
     return PackageLoader("unrender.report", "templates")
 
 
 @cache
 def _environment() -> Environment:
-    return environment()
+    return environment(loader())

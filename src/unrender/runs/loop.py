@@ -62,9 +62,7 @@ class Descent:
         for _ in range(2):
             key = Key(run.seed, 0, stream=1)
             found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
-            run.parameters, state.optimizer = _apply(
-                run.problem, found, state.optimizer, run.optimizer, run.parameters
-            )
+            run.parameters, state.optimizer = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
             state.noise.update(found.gradient, found.variance)
         return time.perf_counter() - started, snapshot(run, state)
 

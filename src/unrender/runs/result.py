@@ -124,7 +124,9 @@ class Result:
             "problem": dict(self.problem),
             "resumed": list(self.resumed),
         }
-        return schema.serialize(schema.RunRecord.model_construct(**fields, **({"error": error} if error else {})))
+        if error:
+            fields["error"] = error
+        return schema.serialize(schema.RunRecord.model_construct(None, **fields))
 
 
 def versions() -> dict[str, str]:

@@ -157,7 +157,9 @@ def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
     data = bounded_files.read_bytes(path, min(manifest.size, _LARGEST_STATE), path.parent)
     if hashlib.sha256(data).hexdigest() != manifest.sha256:
         raise InputError(f"{path}: not what was written: its SHA-256 is not the manifest's")
-    header = bounded_files.parse_json(data[8 : 8 + min(int.from_bytes(data[:8], "little"), len(data))], f"{path}: header")
+    header = bounded_files.parse_json(
+        data[8 : 8 + min(int.from_bytes(data[:8], "little"), len(data))], f"{path}: header"
+    )
     if not isinstance(header, dict):
         raise InputError(f"{path}: not tensors that can be read: its header is no object")
     try:

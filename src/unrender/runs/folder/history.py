@@ -16,7 +16,16 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
 from unrender.runs.folder.schema import HISTORY_AXES, HISTORY_COLUMNS
 
-__all__ = ["LARGEST", "LARGEST_LINE", "ErrorHistory", "History", "HistoryFile", "HistoryReader", "lines", "read_records"]
+__all__ = [
+    "LARGEST",
+    "LARGEST_LINE",
+    "ErrorHistory",
+    "History",
+    "HistoryFile",
+    "HistoryReader",
+    "lines",
+    "read_records",
+]
 
 LARGEST_LINE = 1 << 20
 """In bytes."""

@@ -18,7 +18,15 @@ from unrender.runs.folder import schema
 from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.schema import RunRecord
 
-__all__ = ["RunFolder", "ViewPictures", "pictures_by_view", "read", "read_record", "read_run_record", "root_mean_square"]
+__all__ = [
+    "RunFolder",
+    "ViewPictures",
+    "pictures_by_view",
+    "read",
+    "read_record",
+    "read_run_record",
+    "root_mean_square",
+]
 
 
 @dataclass(frozen=True)

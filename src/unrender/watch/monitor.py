@@ -23,7 +23,7 @@ _LIVE_FILES = (LIVE_STATUS, schema.LIVE_START, schema.LIVE_VIEWS, *_FILES)
 
 WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"
 FINISHED, LOST, VANISHED = "finished", "lost", "vanished"
-"""What a run may be doing. Lost: its process ended without a word."""
+"""States of a run. Lost: its process ended before the run did."""
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,22 @@ class Snapshot:
     problems: tuple[str, ...] = ()
 
     @property
-    def listens(self) -> bool:
-        """Whether commands reach it."""
+    def accepts_commands(self) -> bool:
+        """Whether the run reads commands."""
         return self.state in (RUNNING, PAUSED)
 
 
-class Source:
+class RunMonitor:
     """Follows a run folder. Nothing in it is trusted, nothing of it is required.
 
     Attributes:
         path: the folder.
-        revision: how often something new was seen.
+        revision: how often a change was found.
     """
 
     def __init__(self, path: Path):
         self.path = path
-        self._seen: tuple = ()
+        self._last_stamps: tuple = ()
         self._last = Snapshot(path, WAITING)
         self._histories: dict[Path, HistoryReader] = {}
         self.revision = 0
@@ -68,16 +68,16 @@ class Source:
     def snapshot(self) -> Snapshot:
         """What is there now; the same object as before where nothing has changed. Never raises for what is in the folder."""
         stamps = self._stamps()
-        if stamps != self._seen:
-            found = self._look()
+        if stamps != self._last_stamps:
+            found = self._read()
             if found.run is None and self._last.run is not None and found.state in (VANISHED, WAITING):
                 found = Snapshot(self.path, VANISHED, self._last.run, self._last.status, found.problems)
-            self._seen, self._last = stamps, found
+            self._last_stamps, self._last = stamps, found
             self.revision += 1
         return self._last
 
     def _stamps(self) -> tuple:
-        """Of every file that is read, and of whether the run's process lives."""
+        """Change times, sizes and inodes of every file that is read, and whether the run's process lives."""
         found: list[Any] = []
         for path in [self.path / name for name in _FILES] + [self.path / LIVE / name for name in _LIVE_FILES]:
             try:
@@ -88,14 +88,12 @@ class Source:
         status = self._last.status
         return (self.path.is_dir(), status is not None and _alive(status), *found)
 
-    def _look(self) -> Snapshot:
+    def _read(self) -> Snapshot:
         if not self.path.is_dir():
             return Snapshot(self.path, VANISHED)
         problems: list[str] = []
         status = self._try(problems, self._status)
-        if status is not None and (
-            status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / RECORD)
-        ):
+        if status is not None and (status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / RECORD)):
             run = self._try(problems, lambda: self._live(status, problems))
             state = SAVING if status.status not in (RUNNING, PAUSED) else status.status
             return Snapshot(self.path, state if _alive(status) else LOST, run, status, tuple(problems))
@@ -113,11 +111,11 @@ class Source:
         return schema.validate(LiveStatus, bounded_files.read_object(path, self.path), str(path))
 
     def _live(self, status: LiveStatus, problems: list[str]) -> RunFolder:
-        """A run that goes on, from live/. What is missing is left out; what cannot be read is told in `problems`."""
+        """A run under way, from live/. What is missing is left out; what cannot be read is fields in `problems`."""
         live = self.path / LIVE
         record = read_record(live / RECORD, self.path)
-        told = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
-        record = record.model_copy(update={**told, "skipped": status.skipped, "warnings": status.warnings})
+        fields = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
+        record = record.model_copy(update={**fields, "skipped": status.skipped, "warnings": status.warnings})
         parameters, initial, truth, start, views = (
             self._arrays(live / f"{name}.npz", problems)
             for name in ("parameters", "initial", "truth", "start", "views")
@@ -156,7 +154,7 @@ class Source:
         except InputError as error:
             problems.append(str(error))
         except FileNotFoundError:
-            pass  # replaced or removed while it was read: the next look will tell
+            pass  # replaced or removed while it was read: the next snapshot will show
         except OSError as error:
             problems.append(f"{self.path}: cannot be read: {error.strerror or error}")
         return None
