@@ -62,9 +62,7 @@ def compare(
             raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
         _compare_folders(console, [Path(name) for name in what], out, overwrite)
         return
-    if len(what) > 1:
-        missing = next(name for name in what if not Path(name).is_dir())
-        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
+    _check_single(what)
     chosen = _parse_methods(methods)
     given = _settings_by_method(chosen, arguments.settings(settings, "--set"))
     for one in chosen:
@@ -79,8 +77,7 @@ def compare(
         problem = arguments.open_problem(what[0], options)
         introduce(console, problem, running)
         command = shlex.join(context.find_root().obj or ["unrender"])
-        # Methods take turns, so that a machine that slows down slows all of them.
-        plans = [
+        plans = [  # methods take turns, so that a machine that slows down slows all of them
             Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
             for number, one in itertools.product(range(seed, seed + seeds), chosen)
         ]
@@ -88,12 +85,24 @@ def compare(
     finally:
         arguments.remove_if_empty(folder)
     if directories:
-        comparison, notices = report.load_comparison(directories)
-        _print_comparison(console, comparison)
-        console.print("Time of compilation is left out for every method alike.")
-        console.print(f"page: {_plain(str(report.write_comparison(comparison, notices, folder)))}", soft_wrap=True)
+        _report(console, directories, folder)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
+
+
+def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
+    """Compare runs made here."""
+    comparison, notices = report.load_comparison(directories)
+    _print_comparison(console, comparison)
+    console.print("Time of compilation is left out for every method alike.")
+    console.print(f"page: {_plain(str(report.write_comparison(comparison, notices, folder)))}", soft_wrap=True)
+
+
+def _check_single(what: Sequence[str]) -> None:
+    """Raise `InputError` unless one problem is given."""
+    if len(what) > 1:
+        missing = next(name for name in what if not Path(name).is_dir())
+        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
 
 
 def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:

@@ -94,7 +94,7 @@ def _draw(axes: Axes, metric: Metric, axis: str) -> None:
     axes.tick_params(labelsize=8)
     axes.grid(color="#edeae4")
     axes.set_axisbelow(True)
-    axes.spines[["error_limit", "right"]].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _plain(text: str) -> str:

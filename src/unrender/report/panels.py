@@ -77,7 +77,7 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
     what = name.lower()
     error = tone_mapping.absolute_error(shown.result, shown.reference)
     before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference)
-    high = tone_mapping.error_limit(error if before is None else before)
+    high = tone_mapping.colour_limit(error if before is None else before)
     result = encoder.colour(shown.result, factor, f"View {view}: the {what}")
     stacks: list[tuple[Slider | Figure, ...]] = [
         (Slider(encoder.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
@@ -107,7 +107,7 @@ def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> li
         found.append(Figure(picture, "Control weight", note, bar))
     if shown.pixel_probability is not None:
         density = shown.pixel_probability
-        high = tone_mapping.error_limit(density)
+        high = tone_mapping.colour_limit(density)
         picture = encoder.false_colour(
             density, 0.0, high, tone_mapping.VALUE_COLORMAP, f"View {view}: probability of each pixel"
         )
@@ -121,7 +121,7 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
     reference = next(iter(shown.values())).reference
     factor = tone_mapping.exposure(reference)
     errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
-    high = max(tone_mapping.error_limit(error) for error in errors.values())
+    high = max(tone_mapping.colour_limit(error) for error in errors.values())
     stacks = tuple(
         (
             Slider(
@@ -151,7 +151,7 @@ def map_of_run(
             for caption, one in (("Error at the start", start), ("Error", plane))
             if one is not None and wanted is not None and one.shape == wanted.shape
         }
-        high = tone_mapping.error_limit(next(iter(errors.values()))) if errors else 1.0
+        high = tone_mapping.colour_limit(next(iter(errors.values()))) if errors else 1.0
         column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, start, wanted)]
         if wanted is not None and start is not None:
             column.append(
@@ -182,7 +182,7 @@ def map_of_methods(
         for name, plane in found.items()
         if plane is not None and plane.shape == wanted.shape
     }
-    high = max([tone_mapping.error_limit(error) for error in errors.values()], default=1.0)
+    high = max([tone_mapping.colour_limit(error) for error in errors.values()], default=1.0)
     stacks = []
     for name, plane in found.items():
         if plane is None:

@@ -89,7 +89,7 @@ class Chart:
     width: int = WIDTH
     height: int = HEIGHT
     frame: dict[str, int] = field(
-        default_factory=lambda: {"left": LEFT, "right": WIDTH - RIGHT, "error_limit": TOP, "bottom": HEIGHT - BOTTOM}
+        default_factory=lambda: {"left": LEFT, "right": WIDTH - RIGHT, "top": TOP, "bottom": HEIGHT - BOTTOM}
     )
 
 

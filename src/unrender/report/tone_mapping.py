@@ -29,7 +29,7 @@ __all__ = [
     "apply_colormap",
     "colour_bar",
     "error_bar",
-    "error_limit",
+    "colour_limit",
     "exposure",
     "inline",
     "srgb",
@@ -179,7 +179,7 @@ def absolute_error(shown: np.ndarray, reference: np.ndarray) -> np.ndarray:
         return np.mean(np.abs(shown - reference), axis=-1)
 
 
-def error_limit(error: np.ndarray) -> float:
+def colour_limit(error: np.ndarray) -> float:
     """The end of an error's colour scale: its 99th percentile (its maximum where that is 0)."""
     finite = error[np.isfinite(error)]
     if finite.size == 0:

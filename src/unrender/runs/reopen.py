@@ -62,13 +62,13 @@ def problem_of(directory: str | Path) -> Problem:
     folder = Path(directory)
     origin = read_run_record(folder).problem.origin
     path = folder / serialization.FILE
-    serialize = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
-    if "gallery" in serialize:
-        name, options = serialize["gallery"], serialize.get("options", {})
-        if not isinstance(name, str) or not isinstance(options, dict) or set(serialize) - {"gallery", "options"}:
-            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(serialize)[:80]}')
+    stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
+    if "gallery" in stored:
+        name, options = stored["gallery"], stored.get("options", {})
+        if not isinstance(name, str) or not isinstance(options, dict) or set(stored) - {"gallery", "options"}:
+            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(stored)[:80]}')
         return gallery.problem(name, **options)
-    if "scene" not in serialize:
+    if "scene" not in stored:
         raise InputError(
             f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
             "unrender.export((problem, result.parameters), out)"
