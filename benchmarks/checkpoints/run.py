@@ -21,7 +21,6 @@ from common import write
 
 import unrender as ur
 from unrender.methods.catalogue import method
-from unrender.runs.folder import writer
 from unrender.runs.folder.writer import RunWriter
 
 HERE = Path(__file__).resolve().parent
@@ -43,19 +42,19 @@ BOTH = ("quad, smoothed", "indirect-room, rcv")
 
 
 class Timed(RunWriter):
-    """A keeper that knows how long it took."""
+    """A writer that measures how long it takes."""
 
     spent: dict[str, float] = {}  # noqa: RUF012
     count = 0
 
-    def step(self, record: Any) -> None:
+    def append(self, record: Any) -> None:
         began = time.perf_counter()
-        super().step(record)
+        super().append(record)
         Timed.spent["history"] = Timed.spent.get("history", 0.0) + time.perf_counter() - began
 
-    def checkpoint(self, *arguments: Any) -> None:
+    def write_checkpoint(self, *arguments: Any) -> None:
         began, before = time.perf_counter(), self._written_step
-        super().checkpoint(*arguments)
+        super().write_checkpoint(*arguments)
         Timed.spent["checkpoints"] = Timed.spent.get("checkpoints", 0.0) + time.perf_counter() - began
         Timed.count += self._written_step != before
 
@@ -88,10 +87,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     asked = parser.parse_args()
     print(ur.use())
-    writer.RunWriter = Timed
-    from unrender.runs import loop
+    from unrender.runs import optimize
 
-    loop.RunWriter = Timed
+    optimize.RunWriter = Timed
     found: dict[str, Any] = {}
     for name, case in CASES.items():
         ways = {"50": 50, "default": None} if name in BOTH else {"50": 50}

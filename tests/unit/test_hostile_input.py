@@ -185,7 +185,7 @@ CHECKPOINTS: dict[str, Callable[[Path], Any]] = {
     "a class of the standard library": lambda f: _node(f, lambda n: n.update(optimizer=_class("os.system", command="touch escape"))),
     "a class of another module": lambda f: _node(f, lambda n: n.update(optimizer=_class(f"unrender.{_CANARY}.State"))),
     "a function of this package": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.io.files.write", path="escape"))),
-    "a class that is no state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.runs.folder.writer.RunWriter", folder="."))),
+    "a class that is no state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.runs.folder.writer.RunWriter"))),
     "another state": lambda f: _node(f, lambda n: n.update(optimizer=_class("unrender.estimators.loss_values.LossState"))),
     "a state with other fields": lambda f: _node(f, lambda n: n["optimizer"]["fields"].update(more=1)),
     "a state with a field of another type": lambda f: _node(f, lambda n: n["optimizer"]["fields"].update(step="4")),
