@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from unrender.problem.view import View
     from unrender.runs.callbacks import Callback
     from unrender.runs.live import Live
-    from unrender.runs.loop import estimate, optimize
+    from unrender.runs.optimize import estimate, optimize
     from unrender.runs.reopen import resume
     from unrender.runs.result import Result
     from unrender.runs.tensorboard import TensorBoard
@@ -86,9 +86,9 @@ _HOMES = {
     "SmoothedDerivatives": "estimators.smoothed",
     "TensorBoard": "runs.tensorboard",
     "View": "problem.view",
-    "estimate": "runs.loop",
+    "estimate": "runs.optimize",
     "export": "exporting.scene_folder",
-    "optimize": "runs.loop",
+    "optimize": "runs.optimize",
     "read_grid": "io.volumes",
     "register": "core.registry",
     "render": "problem.render",

@@ -92,7 +92,7 @@ def test_resume_refuses_in_one_line(unrender, stopped: Path, words: list[str], m
 def test_a_second_run_in_the_folder_is_refused(unrender, stopped: Path, mitsuba_variant: str):
     """By another process, which holds it."""
     code = "import sys; from pathlib import Path; from unrender.runs.folder.lock import Lock\n"
-    code += "Lock(Path(sys.argv[1])).take(); print('held', flush=True); sys.stdin.read()"
+    code += "Lock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
     environment = {**os.environ, "PYTHONPATH": str(Path(package.__file__).parents[1])}
     other = subprocess.Popen(
         [sys.executable, "-c", code, str(stopped)],

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.io.bounded_files import arrays
+from unrender.io.bounded_files import read_float_arrays
 from unrender.io.thumbnails import reduced
 from unrender.runs import live as module
 from unrender.runs.folder.reader import read_record
 from unrender.runs.live import Live
-from unrender.watch.source import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, Source
+from unrender.watch.monitor import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, RunMonitor
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def _always(monkeypatch: pytest.MonkeyPatch) -> None:
     """An update at every step."""
     monkeypatch.setattr(module, "_INTERVAL", 0.0)
     monkeypatch.setattr(module, "_SHARE", 1e9)
-    monkeypatch.setattr(module, "_LOOK", 0.0)
+    monkeypatch.setattr(module, "_POLL_SECONDS", 0.0)
 
 
 class Then(ur.Callback):
@@ -59,7 +59,7 @@ def order(folder: Path, command: str) -> None:
 def test_what_is_written_is_what_the_run_is(problem, tmp_path):
     live = Live(tmp_path / "run", method="plain", command="unrender run exponential")
     seen: list[Any] = []
-    source = Source(tmp_path / "run")
+    source = RunMonitor(tmp_path / "run")
     descend(problem, [live, Then(_4=lambda: seen.append(source.snapshot()))])
     (snapshot,) = seen
     assert snapshot.state == RUNNING
@@ -101,7 +101,7 @@ def test_pictures_are_those_of_the_step(problem, tmp_path):
 
 
 def test_a_pause_holds_the_step_and_is_no_time_of_the_run(problem, tmp_path):
-    source, seen = Source(tmp_path), []
+    source, seen = RunMonitor(tmp_path), []
 
     def resume() -> None:
         while source.snapshot().state != PAUSED:
@@ -166,7 +166,7 @@ def test_a_folder_that_vanishes_is_a_warning_and_is_not_brought_back(problem, tm
 
 def test_a_paused_run_whose_folder_vanishes_goes_on(problem, tmp_path):
     folder = tmp_path / "run"
-    source = Source(folder)
+    source = RunMonitor(folder)
 
     def remove() -> None:
         while source.snapshot().state != PAUSED:
@@ -223,7 +223,7 @@ def test_history_of_its_own_until_somebody_else_writes_one(problem, tmp_path):
 
 
 def test_a_run_whose_process_died_is_told_from_one_that_goes_on(problem, tmp_path):
-    source = Source(tmp_path)
+    source = RunMonitor(tmp_path)
     assert source.snapshot().state == WAITING
     kept: list[str] = []
     path = tmp_path / "live" / "status.json"
@@ -238,7 +238,7 @@ def test_a_run_whose_process_died_is_told_from_one_that_goes_on(problem, tmp_pat
 def test_the_live_folder_is_readable_as_a_run_folder_s_parts_are(problem, tmp_path):
     descend(problem, [Live(tmp_path)])
     assert read_record(tmp_path / "live" / "run.json", tmp_path).name == problem.name
-    assert arrays(tmp_path / "live" / "parameters.npz", tmp_path).keys() == set(problem.initial())
+    assert read_float_arrays(tmp_path / "live" / "parameters.npz", tmp_path).keys() == set(problem.initial())
 
 
 def test_reduced_keeps_the_mean_and_the_largest_side():

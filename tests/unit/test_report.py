@@ -13,7 +13,7 @@ from PIL import Image
 from report_folders import KEY, Page, write_run
 
 from unrender import report
-from unrender.report import curves, images, panels, words
+from unrender.report import curves, formatting, panels, tone_mapping
 from unrender.runs.folder.reader import read
 
 
@@ -96,7 +96,7 @@ def test_page_opens_only_when_asked(tmp_path, monkeypatch):
 
 def test_srgb_has_the_standards_values():
     assert np.allclose(
-        images.srgb(np.array([-1.0, 0.0, 0.0031308, 0.5, 1.0, 9.0, np.nan])),
+        tone_mapping.srgb(np.array([-1.0, 0.0, 0.0031308, 0.5, 1.0, 9.0, np.nan])),
         [0, 0, 0.04045, 0.735357, 1, 1, 0],
         atol=1e-5,
     )
@@ -104,11 +104,11 @@ def test_srgb_has_the_standards_values():
 
 def test_exposure_takes_the_references_percentile_to_its_place_and_ignores_a_lamp():
     flat = np.full((10, 10, 3), 0.02)
-    assert images.exposure(flat) == pytest.approx(0.7 / 0.02)
+    assert tone_mapping.exposure(flat) == pytest.approx(0.7 / 0.02)
     with_lamp = flat.copy()
     with_lamp[0, :4] = 50.0
-    assert images.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
-    assert images.exposure(np.zeros((2, 2, 3))) == 1.0
+    assert tone_mapping.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
+    assert tone_mapping.exposure(np.zeros((2, 2, 3))) == 1.0
 
 
 def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
@@ -116,11 +116,11 @@ def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
     reference = rng.uniform(0.01, 0.1, (6, 8, 3)).astype(np.float32)
     views = {"view0/reference": reference, "view0/initial": 2 * reference, "view0/result": 0.7 * reference}
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
-    factor = images.exposure(reference)
+    factor = tone_mapping.exposure(reference)
     for alt, linear in {"the reference": 1.0, "the result": 0.7, "before the first step": 2.0}.items():
-        expected = images.srgb(linear * reference * factor) * 255
+        expected = tone_mapping.srgb(linear * reference * factor) * 255
         assert np.abs(page.picture(f"View 0: {alt}") - expected).max() <= 0.51
-    assert words.number(factor) in page.words
+    assert formatting.number(factor) in page.words
 
 
 def test_control_weight_is_the_mean_over_channels_from_0_to_1(tmp_path):
@@ -141,7 +141,7 @@ def test_error_pictures_of_start_and_result_share_one_scale(tmp_path):
     views = {"view0/reference": reference, "view0/initial": reference + 0.4, "view0/result": result}
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
     start, end = (page.picture(f"View 0: error {of}") for of in ("before the first step", "of the result"))
-    expected = images.mapped(np.array([[1.0, 0.5, 0.0]]), 0.0, 1.0, images.ERRORS)[0] * 255
+    expected = tone_mapping.apply_colormap(np.array([[1.0, 0.5, 0.0]]), 0.0, 1.0, tone_mapping.ERROR_COLORMAP)[0] * 255
     assert np.abs(start - expected[0]).max() <= 1  # 0.4 is the end of the scale
     assert np.abs(end[0, 0] - expected[1]).max() <= 2  # a quarter of it is half-way: square root
     assert np.abs(end[1:] - expected[2]).max() <= 1
@@ -150,10 +150,10 @@ def test_error_pictures_of_start_and_result_share_one_scale(tmp_path):
 def test_large_pictures_are_box_filtered():
     large = np.zeros((2, 3000, 3))
     large[:, ::3] = 0.3
-    shown = images.INLINE.colour(large, 1.0, "")
+    shown = tone_mapping.INLINE.colour(large, 1.0, "")
     pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown.source.split(",")[1]))))
     assert pixels.shape == (1, 1000, 3)
-    assert np.abs(pixels - 255 * images.srgb(np.array(0.1))).max() <= 0.51
+    assert np.abs(pixels - 255 * tone_mapping.srgb(np.array(0.1))).max() <= 0.51
 
 
 @pytest.mark.parametrize(
@@ -189,10 +189,10 @@ def test_maps_scalars_and_volumes(tmp_path):
     assert "0.125" in page.words
     assert "0.75, 0.5, 0.25" in page.words
     for axis, plane in {"z": volume[2], "y": volume[:, 2], "x": volume[:, :, 3]}.items():
-        expected = images.mapped(plane[..., 0], 0.0, volume.max(), images.VALUES) * 255
+        expected = tone_mapping.apply_colormap(plane[..., 0], 0.0, volume.max(), tone_mapping.VALUE_COLORMAP) * 255
         assert np.abs(page.picture(f"grid.data middle slice along {axis}: the truth") - expected).max() <= 0.51
     environment = page.picture("environment.data : the truth")
-    assert np.abs(environment - 255 * images.srgb(np.array(0.7))).max() <= 0.51  # exposed, for it passes 1
+    assert np.abs(environment - 255 * tone_mapping.srgb(np.array(0.7))).max() <= 0.51  # exposed, for it passes 1
 
 
 def test_the_table_tells_errors_from_the_truth(tmp_path):
@@ -204,8 +204,8 @@ def test_the_table_tells_errors_from_the_truth(tmp_path):
         parameters={"a": np.array([0.3, 0.4]), "b": np.array([1.25])},
     )
     words_of_page = Page(report.page(run)).words
-    assert words.number(np.sqrt(12.5)) in words_of_page
-    assert words.number(np.sqrt(0.125)) in words_of_page
+    assert formatting.number(np.sqrt(12.5)) in words_of_page
+    assert formatting.number(np.sqrt(0.125)) in words_of_page
     assert "0.25" in words_of_page
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from report_folders import write_run
 
-from unrender.report import curves, plots, words
+from unrender.report import curves, formatting, plots
 from unrender.report.curves import Series
 from unrender.report.plots import Line
 from unrender.runs.folder.reader import read
@@ -40,7 +40,7 @@ def test_long_histories_are_thinned_to_median_and_range():
     rng = np.random.default_rng(0)
     x = np.linspace(0.001, 7.0, 20_000)
     y = 2.0 + rng.uniform(-1, 1, x.size)
-    thin = curves.bucketed(x, y)
+    thin = curves.binned(x, y)
     assert len(thin.x) <= 200
     assert thin.low.min() == y.min()
     assert thin.high.max() == y.max()
@@ -52,8 +52,8 @@ def test_a_series_keeps_its_value_until_the_next():
     series = Series(np.array([1.0, 2.0, 3.0]), np.array([10.0, 20.0, 30.0]), np.array([9.0, 4.0, 6.0]))
     assert series.at(np.array([0.0, 1.0, 1.99, 2.0, 50.0])).tolist() == [9, 9, 9, 4, 6]
     assert series.at(np.array([25.0]), "samples").tolist() == [4]
-    assert series.reached(5.0) == 2.0
-    assert series.reached(1.0) is None
+    assert series.time_to(5.0) == 2.0
+    assert series.time_to(1.0) is None
 
 
 def test_the_loss_is_smoothed_over_its_window_only(tmp_path):
@@ -89,7 +89,7 @@ def test_median_and_spread_over_runs():
     ],
 )
 def test_numbers(value, text):
-    assert words.number(value) == text
+    assert formatting.number(value) == text
 
 
 @pytest.mark.parametrize(
@@ -97,8 +97,8 @@ def test_numbers(value, text):
     [(0.0, "0 s"), (12.34, "12.3 s"), (59.7, "1 min 00 s"), (200.0, "3 min 20 s"), (3900, "1 h 05 min")],
 )
 def test_durations(seconds, text):
-    assert words.duration(seconds) == text
+    assert formatting.duration(seconds) == text
 
 
 def test_counts():
-    assert [words.count(n) for n in (0, 999, 20_000, 1_500_000)] == ["0", "999", "20 k", "1.5 M"]
+    assert [formatting.count(n) for n in (0, 999, 20_000, 1_500_000)] == ["0", "999", "20 k", "1.5 M"]

@@ -19,8 +19,8 @@ from report_folders import KEY, Page, write_run
 from unrender import report
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
-from unrender.runs.folder import history_reader
-from unrender.watch.source import Source
+from unrender.runs.folder import history
+from unrender.watch.monitor import RunMonitor
 
 GOOD = np.ones((4, 5, 3), np.float32)
 Break = Callable[[Path], Any]
@@ -212,7 +212,7 @@ HOSTILE: dict[str, tuple[Break, str]] = {
     "a link to itself": (replaced("truth.npz", lambda path: path.symlink_to("truth.npz")), "cannot be read"),
     "a device": (replaced("truth.npz", lambda path: path.symlink_to("/dev/zero")), "leads out of the folder"),
     "a pipe": (replaced("history.jsonl", os.mkfifo), "not a regular file"),
-    "a folder": (replaced("initial.npz", Path.mkdir), "not a regular file"),
+    "a folder": (replaced("initial.npz", Path.mkdir), "a folder, expected a file"),
     # Pictures
     "a picture of nothing": (pictures(reference=GOOD[:0], result=GOOD[:0]), "expected shape"),
     "a probability of another size": (
@@ -250,7 +250,7 @@ def test_a_hostile_folder_is_refused_in_one_line(tmp_path, monkeypatch, name):
     assert str(run) in str(raised.value)
     assert len(str(raised.value)) < 600
     assert peak < 200 << 20
-    snapshot = Source(run).snapshot()
+    snapshot = RunMonitor(run).snapshot()
     assert any(str(run) in line for line in snapshot.problems)
     assert sorted(path for path in tmp_path.rglob("*")) == before  # neither a page nor anything else
     assert not Path("owned").exists()
@@ -279,7 +279,7 @@ def test_an_archive_that_unpacks_to_more_than_memory_holds_is_not_unpacked(tmp_p
 def test_a_history_of_more_than_a_gigabyte_is_not_read(tmp_path):
     run = write_run(tmp_path / "run")
     with (run / "history.jsonl").open("r+b") as file:
-        file.truncate(history_reader.LONGEST + 1)  # a hole: it takes no room
+        file.truncate(history.LARGEST + 1)  # a hole: it takes no room
     with pytest.raises(InputError, match="larger than 1 GiB"):
         report.page(run)
 

@@ -236,7 +236,7 @@ def test_a_file_in_the_folder_s_place_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unrender.runs.folder.writer._WATCH_SECONDS", 0.0)
+    monkeypatch.setattr("unrender.runs.folder.writer._CHECK_SECONDS", 0.0)
     folder = tmp_path / "run"
     result = start(folder, every=4, callbacks=[At(5, lambda run: shutil.rmtree(folder))])
     assert result.warnings == [
@@ -249,14 +249,14 @@ def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: 
 
 
 def test_a_folder_deleted_and_taken_by_another_is_left_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unrender.runs.folder.writer._WATCH_SECONDS", 0.0)
+    monkeypatch.setattr("unrender.runs.folder.writer._CHECK_SECONDS", 0.0)
     folder = tmp_path / "run"
     other = Lock(folder)
 
     def take(run: Any) -> None:
         shutil.rmtree(folder)
         folder.mkdir()
-        other.take()
+        other.acquire()
 
     try:
         with pytest.raises(InputError, match="another run has taken its place; the result is not saved"):
@@ -287,7 +287,7 @@ def test_two_runs_in_one_folder(tmp_path: Path) -> None:
 
 def test_the_lock_of_a_process_that_died_is_no_lock(tmp_path: Path) -> None:
     code = "import sys, time; from pathlib import Path; from unrender.runs.folder.lock import Lock\n"
-    code += "Lock(Path(sys.argv[1])).take(); print('held', flush=True); time.sleep(60)"
+    code += "Lock(Path(sys.argv[1])).acquire(); print('held', flush=True); time.sleep(60)"
     environment = {**os.environ, "PYTHONPATH": str(Path(ur.__file__).parents[1])}
     words = [sys.executable, "-c", code, str(tmp_path)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment)
@@ -298,14 +298,14 @@ def test_the_lock_of_a_process_that_died_is_no_lock(tmp_path: Path) -> None:
         assert found is not None
         assert found.pid == process.pid
         with pytest.raises(InputError, match=f"in use by process {process.pid} on "):
-            Lock(tmp_path).take()
+            Lock(tmp_path).acquire()
     finally:
         process.kill()
         process.communicate()
     assert (tmp_path / "lock").exists()
     assert lock.holder(tmp_path) is None
     mine = Lock(tmp_path)
-    mine.take()
+    mine.acquire()
     mine.release()
     assert not (tmp_path / "lock").exists()
 
@@ -320,14 +320,14 @@ def test_a_number_given_to_another_process_is_told_apart(tmp_path: Path) -> None
     write_lock(tmp_path, started="another/1")
     assert lock.holder(tmp_path) is None
     mine = Lock(tmp_path)
-    mine.take()
+    mine.acquire()
     mine.release()
 
 
 def test_the_lock_of_another_machine_is_believed(tmp_path: Path) -> None:
     write_lock(tmp_path, host="elsewhere", started="")
     with pytest.raises(InputError, match=r"in use by process \d+ on elsewhere; if that is no more, delete .*lock"):
-        Lock(tmp_path).take()
+        Lock(tmp_path).acquire()
     assert (tmp_path / "lock").exists()
 
 
@@ -338,9 +338,9 @@ def test_without_locks_in_the_file_system_the_name_decides(tmp_path: Path, monke
     monkeypatch.setattr("fcntl.flock", refuse)
     write_lock(tmp_path)
     with pytest.raises(InputError, match="in use by process"):
-        Lock(tmp_path).take()
+        Lock(tmp_path).acquire()
     write_lock(tmp_path, started="another/1")
-    Lock(tmp_path).take()
+    Lock(tmp_path).acquire()
 
 
 def test_a_clock_set_back_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 from report_folders import KEY, write_run
 
 from browser import chromium
-from unrender.report import images
+from unrender.report import tone_mapping
 from unrender.watch import Address, application
 from unrender.watch.server import listen
 
@@ -132,12 +132,12 @@ def test_the_page_shows_a_finished_run(tmp_path):
     with np.load(run / "pictures.npz") as found:
         reference = found["view0/reference"]
     (address,) = {m[1] for m in re.finditer(r'src="(picture/\w+)"[^>]*alt="View 0: the reference"', page)}
-    factor = images.exposure(reference)
+    factor = tone_mapping.exposure(reference)
     for stops in (0, 1.5, -2):
         answer = asked.get(f"{address}?stops={stops}")
         assert answer.headers["content-type"] == "image/png"
         shown = np.asarray(Image.open(io.BytesIO(answer.content)))
-        expected = 255 * images.srgb(reference * factor * 2.0**stops)
+        expected = 255 * tone_mapping.srgb(reference * factor * 2.0**stops)
         assert np.abs(shown - expected).max() <= 0.51
     assert [asked.get(f"{address}?stops={bad}").status_code for bad in ("nan", "inf", "99", "x")] == [400] * 4
 

@@ -20,7 +20,7 @@ from unrender.cli.execute import Plan, execute, introduce
 from unrender.core.errors import InputError
 from unrender.evaluation.metrics import has_flip
 from unrender.methods import Method, method
-from unrender.report import words
+from unrender.report import formatting
 from unrender.report.equal_time import Comparison, Spread
 
 INTERRUPTED = 130
@@ -60,21 +60,10 @@ def compare(
     if all(Path(name).is_dir() for name in what):
         if methods or settings or problem_settings or seconds is not None:
             raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
-        folder = arguments.folder(out, "compare", overwrite, *_MARKS)
-        try:
-            comparison, notices = report.examine([Path(name) for name in what])
-            page = report.publish(comparison, notices, folder)
-        finally:
-            arguments.remove_if_empty(folder)
-        _tell(console, comparison)
-        for notice in notices:
-            console.print(f"note: {_plain(notice)}", soft_wrap=True)
-        console.print(f"page: {_plain(str(page))}", soft_wrap=True)
+        _compare_folders(console, [Path(name) for name in what], out, overwrite)
         return
-    if len(what) > 1:
-        missing = next(name for name in what if not Path(name).is_dir())
-        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
-    chosen = _chosen(methods)
+    _check_single(what)
+    chosen = _parse_methods(methods)
     given = _settings_by_method(chosen, arguments.settings(settings, "--set"))
     for one in chosen:
         one.start(given[one.name])
@@ -83,36 +72,68 @@ def compare(
     _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
     name = Path(what[0]).stem if what[0].endswith(".toml") else what[0]
     folder = arguments.folder(out, f"{name}-compare", overwrite, *_MARKS)
-    directories: list[Path] = []
-    interrupted = False
     try:
         running = arguments.use_variant(variant)
         problem = arguments.open_problem(what[0], options)
         introduce(console, problem, running)
         command = shlex.join(context.find_root().obj or ["unrender"])
-        # Methods take turns, so that a machine that slows down slows all of them.
-        for number, one in itertools.product(range(seed, seed + seeds), chosen):
-            console.print(f"[bold]{one.name}[/], seed {number}, {seconds:g} s")
-            plan = Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
-            directory = folder / f"{one.name}-seed{number}"
-            result = execute(plan, directory, console)
-            interrupted = result.stopped == "interrupted"
-            if result.steps:
-                directories.append(directory)
-            if interrupted:
-                break
+        plans = [  # methods take turns, so that a machine that slows down slows all of them
+            Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
+            for number, one in itertools.product(range(seed, seed + seeds), chosen)
+        ]
+        directories, interrupted = _run_all(console, plans, folder)
     finally:
         arguments.remove_if_empty(folder)
     if directories:
-        comparison, notices = report.examine(directories)
-        _tell(console, comparison)
-        console.print("Time of compilation is left out for every method alike.")
-        console.print(f"page: {_plain(str(report.publish(comparison, notices, folder)))}", soft_wrap=True)
+        _report(console, directories, folder)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-def _chosen(names: str | None) -> list[Method]:
+def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
+    """Compare runs made here."""
+    comparison, notices = report.load_comparison(directories)
+    _print_comparison(console, comparison)
+    console.print("Time of compilation is left out for every method alike.")
+    console.print(f"page: {_plain(str(report.write_comparison(comparison, notices, folder)))}", soft_wrap=True)
+
+
+def _check_single(what: Sequence[str]) -> None:
+    """Raise `InputError` unless one problem is given."""
+    if len(what) > 1:
+        missing = next(name for name in what if not Path(name).is_dir())
+        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
+
+
+def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:
+    """Compare runs made earlier."""
+    folder = arguments.folder(out, "compare", overwrite, *_MARKS)
+    try:
+        comparison, notices = report.load_comparison(directories)
+        page = report.write_comparison(comparison, notices, folder)
+    finally:
+        arguments.remove_if_empty(folder)
+    _print_comparison(console, comparison)
+    for notice in notices:
+        console.print(f"note: {_plain(notice)}", soft_wrap=True)
+    console.print(f"page: {_plain(str(page))}", soft_wrap=True)
+
+
+def _run_all(console: Console, plans: Sequence[Plan], folder: Path) -> tuple[list[Path], bool]:
+    """Carry out the plans until one is interrupted. Returns the run folders of runs that took a step, and whether one was interrupted."""
+    directories: list[Path] = []
+    for plan in plans:
+        console.print(f"[bold]{plan.method.name}[/], seed {plan.seed}, {plan.seconds:g} s")
+        directory = folder / f"{plan.method.name}-seed{plan.seed}"
+        result = execute(plan, directory, console)
+        if result.steps:
+            directories.append(directory)
+        if result.stopped == "interrupted":
+            return directories, True
+    return directories, False
+
+
+def _parse_methods(names: str | None) -> list[Method]:
     if names is None:
         return [method("plain"), method("rcv")]
     chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
@@ -140,17 +161,17 @@ def _settings_by_method(chosen: Sequence[Method], given: Mapping[str, str]) -> d
     return found
 
 
-def _tell(console: Console, comparison: Comparison) -> None:
+def _print_comparison(console: Console, comparison: Comparison) -> None:
     """The median over each method's runs, and the range: of every metric, and of the last pictures."""
     parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
     for metric in parameters or comparison.metrics:
         console.print(f"[bold]{_plain(metric.title)}[/]", soft_wrap=True)
-        first = metric.standings[comparison.groups[0].label]
-        times = [f"at {words.duration(moment.seconds)}" for moment in first.moments]
-        table = _table("method", "runs", *times, f"after {words.count(comparison.samples)} paths")
+        first = metric.methods[comparison.groups[0].label]
+        times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
+        table = _table("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
         for group in comparison.groups:
-            standing = metric.standings[group.label]
-            cells = [moment.error for moment in (*standing.moments, standing.at_samples[-1])]
+            outcome = metric.methods[group.label]
+            cells = [moment.error for moment in (*outcome.moments, outcome.at_samples[-1])]
             table.add_row(_plain(group.label), str(len(group.runs)), *map(_spread, cells))
         console.print(table)
     if comparison.image_error[comparison.groups[0].label].median is not None:
@@ -178,6 +199,6 @@ def _table(*headings: str) -> Table:
 def _spread(of: Spread) -> str:
     if of.median is None:
         return "–"
-    middle = words.number(of.median)
-    low, high = words.number(of.low), words.number(of.high)
+    middle = formatting.number(of.median)
+    low, high = formatting.number(of.low), formatting.number(of.high)
     return middle if low == high else f"{middle} ({low}–{high})"

@@ -1,4 +1,4 @@
-"""One run from start to folder, and how it is told."""
+"""One run of the command line, from a plan to a run folder, and its summary."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from unrender.cli.progress import Progress
 from unrender.methods import Method
 from unrender.problem.problem import Problem
 from unrender.runs.live import Live
-from unrender.runs.loop import RunAnnotations, optimize
+from unrender.runs.metadata import RunAnnotations
+from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 
 
@@ -29,8 +30,8 @@ class Plan:
         settings: of the method, where they are not the defaults.
         steps, seconds, seed: see `optimize`.
         final_spp: of the final pictures; None chooses.
-        command: what was typed, to be kept with the results.
-        problem_settings: of a gallery problem, to be kept with the results.
+        command: what was typed, to be saved with the results.
+        problem_settings: of a gallery problem, to be saved with the results.
         checkpoint_every: see `optimize`.
     """
 
@@ -50,9 +51,9 @@ def execute(plan: Plan, directory: Path, console: Console) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came."""
     estimator, optimizer = plan.method.start(plan.settings)
     options = plan.method.configure(plan.settings).model_dump()
-    kept = {"options": options, "problem_options": dict(plan.problem_settings)}
-    kept = {name: value for name, value in kept.items() if value}
-    about = RunAnnotations(plan.method.name, kept, plan.command, plan.final_spp)
+    settings = {"options": options, "problem_options": dict(plan.problem_settings)}
+    settings = {name: value for name, value in settings.items() if value}
+    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
     with Progress(console) as progress:
         result = optimize(
@@ -65,7 +66,7 @@ def execute(plan: Plan, directory: Path, console: Console) -> Result:
             [progress, live],
             directory,
             plan.checkpoint_every,
-            about,
+            annotations,
         )
     live.clear()
     return result

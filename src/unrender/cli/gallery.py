@@ -17,10 +17,10 @@ from unrender import gallery as problems
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import introduce
+from unrender.evaluation.metrics import exposure, srgb
 from unrender.io.files import write
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
-from unrender.report import images
 
 _SPP = 64
 
@@ -90,11 +90,11 @@ def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
             requests["truth"] = render(problem, problem.truth, index, spp or _SPP)
         for what, picture in requests.items():
             path = folder / f"view{index}-{what}.png"
-            written.append(write(path, _png(picture * images.exposure(reference))))
+            written.append(write(path, _png(picture * exposure(reference))))
     return written
 
 
 def _png(linear: np.ndarray) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray((images.srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    Image.fromarray((srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
     return buffer.getvalue()

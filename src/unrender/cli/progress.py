@@ -13,8 +13,8 @@ from rich.progress import Progress as Bar
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Run
     from unrender.runs.result import Result
+    from unrender.runs.run import Run
 
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 2.0

@@ -1,4 +1,4 @@
-"""`unrender resume`: take up a run where its last checkpoint left it."""
+"""`unrender resume`: continue a run from its last checkpoint."""
 
 from __future__ import annotations
 

@@ -28,11 +28,9 @@ def watch(
     """
     for directory in directories:
         if not directory.is_dir():
-            pair_request = (
-                [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []
-            )
+            siblings = [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []
             what = "a file, expected a run folder" if directory.exists() else "no such folder"
-            raise InputError(f"{directory}: {what}{did_you_mean(directory.name, pair_request)}")
+            raise InputError(f"{directory}: {what}{did_you_mean(directory.name, siblings)}")
     if len({directory.resolve() for directory in directories}) < len(directories):
         raise InputError("watch: a run folder is given twice")
     with server.listen(port) as opened:

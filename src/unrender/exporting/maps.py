@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from unrender.evaluation.metrics import srgb
 from unrender.exporting.ready_made import as_bitmap, file_name
 from unrender.io.volumes import write_grid
-from unrender.report.images import srgb
 
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
 _LARGEST = 64

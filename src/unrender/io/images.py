@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
-from unrender.io import files, image_size
+from unrender.io import bounded_files, image_size
 
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name endings that `read` knows."""
@@ -50,7 +50,7 @@ def read(source: Any, linearise: bool = True) -> Picture:
             raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
         try:
             numpy_file = path.suffix.lower() == ".npy"
-            picture = _from_array(files.read_array(path), linearise) if numpy_file else _read(path, linearise)
+            picture = _from_array(bounded_files.read_array(path), linearise) if numpy_file else _read(path, linearise)
             _check_finite(picture.values)
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error

@@ -14,7 +14,7 @@ from typing import Any
 from xml.parsers import expat
 
 from unrender.core.errors import InputError
-from unrender.io import files
+from unrender.io import bounded_files
 
 _DEEPEST = 128
 _DEEPEST_INCLUDE = 16
@@ -69,7 +69,7 @@ class _Reader:
         parser.StartElementHandler, parser.EndElementHandler = start, end
         parser.StartDoctypeDeclHandler = declared
         try:
-            parser.Parse(files.read_bytes(path, _LONGEST), True)
+            parser.Parse(bounded_files.read_bytes(path, _LONGEST), True)
         except expat.ExpatError as error:
             raise InputError(f"scene {shown}:{error.lineno}: not XML: {expat.ErrorString(error.code)}") from error
 

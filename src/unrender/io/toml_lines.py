@@ -6,12 +6,14 @@ import sys
 from typing import Any
 
 from unrender.core.errors import InputError
-from unrender.problem.errors import Place
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:  # pragma: no cover
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+Place = tuple[str | int, ...]
+"""A field's keys and indices from the top of the file."""
 
 _LONGEST_STATEMENT = 2000
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.io import files
+from unrender.io import bounded_files, files
 
 READABLE = (".vol", ".npy", ".npz")
 """File name endings that `read_grid` knows."""
@@ -128,9 +128,9 @@ def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.n
             raise InputError(f"{file}: {error}") from error
 
     if file.suffix.lower() == ".npz":
-        (array,) = files.read_arrays(file, check=named, one=True).values()
+        (array,) = bounded_files.read_arrays(file, check=named, one=True).values()
     else:
-        array = files.read_array(file, check=named)
+        array = bounded_files.read_array(file, check=named)
     with np.errstate(over="ignore"):
         array = array.astype(np.float32)
     _check_finite(file, array)

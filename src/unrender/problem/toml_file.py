@@ -34,7 +34,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Stric
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.io import files, toml_lines
+from unrender.io import bounded_files, toml_lines
 from unrender.io.toml_lines import tomllib
 from unrender.problem import coarse_to_fine
 from unrender.problem.errors import FieldError, Place, dotted
@@ -95,7 +95,7 @@ def read(path: str | Path) -> Problem:
         InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
     """
     file = Path(path)
-    text = files.read_text(file).replace("\r\n", "\n")
+    text = bounded_files.read_text(file).replace("\r\n", "\n")
     try:
         model = _Problem.model_validate(_parse(file, text))
         problem = _build(model, file)

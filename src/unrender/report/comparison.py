@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from unrender.io.files import write
-from unrender.report import curves, html, measures, panels, plots
+from unrender.report import curves, html, image_metrics, panels, plots
 from unrender.report import groups as grouping
-from unrender.report.equal_time import Comparison, measure
+from unrender.report.equal_time import Comparison, compare_groups
+from unrender.report.overview_figure import overview_figure
 from unrender.report.plots import Chart, Line
-from unrender.report.poster import poster
 from unrender.runs.folder.reader import RunFolder, read
 
 _VIEWS = 4
@@ -24,7 +24,7 @@ _MAPS = 8
 
 
 def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
-    """Compare runs of one problem, grouped by method over seeds; the first one's method is the measure of the others.
+    """Compare runs of one problem, grouped by method over seeds; ratios are to the first one's method.
 
     Args:
         directories: run folders.
@@ -36,29 +36,29 @@ def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
     Raises:
         InputError: no folders, one that is malformed or of another problem, or `out` cannot be written to.
     """
-    return publish(*examine(directories), out)
+    return write_comparison(*load_comparison(directories), out)
 
 
-def examine(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
+def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
     """The numbers of a comparison, and what makes it weaker, one line each. Raises `InputError`."""
     runs = [read(directory) for directory in directories]
     with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
-        notices = grouping.check(runs)
-        return measure(grouping.group(runs)), notices
+        notices = grouping.check_comparable(runs)
+        return compare_groups(grouping.group(runs)), notices
 
 
-def publish(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
+def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
     """Write the page, its picture and its numbers; returns the page's path. Raises `InputError`."""
     folder = Path(out)
     write(folder / "compare.json", _numbers(comparison, notices))
     with np.errstate(over="ignore", invalid="ignore"):
-        write(folder / "compare.png", poster(comparison))
+        write(folder / "compare.png", overview_figure(comparison))
         return write(folder / "compare.html", _page(comparison, notices))
 
 
 def _page(comparison: Comparison, notices: list[str]) -> bytes:
-    chosen = comparison.chosen
-    first = next(iter(chosen.values()))
+    representatives = comparison.representatives
+    first = next(iter(representatives.values()))
     maps = [key for key, truth in first.truth.items() if panels.is_map(truth)]
     views = list(first.views)
     return html.render(
@@ -66,31 +66,34 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         comparison=comparison,
         notices=notices,
         first=comparison.groups[0].label,
-        measures=measures.known(),
+        measures=image_metrics.available(),
         name=first.record.name,
         facts=html.facts(first.record),
-        commands={str(run.path): html.command(run.record) for group in comparison.groups for run in group.runs},
-        views=[panels.view_of_methods(v, {name: run.views[v] for name, run in chosen.items()}) for v in views[:_VIEWS]],
+        commands={str(run.path): run.record.command for group in comparison.groups for run in group.runs},
+        views=[
+            panels.view_of_methods(v, {name: run.views[v] for name, run in representatives.items()})
+            for v in views[:_VIEWS]
+        ],
         more_views=max(0, len(views) - _VIEWS),
         maps=[
-            panels.map_of_methods(k, {name: run.parameters[k] for name, run in chosen.items()}, first.truth[k])
+            panels.map_of_methods(k, {name: run.parameters[k] for name, run in representatives.items()}, first.truth[k])
             for k in maps[:_MAPS]
         ],
         more_maps=max(0, len(maps) - _MAPS),
-        charts={over: _charts(comparison, over) for over in ("seconds", "samples")},
+        charts={axis: _charts(comparison, axis) for axis in plots.AXES},
     )
 
 
-def _charts(comparison: Comparison, over: str) -> list[Chart]:
+def _charts(comparison: Comparison, axis: str) -> list[Chart]:
     found = []
     for metric in comparison.metrics:
         lines = []
-        for colour, (name, standing) in enumerate(metric.standings.items()):
-            band = getattr(standing, f"over_{over}")
-            several = standing.reached.runs > 1
+        for colour, (name, outcome) in enumerate(metric.methods.items()):
+            band = getattr(outcome, f"over_{axis}")
+            several = outcome.reached.runs > 1
             low, high = (band.low, band.high) if several else (None, None)
             lines.append(Line(name, band.x, band.median, low, high, colour))
-        found.append(plots.chart(metric.title, lines, over, max(float(line.x[-1]) for line in lines)))
+        found.append(plots.chart(metric.title, lines, axis, max(float(line.x[-1]) for line in lines)))
     return [chart for chart in found if chart is not None]
 
 
@@ -119,7 +122,7 @@ def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
                 "title": metric.title,
                 "best_of_first": metric.best_of_first,
                 "first_improves": metric.improves,
-                "methods": metric.standings,
+                "methods": metric.methods,
             }
             for metric in comparison.metrics
         ],

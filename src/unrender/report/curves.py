@@ -1,4 +1,4 @@
-"""Curves of a run and of several runs: what is known at a time, the median over seeds, when a level is reached."""
+"""Curves of a run and of several runs: step functions of time, medians over seeds, times to a level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
-_BUCKETS = 200
+_BINS = 200
 _SMOOTHED_POINTS = 500
 _TIMES = 2000
 
@@ -25,12 +25,12 @@ class Series:
     samples: np.ndarray
     values: np.ndarray
 
-    def at(self, where: np.ndarray, over: str = "seconds") -> np.ndarray:
-        """The value last known at each place of the axis `over` ("seconds" or "samples"); the first one before that."""
-        axis = getattr(self, over)
-        return self.values[np.maximum(np.searchsorted(axis, where, side="right") - 1, 0)]
+    def at(self, positions: np.ndarray, axis: str = "seconds") -> np.ndarray:
+        """The value last known at each position of the axis, "seconds" or "samples"; the first one before that."""
+        known = getattr(self, axis)
+        return self.values[np.maximum(np.searchsorted(known, positions, side="right") - 1, 0)]
 
-    def reached(self, level: float) -> float | None:
+    def time_to(self, level: float) -> float | None:
         """The first time, in seconds, at which the value is at most `level`; None if it never is."""
         below = np.flatnonzero(self.values <= level)
         return float(self.seconds[below[0]]) if below.size else None
@@ -45,7 +45,7 @@ class Band:
     low: np.ndarray
     high: np.ndarray
 
-    def reached(self, level: float) -> float | None:
+    def time_to(self, level: float) -> float | None:
         """Where the median first is at most `level`; None if it never is."""
         below = np.flatnonzero(self.median <= level)
         return float(self.x[below[0]]) if below.size else None
@@ -100,29 +100,29 @@ def smoothed_loss(run: RunFolder, window: float) -> Series | None:
     return Series(seconds[ends], samples[ends], np.array(values))
 
 
-def band(series: Sequence[Series], over: str, end: float, count: int | None = None) -> Band:
-    """Median and spread of several runs from 0 to `end`, at `count` even places or wherever one of them changes."""
+def band(series: Sequence[Series], axis: str, end: float, count: int | None = None) -> Band:
+    """Median and spread of several runs from 0 to `end`, at `count` even positions or wherever one of them changes."""
     if count is None:
-        places = np.unique(np.concatenate([getattr(one, over) for one in series] + [np.array([0.0, end])]))
-        places = places[places <= end]
-        places = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _TIMES)).astype(int))]
+        positions = np.unique(np.concatenate([getattr(one, axis) for one in series] + [np.array([0.0, end])]))
+        positions = positions[positions <= end]
+        positions = positions[np.unique(np.linspace(0, len(positions) - 1, min(len(positions), _TIMES)).astype(int))]
     else:
-        places = np.linspace(0.0, end, count)
-    values = np.stack([one.at(places, over) for one in series])
-    return Band(places, np.median(values, axis=0), values.min(axis=0), values.max(axis=0))
+        positions = np.linspace(0.0, end, count)
+    values = np.stack([one.at(positions, axis) for one in series])
+    return Band(positions, np.median(values, axis=0), values.min(axis=0), values.max(axis=0))
 
 
-def bucketed(x: np.ndarray, y: np.ndarray) -> Band:
-    """A long noisy curve thinned for drawing: median, minimum and maximum within at most 200 stretches of x."""
+def binned(x: np.ndarray, y: np.ndarray) -> Band:
+    """A long noisy curve thinned for picture: median, minimum and maximum in at most 200 bins of x."""
     known = np.isfinite(y)
     x, y = x[known], y[known]
-    if len(x) <= _BUCKETS:
+    if len(x) <= _BINS:
         return Band(x, y, y, y)
-    bucket = np.minimum((x / (x[-1] or 1.0) * _BUCKETS).astype(int), _BUCKETS - 1)
-    starts = np.flatnonzero(np.r_[True, np.diff(bucket) > 0])
+    bin_index = np.minimum((x / (x[-1] or 1.0) * _BINS).astype(int), _BINS - 1)
+    starts = np.flatnonzero(np.r_[True, np.diff(bin_index) > 0])
     ends = np.r_[starts[1:], len(y)]
-    # All buckets at once, since a page that follows a run draws these every second: sorted within each, the middle is the median.
-    ordered = y[np.lexsort((y, bucket))]
+    # All bins at once, since a page that follows a run draws these every second: sorted within each, the middle is the median.
+    ordered = y[np.lexsort((y, bin_index))]
     left, right = (starts + ends - 1) // 2, (starts + ends) // 2
     middle, median = (x[left] + x[right]) / 2, (ordered[left] + ordered[right]) / 2
     return Band(middle, median, ordered[starts], ordered[ends - 1])

@@ -1,4 +1,4 @@
-"""What several methods reached at equal time and at equal samples: tables, ratios, times to a level, curves."""
+"""Several methods at equal time and at equal samples: errors, ratios, times to a target error, curves."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from statistics import median
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.report import curves, measures
+from unrender.report import curves, image_metrics
 from unrender.report.curves import Band, Series
 from unrender.report.groups import Group
-from unrender.report.measures import Measure
+from unrender.report.image_metrics import ImageMetric
 from unrender.report.plots import AXES
 from unrender.runs.folder.reader import RunFolder
 
@@ -34,8 +34,8 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Moment:
-    """One method at one time, or after so many samples.
+class ErrorAtBudget:
+    """One method's error at a fraction of the budget, in seconds or in samples.
 
     Attributes:
         share: of the shortest run's time, or of the fewest samples.
@@ -52,13 +52,13 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Reached:
-    """When one method reached the first method's best.
+class TimeToTarget:
+    """When one method reached the target: the lowest median error of the first method.
 
     Attributes:
-        seconds: when the median over its runs did, None if never.
-        fastest, slowest: single runs that did.
-        count, runs: how many of how many did.
+        seconds: when the median over its runs reached it, None if never.
+        fastest, slowest: of the single runs that reached it.
+        count, runs: how many of how many runs reached it.
         speedup: the first method's time over this one's; None where either is unknown or zero.
     """
 
@@ -71,12 +71,19 @@ class Reached:
 
 
 @dataclass(frozen=True)
-class Standing:
-    """One method by one metric: at equal time, at equal samples, until a level, and all along."""
+class MethodResult:
+    """One method by one metric.
 
-    moments: tuple[Moment, ...]
-    at_samples: tuple[Moment, ...]
-    reached: Reached
+    Attributes:
+        moments: errors at `SHARES` of the time that all runs have.
+        at_samples: errors at `SHARES` of the samples that all runs have.
+        reached: the time to the target error.
+        over_seconds, over_samples: the error's median and range along both axes.
+    """
+
+    moments: tuple[ErrorAtBudget, ...]
+    at_samples: tuple[ErrorAtBudget, ...]
+    reached: TimeToTarget
     over_seconds: Band
     over_samples: Band
 
@@ -88,37 +95,37 @@ class Metric:
     Attributes:
         name: "loss", "relative parameter error", or a parameter's key.
         title: for people.
-        best_of_first: the least that the median of the first method's runs came to.
+        best_of_first: the lowest median over the first method's runs.
         improves: whether that is less than where it began.
-        standings: {method's label: standing}.
+        methods: {method's label: outcome}.
     """
 
     name: str
     title: str
     best_of_first: float
     improves: bool
-    standings: dict[str, Standing]
+    methods: dict[str, MethodResult]
 
-    def least(self, moment: int, over: str = "seconds") -> str | None:
-        """Whose median is least at one of `SHARES` of the time or of the samples; None where there is but one method."""
-        moments = {label: of.moments if over == "seconds" else of.at_samples for label, of in self.standings.items()}
-        medians = {label: of[moment].error.median for label, of in moments.items()}
+    def best_at(self, index: int, axis: str = "seconds") -> str | None:
+        """The method with the lowest median at `SHARES[index]` of the time or of the samples; None where there is only one."""
+        errors = {label: of.moments if axis == "seconds" else of.at_samples for label, of in self.methods.items()}
+        medians = {label: of[index].error.median for label, of in errors.items()}
         known = {label: value for label, value in medians.items() if value is not None}
         return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All numbers.
+    """The comparison of several methods.
 
     Attributes:
-        groups: the methods; the first one is the measure of the others.
+        groups: the methods; the first one is the reference for the others.
         seconds: of the shortest run.
         samples: of the run that traced the fewest paths.
         metrics: the first one counts most.
         image_error: {label: root mean square error of the result's pictures}, each run at its own end.
-        images: {measure's name: {label: value}} of the same pictures.
-        chosen: {label: the run whose last value of the first metric is the (lower) median}.
+        images: {metric's name: {label: value}} of the same pictures.
+        representatives: {label: the run whose last value of the first metric is the (lower) median}.
     """
 
     groups: tuple[Group, ...]
@@ -127,19 +134,19 @@ class Comparison:
     metrics: tuple[Metric, ...]
     image_error: dict[str, Spread]
     images: dict[str, dict[str, Spread]]
-    chosen: dict[str, RunFolder]
+    representatives: dict[str, RunFolder]
 
-    def best_image(self, measure: Measure) -> str | None:
-        """Whose median is best by a measure of pictures; None where there is but one method, or nothing is known."""
-        medians = {label: of.median for label, of in self.images[measure.name].items()}
+    def best_image(self, metric: ImageMetric) -> str | None:
+        """The method with the best median of an image metric; None where there is only one, or nothing is known."""
+        medians = {label: of.median for label, of in self.images[metric.name].items()}
         known = {label: value for label, value in medians.items() if value is not None}
-        best = max if measure.larger else min
+        best = max if metric.larger_is_better else min
         return best(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
 
 
-def measure(groups: tuple[Group, ...]) -> Comparison:
+def compare_groups(groups: tuple[Group, ...]) -> Comparison:
     """Compare methods up to the shortest run's time, and up to the fewest samples."""
-    ends = {over: min(float(getattr(run.history, over)[-1]) for group in groups for run in group.runs) for over in AXES}
+    ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
     end = ends["seconds"]
     first_run = groups[0].runs[0]
     keys = [key for key in first_run.parameters if all(key in run.truth for group in groups for run in group.runs)]
@@ -166,13 +173,13 @@ def measure(groups: tuple[Group, ...]) -> Comparison:
             f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
         )
     images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
-    found_images = {g.label: [measures.of_run(run) for run in g.runs] for g in groups}
-    by_measure = {
-        measure.name: {label: _spread([run[measure.name] for run in runs]) for label, runs in found_images.items()}
-        for measure in measures.known()
+    found_images = {g.label: [image_metrics.measure_run(run) for run in g.runs] for g in groups}
+    by_metric = {
+        metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in found_images.items()}
+        for metric in image_metrics.available()
     }
-    chosen = {g.label: _chosen(g, keys) for g in groups}
-    return Comparison(groups, end, ends["samples"], metrics, images, by_measure, chosen)
+    representatives = {g.label: _median_run(g, keys) for g in groups}
+    return Comparison(groups, end, ends["samples"], metrics, images, by_metric, representatives)
 
 
 def _metric(
@@ -186,34 +193,35 @@ def _metric(
     first = next(iter(full.values()))
     level = float(first.median.min())
     improves = level < float(first.median[0])
-    at_first = first.reached(level)
-    standings = {}
+    at_first = first.time_to(level)
+    methods = {}
     for label, of in found.items():
         moments, at_samples = (
-            tuple(_moment(share, over, ends[over], of, next(iter(found.values()))) for share in SHARES) for over in AXES
+            tuple(_error_at(share, axis, ends[axis], of, next(iter(found.values()))) for share in SHARES)
+            for axis in AXES
         )
-        reached = _reached(of, full[label], level, at_first if improves else None)
+        reached = _time_to_target(of, full[label], level, at_first if improves else None)
         longest = min(float(s.samples[-1]) for s in of)
         over_seconds = curves.band(of, "seconds", float(full[label].x[-1]), _POINTS)
-        standings[label] = Standing(
+        methods[label] = MethodResult(
             moments, at_samples, reached, over_seconds, curves.band(of, "samples", longest, _POINTS)
         )
-    return Metric(name, title, level, improves, standings)
+    return Metric(name, title, level, improves, methods)
 
 
-def _moment(share: float, over: str, end: float, of: Sequence[Series], first: Sequence[Series]) -> Moment:
-    place = share * end
-    own, measure_of = ([float(s.at(np.array([place]), over)[0]) for s in runs] for runs in (of, first))
-    a, b = median(own), median(measure_of)
+def _error_at(share: float, axis: str, end: float, of: Sequence[Series], first: Sequence[Series]) -> ErrorAtBudget:
+    position = share * end
+    own, reference = ([float(s.at(np.array([position]), axis)[0]) for s in runs] for runs in (of, first))
+    a, b = median(own), median(reference)
     ratio = a / b if b > 0 and math.isfinite(a) and math.isfinite(b) else None
-    seconds, samples = (place, None) if over == "seconds" else (None, place)
-    return Moment(share, seconds, samples, _spread(own), ratio)
+    seconds, samples = (position, None) if axis == "seconds" else (None, position)
+    return ErrorAtBudget(share, seconds, samples, _spread(own), ratio)
 
 
-def _reached(of: Sequence[Series], whole: Band, level: float, at_first: float | None) -> Reached:
-    when, each = whole.reached(level), [t for s in of if (t := s.reached(level)) is not None]
+def _time_to_target(of: Sequence[Series], median_run: Band, level: float, at_first: float | None) -> TimeToTarget:
+    when, each = median_run.time_to(level), [t for s in of if (t := s.time_to(level)) is not None]
     speedup = at_first / when if when and at_first else None
-    return Reached(when, min(each, default=None), max(each, default=None), len(each), len(of), speedup)
+    return TimeToTarget(when, min(each, default=None), max(each, default=None), len(each), len(of), speedup)
 
 
 def _spread(values: Sequence[float | None]) -> Spread:
@@ -221,7 +229,7 @@ def _spread(values: Sequence[float | None]) -> Spread:
     return Spread(median(known), min(known), max(known)) if known else Spread(None, None, None)
 
 
-def _chosen(group: Group, keys: Sequence[str]) -> RunFolder:
+def _median_run(group: Group, keys: Sequence[str]) -> RunFolder:
     def last(run: RunFolder) -> float:
         found = curves.relative_error(run, keys)
         if found is not None:

@@ -11,11 +11,11 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
-from unrender.report.html import flattened
+from unrender.report.html import flatten
 from unrender.runs.folder.reader import RunFolder
 
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
-_ALIKE = 0.01
+_TOLERANCE = 0.01
 _ARGUMENT = re.compile(r"(\w+)=([^=(),]+)(?=[,)])")
 
 
@@ -44,7 +44,7 @@ def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
     return tuple(Group(name, tuple(of)) for name, of in zip(unique, kinds.values(), strict=True))
 
 
-def check(runs: Sequence[RunFolder]) -> list[str]:
+def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     """Refuse runs of different problems; return what makes a comparison weaker, one line each.
 
     Raises:
@@ -61,7 +61,7 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
             raise InputError(f"{run.path / 'history.jsonl'}: no step was taken, there is nothing to compare")
         for key in run.parameters.keys() ^ first.parameters.keys():
             raise InputError(
-                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.shown(key)}"
+                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.printable(key)}"
             )
         for view in run.views.keys() | first.views.keys():
             sizes = [of.views[view].reference.shape[:2] if view in of.views else None for of in (first, run)]
@@ -69,22 +69,22 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
                 what = f"view {view} is {_size(sizes[1])}, not {_size(sizes[0])}"
                 raise InputError(f"{run.path}: another problem than {first.path}: {what}")
         for view in run.views:
-            apart = _apart(run.views[view].reference, first.views[view].reference)
-            if apart > _ALIKE:
+            difference = _relative_difference(run.views[view].reference, first.views[view].reference)
+            if difference > _TOLERANCE:
                 raise InputError(f"{run.path}: another problem than {first.path}: view {view} has another reference")
-            if apart > 0:
+            if difference > 0:
                 notices.append(
-                    f"View {view} of {run.path.name} differs from that of {first.path.name} by {apart:.1g} of its values."
+                    f"View {view} of {run.path.name} differs from that of {first.path.name} by {difference:.1g} of its values."
                 )
         for key in run.truth.keys() & first.truth.keys():
-            if _apart(run.truth[key], first.truth[key]) > _ALIKE:
+            if _relative_difference(run.truth[key], first.truth[key]) > _TOLERANCE:
                 raise InputError(
-                    f"{run.path}: another problem than {first.path}: {bounded_files.shown(key)} has another true value"
+                    f"{run.path}: another problem than {first.path}: {bounded_files.printable(key)} has another true value"
                 )
     records = [run.record for run in runs]
     for what, values in {
         "problems": [of.name for of in records],
-        "losses, so that losses cannot be compared": [str(of.problem.get("loss", "")) for of in records],
+        "losses, so that losses cannot be compared": [str(of.problem.description.get("loss", "")) for of in records],
         "hardware or variants, so that times cannot be compared": [f"{of.hardware} {of.variant}" for of in records],
         "versions": [str(sorted(of.versions.items())) for of in records],
     }.items():
@@ -102,7 +102,7 @@ def check(runs: Sequence[RunFolder]) -> list[str]:
     return list(dict.fromkeys(notices))
 
 
-def _apart(a: np.ndarray, b: np.ndarray) -> float:
+def _relative_difference(a: np.ndarray, b: np.ndarray) -> float:
     """The root mean square difference, relative to `b`; infinite for other shapes.
 
     References that a gallery renders differ by rounding between machines, and in single paths between backends.
@@ -122,7 +122,7 @@ def _size(size: tuple[int, ...] | None) -> str:
 def _settings(run: RunFolder) -> dict[str, str]:
     """The settings that make the method, flat; arguments within "SGD(momentum=0.9)" each on their own."""
     found = {}
-    for name, text in sorted(flattened(run.record.settings).items()):
+    for name, text in sorted(flatten(run.record.settings).items()):
         if name.split(".")[-1] in _NOT_THE_METHOD:
             continue
         arguments = _ARGUMENT.findall(text)
@@ -136,5 +136,5 @@ def _label(kind: tuple, kinds: Sequence[tuple]) -> str:
     method, own = kind[0], dict(kind[1])
     alike = [dict(other[1]) for other in kinds if other[0] == method]
     differing = [name for name in own if any(other.get(name) != own[name] for other in alike)]
-    told = [f"{name.split('.')[-1]} {own[name]}" for name in differing if "…" not in own[name]]
-    return f"{method} ({', '.join(list(dict.fromkeys(told))[:4])})" if told else method
+    shown = [f"{name.split('.')[-1]} {own[name]}" for name in differing if "…" not in own[name]]
+    return f"{method} ({', '.join(list(dict.fromkeys(shown))[:4])})" if shown else method

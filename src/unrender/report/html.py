@@ -5,16 +5,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import shlex
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from unrender.report import words
-from unrender.runs.folder.reader import RunRecord
+from unrender.report import formatting
+from unrender.runs.folder.schema import RunRecord
 
 _SCRIPT = "viewer.js"
 
@@ -30,19 +29,15 @@ def render(template: str, **context: Any) -> bytes:
 
 def source(name: str) -> str:
     """The text of a style sheet or script among the templates."""
-    return _loader().get_source(_environment(), name)[0]
+    return loader().get_source(_environment(), name)[0]
 
 
-_FOR_RESUMING = ("fingerprint", "origin")
-"""What run.json says of the problem to resuming alone."""
-
-
-def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Nested fields as {"outer.inner": text}, what is empty left out."""
     found: dict[str, str] = {}
     for name, value in fields.items():
         if isinstance(value, Mapping):
-            found.update(flattened(value, f"{prefix}{name}."))
+            found.update(flatten(value, f"{prefix}{name}."))
         elif isinstance(value, list) and all(isinstance(part, str) for part in value):
             found[f"{prefix}{name}"] = ", ".join(value)
         elif value not in (None, ""):
@@ -50,45 +45,40 @@ def flattened(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return {name: text for name, text in found.items() if text}
 
 
-def command(record: RunRecord) -> str:
-    """The command line of a run as one would type it."""
-    return record.command if isinstance(record.command, str) else shlex.join(record.command)
-
-
 def facts(record: RunRecord) -> dict[str, str]:
     """What a run was made with, {name: value}: problem, settings, seed, hardware, versions."""
-    hardware = record.hardware if isinstance(record.hardware, dict) else {"hardware": record.hardware}
-    return flattened(
+    return flatten(
         {
-            "problem": {"name": record.name, **{k: v for k, v in record.problem.items() if k not in _FOR_RESUMING}},
+            "problem": {"name": record.name, **record.problem.description},
             "method": record.method,
             "settings": record.settings,
             "seed": record.seed,
             "variant": record.variant,
-            "hardware": hardware,
+            "hardware": record.hardware,
             "versions": record.versions,
         }
     )
 
 
-def environment(*further: BaseLoader) -> Environment:
-    """The templates, and those of `further` loaders; everything that is put into them is escaped."""
+def environment(templates: BaseLoader) -> Environment:
+    """An environment that escapes everything that is put into its templates."""
     found = Environment(
-        loader=ChoiceLoader([*further, _loader()]),
+        loader=templates,
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters.update(number=words.number, duration=words.duration, count=words.count)
+    found.filters.update(number=formatting.number, duration=formatting.duration, count=formatting.count)
     return found
 
 
 @cache
-def _loader() -> PackageLoader:
+def loader() -> PackageLoader:
+    """Of the report's templates."""
     return PackageLoader("unrender.report", "templates")
 
 
 @cache
 def _environment() -> Environment:
-    return environment()
+    return environment(loader())

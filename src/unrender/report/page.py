@@ -6,7 +6,7 @@ import webbrowser
 from pathlib import Path
 
 from unrender.io.files import write
-from unrender.report import convergence, html, measures, panels, plots, tables
+from unrender.report import convergence, html, image_metrics, panels, plots, tables
 from unrender.runs.folder.reader import read
 
 _VIEWS = 8
@@ -32,18 +32,18 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
     content = html.render(
         "page.html",
         run=run,
-        stopped=tables.STOPPED.get(run.record.stopped, run.record.stopped),
-        command=html.command(run.record),
+        stopped=tables.STOP_REASONS.get(run.record.stopped, run.record.stopped),
+        command=run.record.command,
         facts=html.facts(run.record),
         tiles=tables.tiles(run),
         views=[panels.view_of_run(view, of) for view, of in shown.items()],
         more_views=len(run.views) - len(shown),
         view_rows=tables.view_rows(run),
-        measures=measures.known()[1:],
+        measures=image_metrics.available()[1:],
         maps=[panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k)) for k in maps[:_MAPS]],
         more_maps=max(0, len(maps) - _MAPS),
-        rows=[tables.row(run, key) for key in run.parameters],
-        charts={over: convergence.charts(run, over) for over in plots.AXES},
+        rows=[tables.parameter_row(run, key) for key in run.parameters],
+        charts={axis: convergence.charts(run, axis) for axis in plots.AXES},
     )
     path = write(run.path / "report.html", content)
     if open_after:

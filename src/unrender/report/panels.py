@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import images, words
-from unrender.report.images import INLINE, ColourBar, Painter, Picture
+from unrender.report import formatting, tone_mapping
+from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
 
 _VALUES_IN_A_TABLE = 16
@@ -44,15 +44,15 @@ class Panel:
         title: of all of them.
         note: on their exposure or scale.
         stacks: each from top to bottom.
-        led: whether the first stack is the large one.
-        apart: whether pictures of different stacks show different places.
+        first_is_large: whether the first stack is larger than the others.
+        independent: whether pictures of different stacks show different places.
     """
 
     title: str
     note: str
     stacks: tuple[tuple[Slider | Figure, ...], ...]
-    led: bool
-    apart: bool = False
+    first_is_large: bool
+    independent: bool = False
 
 
 def is_map(array: np.ndarray) -> bool:
@@ -64,67 +64,73 @@ def is_map(array: np.ndarray) -> bool:
     return array.ndim in (3, 4) and array.shape[-1] in (1, 3, 4) and sum(n > 1 for n in array.shape[:-1]) >= 2
 
 
-def view_of_run(view: int, shown: ViewPictures, paint: Painter = INLINE, name: str = "Result") -> Panel:
+def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
     """Reference against result, the start, what is left of the error, and where the method looks or what it keeps.
 
     Args:
         view: its index.
         shown: its pictures.
-        paint: makes them.
+        encoder: makes them.
         name: of the result, "Current" while the run goes on.
     """
-    factor = images.exposure(shown.reference)
+    factor = tone_mapping.exposure(shown.reference)
     what = name.lower()
-    error = images.absolute_error(shown.result, shown.reference)
-    before = None if shown.initial is None else images.absolute_error(shown.initial, shown.reference)
-    high = images.top(error if before is None else before)
-    result = paint.colour(shown.result, factor, f"View {view}: the {what}")
+    error = tone_mapping.absolute_error(shown.result, shown.reference)
+    before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference)
+    high = tone_mapping.colour_limit(error if before is None else before)
+    result = encoder.colour(shown.result, factor, f"View {view}: the {what}")
     stacks: list[tuple[Slider | Figure, ...]] = [
-        (Slider(paint.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
+        (Slider(encoder.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
     ]
     if shown.initial is not None and before is not None:
-        picture = paint.colour(shown.initial, factor, f"View {view}: before the first step")
+        picture = encoder.colour(shown.initial, factor, f"View {view}: before the first step")
         stacks.append((Figure(picture, "Start"),))
-        stacks.append((_error(paint, before, high, "Error at the start", f"View {view}: error before the first step"),))
-    maps = _maps_of_view(view, shown, paint)
+        stacks.append(
+            (_error(encoder, before, high, "Error at the start", f"View {view}: error before the first step"),)
+        )
+    maps = _maps_of_view(view, shown, encoder)
     stacks += [(figure,) for figure in maps or [Figure(result, name)]]
-    stacks.append((_error(paint, error, high, f"Error of the {what}", f"View {view}: error of the {what}"),))
+    stacks.append((_error(encoder, error, high, f"Error of the {what}", f"View {view}: error of the {what}"),))
     return Panel(f"View {view}", _exposure_note(factor), tuple(stacks), True)
 
 
-def _maps_of_view(view: int, shown: ViewPictures, paint: Painter) -> list[Figure]:
+def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> list[Figure]:
     """What the method keeps of the past, and where it looks."""
     found = []
     if shown.control_weight is not None:
         weight = np.mean(shown.control_weight, axis=-1)
-        picture = paint.false_colour(weight, 0.0, 1.0, images.VALUES, f"View {view}: control weight per pixel")
-        bar = images.colour_bar(0.0, 1.0, images.VALUES, "Control weight")
+        picture = encoder.false_colour(
+            weight, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"View {view}: control weight per pixel"
+        )
+        bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Control weight")
         note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
         found.append(Figure(picture, "Control weight", note, bar))
     if shown.pixel_probability is not None:
         density = shown.pixel_probability
-        high = images.top(density)
-        picture = paint.false_colour(density, 0.0, high, images.VALUES, f"View {view}: probability of each pixel")
-        bar = images.colour_bar(0.0, high, images.VALUES, "Probability that a pixel is drawn")
-        found.append(Figure(picture, "Pixel probability", f"mean {words.number(_finite_mean(density))}", bar))
+        high = tone_mapping.colour_limit(density)
+        picture = encoder.false_colour(
+            density, 0.0, high, tone_mapping.VALUE_COLORMAP, f"View {view}: probability of each pixel"
+        )
+        bar = tone_mapping.colour_bar(0.0, high, tone_mapping.VALUE_COLORMAP, "Probability that a pixel is drawn")
+        found.append(Figure(picture, "Pixel probability", f"mean {formatting.number(_finite_mean(density))}", bar))
     return found
 
 
-def view_of_methods(view: int, shown: Mapping[str, ViewPictures], paint: Painter = INLINE) -> Panel:
+def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: PictureEncoder = INLINE) -> Panel:
     """Each method's result against the reference, and its error, all on one exposure and one scale."""
     reference = next(iter(shown.values())).reference
-    factor = images.exposure(reference)
-    errors = {label: images.absolute_error(of.result, of.reference) for label, of in shown.items()}
-    high = max(images.top(error) for error in errors.values())
+    factor = tone_mapping.exposure(reference)
+    errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
+    high = max(tone_mapping.colour_limit(error) for error in errors.values())
     stacks = tuple(
         (
             Slider(
-                paint.colour(reference, factor, f"View {view}: the reference"),
-                paint.colour(of.result, factor, f"View {view}: the result of {label}"),
+                encoder.colour(reference, factor, f"View {view}: the reference"),
+                encoder.colour(of.result, factor, f"View {view}: the result of {label}"),
                 "Reference",
                 label,
             ),
-            _error(paint, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
+            _error(encoder, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
         )
         for label, of in shown.items()
     )
@@ -132,31 +138,31 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], paint: Painter
 
 
 def map_of_run(
-    key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None, paint: Painter = INLINE
+    key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None, encoder: PictureEncoder = INLINE
 ) -> Panel:
     """A recovered texture or volume against its truth, or against its start where the truth is unknown."""
-    scale = Scale(result if truth is None or not is_map(truth) else truth)
+    scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
     planes = _planes(result)
     for label, plane in planes.items():
         start, wanted = _planes(initial).get(label), _planes(truth).get(label)
         errors = {
-            caption: images.absolute_error(one, wanted)
+            caption: tone_mapping.absolute_error(one, wanted)
             for caption, one in (("Error at the start", start), ("Error", plane))
             if one is not None and wanted is not None and one.shape == wanted.shape
         }
-        high = images.top(next(iter(errors.values()))) if errors else 1.0
-        column: list[Slider | Figure] = [_against(paint, scale, key, label, plane, start, wanted)]
+        high = tone_mapping.colour_limit(next(iter(errors.values()))) if errors else 1.0
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, start, wanted)]
         if wanted is not None and start is not None:
             column.append(
-                Figure(scale.picture(paint, start, f"{key} {label}: before the first step"), "Start", "", scale.bar)
+                Figure(scale.picture(encoder, start, f"{key} {label}: before the first step"), "Start", "", scale.bar)
             )
         for what, error in errors.items():
             if what == "Error":
                 column.append(
-                    Figure(scale.picture(paint, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
+                    Figure(scale.picture(encoder, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
                 )
-            column.append(_error(paint, error, high, what, f"{key} {label}: {what.lower()}"))
+            column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
         if len(planes) == 1:
             stacks += [(item,) for item in column]
         else:
@@ -164,29 +170,31 @@ def map_of_run(
     return Panel(key, _map_note(result, scale), tuple(stacks), len(planes) == 1, len(planes) > 1)
 
 
-def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, paint: Painter = INLINE) -> Panel:
+def map_of_methods(
+    key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, encoder: PictureEncoder = INLINE
+) -> Panel:
     """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
-    scale = Scale(truth)
+    scale = ColourScale(truth)
     label, wanted = next(iter(_planes(truth).items()))
     found = {name: _planes(result).get(label) for name, result in results.items()}
     errors = {
-        name: images.absolute_error(plane, wanted)
+        name: tone_mapping.absolute_error(plane, wanted)
         for name, plane in found.items()
         if plane is not None and plane.shape == wanted.shape
     }
-    high = max([images.top(error) for error in errors.values()], default=1.0)
+    high = max([tone_mapping.colour_limit(error) for error in errors.values()], default=1.0)
     stacks = []
     for name, plane in found.items():
         if plane is None:
             continue
-        column: list[Slider | Figure] = [_against(paint, scale, key, label, plane, None, wanted, name)]
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, None, wanted, name)]
         if name in errors:
-            column.append(_error(paint, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
+            column.append(_error(encoder, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
         stacks.append(tuple(column))
     return Panel(key, _map_note(truth, scale), tuple(stacks), False)
 
 
-class Scale:
+class ColourScale:
     """How one parameter's values become colours; fixed by one array, used for all that are compared with it.
 
     One channel: false colour over the range of `fixed_by`. Three: sRGB, exposed only where a value passes 1.
@@ -196,26 +204,28 @@ class Scale:
         finite = fixed_by[np.isfinite(fixed_by)]
         self.low, self.high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
         self.scalar = fixed_by.ndim == 2 or fixed_by.shape[-1] == 1
-        self.factor = 1.0 if self.scalar or self.high <= 1.0 else images.exposure(fixed_by[..., :3])
+        self.factor = 1.0 if self.scalar or self.high <= 1.0 else tone_mapping.exposure(fixed_by[..., :3])
         if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
             self.low, self.high = min(0.0, self.low), max(1.0, self.high)
 
     def colours(self, plane: np.ndarray) -> np.ndarray:
         """(H, W, C) values as (H, W, 3) in [0, 1], ready to be seen."""
         if plane.shape[-1] == 1:
-            return images.mapped(plane[..., 0], self.low, self.high, images.VALUES)
-        return images.srgb(plane[..., :3] * self.factor)
+            return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP)
+        return tone_mapping.srgb(plane[..., :3] * self.factor)
 
-    def picture(self, paint: Painter, plane: np.ndarray, alt: str) -> Picture:
+    def picture(self, encoder: PictureEncoder, plane: np.ndarray, alt: str) -> Picture:
         """The same as a picture of the page."""
         if plane.shape[-1] == 1:
-            return paint.false_colour(plane[..., 0], self.low, self.high, images.VALUES, alt)
-        return paint.colour(plane[..., :3], self.factor, alt)
+            return encoder.false_colour(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP, alt)
+        return encoder.colour(plane[..., :3], self.factor, alt)
 
     @property
     def bar(self) -> ColourBar | None:
         """The legend, where there is one channel."""
-        return images.colour_bar(self.low, self.high, images.VALUES, "Value") if self.scalar else None
+        return (
+            tone_mapping.colour_bar(self.low, self.high, tone_mapping.VALUE_COLORMAP, "Value") if self.scalar else None
+        )
 
 
 def plane(array: np.ndarray) -> np.ndarray | None:
@@ -239,9 +249,9 @@ def _planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
     return found or {"slice": array.reshape(-1, *array.shape[2:])}
 
 
-def _against(
-    paint: Painter,
-    scale: Scale,
+def _compare_map(
+    encoder: PictureEncoder,
+    scale: ColourScale,
     key: str,
     label: str,
     plane: np.ndarray,
@@ -249,18 +259,18 @@ def _against(
     wanted: np.ndarray | None,
     name: str = "Recovered",
 ) -> Slider | Figure:
-    found = scale.picture(paint, plane, f"{key} {label}: {name}")
+    found = scale.picture(encoder, plane, f"{key} {label}: {name}")
     caption = label.capitalize()
     if wanted is not None:
-        return Slider(scale.picture(paint, wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
+        return Slider(scale.picture(encoder, wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
     if start is not None:
-        return Slider(scale.picture(paint, start, f"{key} {label}: start"), found, "Start", name, caption)
+        return Slider(scale.picture(encoder, start, f"{key} {label}: start"), found, "Start", name, caption)
     return Figure(found, caption or name, "", scale.bar)
 
 
-def _error(paint: Painter, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
-    note = f"mean {words.number(_finite_mean(error))}"
-    return Figure(paint.error(error, high, alt), caption, note, images.error_bar(high))
+def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
+    note = f"mean {formatting.number(_finite_mean(error))}"
+    return Figure(encoder.error(error, high, alt), caption, note, tone_mapping.error_bar(high))
 
 
 def _finite_mean(values: np.ndarray) -> float:
@@ -269,11 +279,11 @@ def _finite_mean(values: np.ndarray) -> float:
 
 
 def _exposure_note(factor: float) -> str:
-    return f"Exposure ×{words.number(factor)}"
+    return f"Exposure ×{formatting.number(factor)}"
 
 
-def _map_note(array: np.ndarray, scale: Scale) -> str:
+def _map_note(array: np.ndarray, scale: ColourScale) -> str:
     shape = " × ".join(str(n) for n in array.shape)
     if scale.scalar:
-        return f"{shape}; colours from {words.number(scale.low)} to {words.number(scale.high)}"
-    return f"{shape}; in sRGB" + (f" at exposure ×{words.number(scale.factor)}" if scale.factor != 1.0 else "")
+        return f"{shape}; colours from {formatting.number(scale.low)} to {formatting.number(scale.high)}"
+    return f"{shape}; in sRGB" + (f" at exposure ×{formatting.number(scale.factor)}" if scale.factor != 1.0 else "")

@@ -1,4 +1,4 @@
-"""Line charts as SVG within the page: the geometry is made here, the drawing and the colours are the template's."""
+"""Line charts as SVG within the page: the geometry is made here, the picture and the colours are the template's."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unrender.report import words
+from unrender.report import formatting
 
 AXES = ("seconds", "samples")
-"""What a curve may run over."""
+"""Horizontal axes."""
 WIDTH, HEIGHT = 420, 270
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
 _LOGARITHMIC_FROM = 4.0
@@ -40,15 +40,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """A way from values to places in [0, 1], and the marks on it."""
+    """A mapping of values to [0, 1], linear or logarithmic, and its ticks."""
 
     low: float
     high: float
     logarithmic: bool
     ticks: tuple[tuple[float, str], ...]
 
-    def place(self, values: np.ndarray) -> np.ndarray:
-        """Values beyond the ends stay at the ends."""
+    def position(self, values: np.ndarray) -> np.ndarray:
+        """Positions in [0, 1]; values beyond the ends are clipped."""
         low, high = self.low, self.high
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), math.log(low), math.log(high)
@@ -67,13 +67,13 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """What the template draws.
+    """A chart as the template draws it.
 
     Attributes:
         title, x_label: words.
-        description: for those who cannot see it.
-        curves: in drawing order.
-        x_ticks, y_ticks: (place, label).
+        description: the text alternative.
+        curves: in picture order.
+        x_ticks, y_ticks: (coordinate, label).
         logarithmic: of the vertical axis.
         more: how many lines were left out.
     """
@@ -93,9 +93,9 @@ class Chart:
     )
 
 
-def over(axis: str) -> tuple[str, Callable[[float], str]]:
-    """The label of the axis "seconds" or "samples", and what writes its values."""
-    return ("Seconds", words.number) if axis == "seconds" else ("Samples (paths)", words.count)
+def axis_format(axis: str) -> tuple[str, Callable[[float], str]]:
+    """The label of the axis "seconds" or "samples", and the formatter of its values."""
+    return ("Seconds", formatting.number) if axis == "seconds" else ("Samples (paths)", formatting.count)
 
 
 def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
@@ -107,21 +107,21 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
         axis: the horizontal one, "seconds" or "samples", from 0.
         end: where it ends.
     """
-    x_label, mark = over(axis)
+    x_label, format_value = axis_format(axis)
     drawn = [line for line in lines if np.isfinite(line.y).any()]
     more, drawn = max(0, len(drawn) - _COLOURS), drawn[:_COLOURS]
     if not drawn:
         return None
     end = end if end > 0 else 1.0
-    x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, mark))
+    x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, format_value))
     y_axis = _vertical(drawn)
     return Chart(
         title,
         x_label,
         "; ".join(f"{line.name}: from {_end(line, 0)} to {_end(line, -1)}" for line in drawn),
         tuple(_curve(line, x_axis, y_axis) for line in drawn),
-        tuple((float(_across(x_axis, np.array([v]))[0]), label) for v, label in x_axis.ticks),
-        tuple((float(_down(y_axis, np.array([v]))[0]), label) for v, label in y_axis.ticks),
+        tuple((float(_to_x(x_axis, np.array([v]))[0]), label) for v, label in x_axis.ticks),
+        tuple((float(_to_y(y_axis, np.array([v]))[0]), label) for v, label in y_axis.ticks),
         y_axis.logarithmic,
         more,
     )
@@ -145,16 +145,18 @@ def _vertical(lines: Sequence[Line]) -> Axis:
     low, high = min(values.min(), 0.0) if values.min() < 0.5 * values.max() else values.min(), values.max()
     span = (high - low) or abs(high) or 1.0
     low, high = (low if low == 0 else low - 0.05 * span), high + 0.05 * span
-    return Axis(low, high, False, _even_ticks(low, high, 5, words.number))
+    return Axis(low, high, False, _even_ticks(low, high, 5, formatting.number))
 
 
-def _even_ticks(low: float, high: float, count: int, mark: Callable[[float], str]) -> tuple[tuple[float, str], ...]:
+def _even_ticks(
+    low: float, high: float, count: int, format_value: Callable[[float], str]
+) -> tuple[tuple[float, str], ...]:
     rough = (high - low) / count
     size = 10.0 ** math.floor(math.log10(rough))
     step = next(size * factor for factor in (1, 2, 2.5, 5, 10) if size * factor >= rough * 0.999)
     first = math.ceil(low / step - 1e-9)
     values = [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
-    return tuple((value, mark(value)) for value in values)
+    return tuple((value, format_value(value)) for value in values)
 
 
 def _logarithmic_ticks(low: float, high: float) -> tuple[tuple[float, str], ...]:
@@ -165,24 +167,24 @@ def _logarithmic_ticks(low: float, high: float) -> tuple[tuple[float, str], ...]
         if len(values) >= 3:
             break
     every = -(-len(values) // 7)
-    return tuple((value, words.number(value)) for value in values[::every])
+    return tuple((value, formatting.number(value)) for value in values[::every])
 
 
-def _across(axis: Axis, x: np.ndarray) -> np.ndarray:
-    return LEFT + axis.place(x) * (WIDTH - LEFT - RIGHT)
+def _to_x(axis: Axis, x: np.ndarray) -> np.ndarray:
+    return LEFT + axis.position(x) * (WIDTH - LEFT - RIGHT)
 
 
-def _down(axis: Axis, y: np.ndarray) -> np.ndarray:
-    return HEIGHT - BOTTOM - axis.place(y) * (HEIGHT - TOP - BOTTOM)
+def _to_y(axis: Axis, y: np.ndarray) -> np.ndarray:
+    return HEIGHT - BOTTOM - axis.position(y) * (HEIGHT - TOP - BOTTOM)
 
 
 def _curve(line: Line, x_axis: Axis, y_axis: Axis) -> Curve:
     band = ""
     if line.low is not None and line.high is not None:
         known = np.isfinite(line.low) & np.isfinite(line.high)
-        across = _across(x_axis, line.x[known])
-        there = zip(across, _down(y_axis, line.high[known]), strict=True)
-        back = zip(across[::-1], _down(y_axis, line.low[known])[::-1], strict=True)
+        across = _to_x(x_axis, line.x[known])
+        there = zip(across, _to_y(y_axis, line.high[known]), strict=True)
+        back = zip(across[::-1], _to_y(y_axis, line.low[known])[::-1], strict=True)
         band = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in [*there, *back]) + "Z" if known.sum() > 1 else ""
     return Curve(line.name, _path(line, x_axis, y_axis), band, line.colour % _COLOURS)
 
@@ -190,7 +192,7 @@ def _curve(line: Line, x_axis: Axis, y_axis: Axis) -> Curve:
 def _path(line: Line, x_axis: Axis, y_axis: Axis) -> str:
     """Pieces of consecutive finite points; one point alone becomes a dot (a line of no length with a round cap)."""
     finite = np.isfinite(line.y)
-    across, down = _across(x_axis, line.x), _down(y_axis, np.where(finite, line.y, 1.0))
+    across, down = _to_x(x_axis, line.x), _to_y(y_axis, np.where(finite, line.y, 1.0))
     pieces: list[list[str]] = [[]]
     for known, x, y in zip(finite, across, down, strict=True):
         if known:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import curves, images, measures, words
+from unrender.report import curves, formatting, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
-STOPPED = {
+STOP_REASONS = {
     "steps": "all steps done",
     "seconds": "stopped when time was up",
     "interrupted": "interrupted: this is what was reached",
@@ -77,22 +77,24 @@ def tiles(run: RunFolder) -> list[Tile]:
     loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
     if loss is not None:
         found.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
-    note = f"and {words.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
-    found.append(Tile("Time", words.duration(run.record.seconds), note))
+    note = f"and {formatting.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
+    found.append(Tile("Time", formatting.duration(run.record.seconds), note))
     skipped = f"{run.record.skipped} skipped, not finite" if run.record.skipped else ""
     found.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
     if len(run.history):
         samples, seconds = float(run.history.samples[-1]), float(run.history.seconds[-1])
-        rate = f"{words.count(samples / seconds)} per second" if seconds > 0 else ""
-        found.append(Tile("Samples", words.count(samples), rate))
+        rate = f"{formatting.count(samples / seconds)} per second" if seconds > 0 else ""
+        found.append(Tile("Samples", formatting.count(samples), rate))
     return found
 
 
 def _tile(label: str, before: float | None, after: float, unit: str) -> Tile:
-    return Tile(label, words.number(after), f"{unit}, from {words.number(before)}" if before is not None else unit)
+    return Tile(
+        label, formatting.number(after), f"{unit}, from {formatting.number(before)}" if before is not None else unit
+    )
 
 
-def row(run: RunFolder, key: str) -> ParameterRow:
+def parameter_row(run: RunFolder, key: str) -> ParameterRow:
     """One parameter."""
     result, initial, truth = run.parameters[key], run.initial[key], run.truth.get(key)
     return ParameterRow(
@@ -111,20 +113,20 @@ def _values(array: np.ndarray) -> str:
     if array.size == 0:
         return ""
     if array.size > _LISTED_VALUES:
-        return " … ".join(words.number(float(value)) for value in (array.min(), array.max()))
-    return ", ".join(words.number(float(value)) for value in array.reshape(-1))
+        return " … ".join(formatting.number(float(value)) for value in (array.min(), array.max()))
+    return ", ".join(formatting.number(float(value)) for value in array.reshape(-1))
 
 
 def _swatch(array: np.ndarray) -> str:
     """The colour of a parameter of three values within [0, 1], as #rrggbb; empty for others."""
     if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
         return ""
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in images.srgb(array.reshape(-1)))
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in tone_mapping.srgb(array.reshape(-1)))
 
 
 def view_rows(run: RunFolder) -> list[ViewRow]:
     """All views."""
-    measured = measures.of_views(run)
+    measured = image_metrics.measure_views(run)
     return [
         ViewRow(
             view,

@@ -13,41 +13,40 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+from pydantic import BaseModel
 
+from unrender.backend.variant import current
 from unrender.core import arrays
-from unrender.io import files
 from unrender.core.errors import InputError
+from unrender.io import files
 from unrender.io.thumbnails import reduced, resize_nearest
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines
+from unrender.runs.folder.schema import COMMANDS, CONTROL, LIVE, LIVE_START, LIVE_STATUS, LIVE_VIEWS
 from unrender.runs.result import hardware, versions
-from unrender.backend.variant import current
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Run
     from unrender.runs.result import Result
+    from unrender.runs.run import Run
 
-FOLDER = "live"
-"""Within the run folder."""
-CONTROL = "control.json"
-"""In the run folder: {"command": "run" | "pause" | "stop"}."""
-COMMANDS = ("run", "pause", "stop")
+__all__ = ["Live"]
 
 _INTERVAL = 1.0
 _SHARE = 0.02
-_LOOK = 0.1
+_POLL_SECONDS = 0.1
 _VIEWS = 8
 _PICTURE, _VOLUME = 512, 64
-_WHOLE = 1 << 16
-_LONGEST_CONTROL = 4096
+_LARGEST_OTHER = 1 << 16
+_LARGEST_CONTROL = 4096
 
 
 class Live(Callback):
-    """Writes what a run looks like now, about once a second, and obeys commands.
+    """Writes what a run looks like now, about once a second, and follows commands.
 
     Into `live/` of the run folder go: `status.json`; `views.npz`, each view's picture as the loss saw it, with its control weight or
     pixel probability where there is one; `parameters.npz`; once, `run.json`, `start.npz` (references, and the first step's pictures),
-    `initial.npz` and `truth.npz`; and `history.jsonl`, unless somebody writes one in the run folder itself. Large pictures,
+    `initial.npz` and `truth.npz`; and `history.jsonl`, unless the run folder itself gets one. Large pictures,
     textures and volumes are box-filtered, of the first eight views at most. Each file is written beside its place and renamed.
 
     `control.json` in the run folder holds {"command": "run"}, "pause" or "stop". A pause blocks after a step, and is no time of the
@@ -69,11 +68,11 @@ class Live(Callback):
         settings: Mapping[str, Any] | None = None,
     ):
         self._folder = Path(folder)
-        self._told = {"name": name, "method": method, "command": command, "settings": dict(settings or {})}
-        self._history = _OwnHistory(self._folder)
-        self._silent = False
-        self._started = False
-        self._next_look = self._next_update = 0.0
+        self._description = {"name": name, "method": method, "command": command, "settings": dict(settings or {})}
+        self._history = _LiveHistory(self._folder)
+        self._disabled = False
+        self._first_images_written = False
+        self._next_poll = self._next_update = 0.0
         self._cost = 0.0
         self._initial_error: dict[str, float] = {}
         self._command: tuple[tuple[int, int], str] = ((0, 0), "run")
@@ -88,51 +87,51 @@ class Live(Callback):
             self._write_start(run)
             self._write_status(run, "running", None)
         except (OSError, InputError) as error:
-            self._give_up(run, error)
+            self._disable(run, error)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
-        if self._silent:
+        if self._disabled:
             return
-        self._history.take(record)
+        self._history.append(record)
         now = time.monotonic()
         try:
-            if now >= self._next_look or run.stopped:
-                self._next_look = now + _LOOK
-                self._obey(run, record)
+            if now >= self._next_poll or run.stopped:
+                self._next_poll = now + _POLL_SECONDS
+                self._follow_command(run, record)
             if now >= self._next_update or run.stopped:
                 self._update(run, record, "running")
         except (OSError, InputError) as error:
-            self._give_up(run, error)
+            self._disable(run, error)
 
     def on_end(self, run: Run, result: Result) -> None:
         """See `Callback.on_end`."""
-        if self._silent:
+        if self._disabled:
             return
         try:
             last = result.history[-1] if result.history else None
             self._write_status(run, "ended", last)
             (self._folder / CONTROL).unlink(missing_ok=True)
         except (OSError, InputError) as error:
-            self._give_up(run, error)
+            self._disable(run, error)
 
     def clear(self) -> None:
-        """Remove what this callback wrote, once the run folder itself tells all of it."""
+        """Remove what this callback wrote, once the run folder itself holds all of it."""
         (self._folder / CONTROL).unlink(missing_ok=True)
         if not self._live.is_symlink():
             shutil.rmtree(self._live, ignore_errors=True)
 
     @property
     def _live(self) -> Path:
-        return self._folder / FOLDER
+        return self._folder / LIVE
 
-    def _obey(self, run: Run, record: dict[str, Any]) -> None:
+    def _follow_command(self, run: Run, record: dict[str, Any]) -> None:
         command = self._read_command()
         if command == "pause" and not run.stopped:
             self._update(run, record, "paused")
-            # Nobody could say "run" in a folder that is gone.
+            # In a folder that is gone, no command could end the pause.
             while command == "pause" and not run.stopped and self._live.is_dir():
-                time.sleep(_LOOK / 2)
+                time.sleep(_POLL_SECONDS / 2)
                 command = self._read_command()
             self._next_update = 0.0
         if command == "stop":
@@ -146,7 +145,7 @@ class Live(Callback):
             stamp = status.st_mtime_ns, status.st_ino
             if stamp != self._command[0]:
                 self._command = stamp, self._command[1]
-                if 0 < status.st_size <= _LONGEST_CONTROL and path.is_file() and not path.is_symlink():
+                if 0 < status.st_size <= _LARGEST_CONTROL and path.is_file() and not path.is_symlink():
                     found = json.loads(path.read_text("utf-8"))
                     command = found.get("command") if isinstance(found, dict) else None
                     if command in COMMANDS:
@@ -162,12 +161,12 @@ class Live(Callback):
         began = time.monotonic()
         if not self._live.is_dir():  # writing would bring back a folder that somebody removed
             raise InputError(f"{self._live}: the folder is gone")
-        if not self._started and run.estimate is not None:
-            self._started = True
+        if not self._first_images_written and run.estimate is not None:
+            self._first_images_written = True
             views = {**_references(run), **{f"{name}/initial": image for name, image in _images(run).items()}}
-            files.write_arrays(self._live / "start.npz", views, compress=False)
-        files.write_arrays(self._live / "views.npz", _views(run), compress=False)
-        files.write_arrays(self._live / "parameters.npz", _small(run.full()), compress=False)
+            files.write_arrays(self._live / LIVE_START, views, compress=False)
+        files.write_arrays(self._live / LIVE_VIEWS, _views(run), compress=False)
+        files.write_arrays(self._live / schema.PARAMETERS, _reduced_parameters(run.full()), compress=False)
         self._history.write(self._live)
         self._write_status(run, status, record)
         self._cost = time.monotonic() - began
@@ -176,63 +175,65 @@ class Live(Callback):
     def _write_start(self, run: Run) -> None:
         initial = run.full()
         self._initial_error = run.problem.parameter_error(initial)
-        files.write_arrays(self._live / "start.npz", _references(run), compress=False)
-        files.write_arrays(self._live / "initial.npz", _small(initial), compress=False)
-        files.write_arrays(self._live / "parameters.npz", _small(initial), compress=False)
+        files.write_arrays(self._live / LIVE_START, _references(run), compress=False)
+        files.write_arrays(self._live / schema.INITIAL, _reduced_parameters(initial), compress=False)
+        files.write_arrays(self._live / schema.PARAMETERS, _reduced_parameters(initial), compress=False)
         if run.problem.truth:
-            files.write_arrays(self._live / "truth.npz", _small(run.problem.truth), compress=False)
-        record = {
-            **self._told,
-            "name": self._told["name"] or run.problem.name,
-            "method": self._told["method"] or type(run.estimator).__name__,
-            "settings": {**self._told["settings"], "estimator": repr(run.estimator), "optimizer": repr(run.optimizer)},
-            "seed": run.seed,
-            "versions": versions(),
-            "hardware": hardware(),
-            "variant": current() or "",
-            "problem": {"parameters": list(initial), "views": len(run.problem.views), "loss": repr(run.problem.loss)},
-        }
-        _write_json(self._live / "run.json", record)
+            files.write_arrays(self._live / schema.TRUTH, _reduced_parameters(run.problem.truth), compress=False)
+        description = self._description
+        components = {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
+        record = schema.RunRecord.model_construct(
+            name=description["name"] or run.problem.name,
+            method=description["method"] or type(run.estimator).__name__,
+            settings={**description["settings"], **components},
+            seed=run.seed,
+            command=description["command"],
+            versions=versions(),
+            hardware=hardware(),
+            variant=current() or "",
+            problem={"parameters": list(initial), "views": len(run.problem.views), "loss": repr(run.problem.loss)},
+        )
+        _write_json(self._live / schema.RECORD, record)
 
     def _write_status(self, run: Run, status: str, record: Mapping[str, Any] | None) -> None:
-        found = {
-            "status": status,
-            "stopped": run.stopped,
-            "step": run.step,
-            "steps": run.steps,
-            "seconds": run.clock,
-            "budget_seconds": run.seconds,
-            "loss": record["loss"] if record else None,
-            "samples": record["samples"] if record else 0,
-            "skipped": run.skipped,
-            "warnings": list(run.warnings),
-            "control": self._command[1],
-            "process": os.getpid(),
-            "host": platform.node(),
-            "update_seconds": self._cost,
-            "initial_error": self._initial_error,
-            "shapes": run.problem.shapes(),
-        }
-        _write_json(self._live / "status.json", found)
+        found = schema.LiveStatus.model_construct(
+            status=status,
+            stopped=run.stopped,
+            step=run.step,
+            steps=run.steps,
+            seconds=run.clock,
+            budget_seconds=run.seconds,
+            loss=record["loss"] if record else None,
+            samples=record["samples"] if record else 0,
+            skipped=run.skipped,
+            warnings=list(run.warnings),
+            control=self._command[1],
+            process=os.getpid(),
+            host=platform.node(),
+            update_seconds=self._cost,
+            initial_error=self._initial_error,
+            shapes=run.problem.shapes(),
+        )
+        _write_json(self._live / LIVE_STATUS, found)
 
-    def _give_up(self, run: Run, error: Exception) -> None:
-        self._silent = True
+    def _disable(self, run: Run, error: Exception) -> None:
+        self._disabled = True
         run.warnings.append(f"the run goes on, but can no longer be watched: {' '.join(str(error).split())}")
 
 
-class _OwnHistory:
-    """Appends to live/history.jsonl as long as nobody writes history.jsonl in the run folder."""
+class _LiveHistory:
+    """Appends to live/history.jsonl as long as the run folder itself gets no history.jsonl."""
 
     def __init__(self, folder: Path):
-        self._other = folder / "history.jsonl"
+        self._other = folder / schema.HISTORY
         self._records: list[Mapping[str, Any]] = []
         self._before = _stamp(self._other)
 
-    def take(self, record: Mapping[str, Any]) -> None:
+    def append(self, record: Mapping[str, Any]) -> None:
         self._records.append(record)
 
     def write(self, live: Path) -> None:
-        path = live / "history.jsonl"
+        path = live / schema.HISTORY
         if _stamp(self._other) != self._before:
             path.unlink(missing_ok=True)
         elif self._records:
@@ -255,7 +256,7 @@ def _references(run: Run) -> dict[str, np.ndarray]:
 
 
 def _images(run: Run) -> dict[str, np.ndarray]:
-    """{"view0": (H, W, 3)} as the loss saw them, of those views that the estimate tells."""
+    """{"view0": (H, W, 3)} as the loss saw them, of the views that the last estimate has."""
     info = run.estimate.info if run.estimate is not None else {}
     found = {i: arrays.numpy(image) for i, image in info.get("images", {}).items() if i < _VIEWS}
     wanted = {i: np.asarray(view.reference).shape for i, view in enumerate(run.problem.views)}
@@ -274,7 +275,7 @@ def _views(run: Run) -> dict[str, np.ndarray]:
     return found
 
 
-def _small(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _reduced_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Textures and volumes box-filtered; of other large arrays the least and the greatest value."""
     found = {}
     for key, value in parameters.items():
@@ -283,11 +284,11 @@ def _small(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             array = reduced(array, _VOLUME, 3)
         elif array.ndim in (2, 3) and min(array.shape[:2]) > 1 and array.shape[2:] in ((), (1,), (3,), (4,)):
             array = reduced(array, _PICTURE)
-        elif array.size > _WHOLE:
+        elif array.size > _LARGEST_OTHER:
             array = np.array([array.min(), array.max()])
         found[key] = array
     return found
 
 
-def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    files.write(path, lines([value]))
+def _write_json(path: Path, model: BaseModel) -> None:
+    files.write(path, lines([schema.serialize(model)]))

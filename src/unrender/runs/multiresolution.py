@@ -12,7 +12,7 @@ import time
 from unrender.core import arrays, trees
 from unrender.problem.upsampling import NotCarried, Upsampler, restarted, upsampled
 from unrender.runs.noise import GradientNoise
-from unrender.runs.run import Memory, Run
+from unrender.runs.run import Run, RunState
 
 __all__ = ["is_due", "refine", "unfinished"]
 
@@ -34,7 +34,7 @@ def unfinished(run: Run) -> list[str]:
     return found
 
 
-def refine(run: Run, memory: Memory) -> float:
+def refine(run: Run, state: RunState) -> float:
     """Bring parameters and states to the resolution of the next step. Returns the seconds it took."""
     started = time.perf_counter()
     upsampler = Upsampler(run.problem, run.step, run.parameters)
@@ -46,13 +46,13 @@ def refine(run: Run, memory: Memory) -> float:
         run.optimizer.init(run.parameters, run.problem.learning_rates),
     )
     for name, new in zip(("estimator", "optimizer"), fresh, strict=True):
-        state = getattr(memory, name)
+        component = getattr(state, name)
         try:
-            state = upsampled(state, upsampler) if carry[name] else restarted(state, new)
+            after = upsampled(component, upsampler) if carry[name] else restarted(component, new)
         except NotCarried as error:
             run.warnings.append(f"step {run.step}: {error} cannot be carried to another resolution: it starts anew")
-            state = restarted(state, new)
-        setattr(memory, name, state)
-    memory.noise = GradientNoise()
-    arrays.evaluate(run.parameters, memory.estimator, memory.optimizer)
+            after = restarted(component, new)
+        setattr(state, name, after)
+    state.noise = GradientNoise()
+    arrays.evaluate(run.parameters, state.estimator, state.optimizer)
     return time.perf_counter() - started

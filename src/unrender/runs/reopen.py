@@ -8,12 +8,12 @@ from pathlib import Path
 from unrender import gallery
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
-from unrender.io import files, toml_lines
+from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
 from unrender.runs.callbacks import Callback
-from unrender.runs.folder import record
+from unrender.runs.folder.reader import read_run_record
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
 
@@ -62,15 +62,15 @@ def problem_of(directory: str | Path) -> Problem:
         InputError: it was made in Python, or problem.toml is malformed.
     """
     folder = Path(directory)
-    origin = record.read(folder).problem.origin
+    origin = read_run_record(folder).problem.origin
     path = folder / serialization.FILE
-    document = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
-    if "gallery" in document:
-        name, options = document["gallery"], document.get("options", {})
-        if not isinstance(name, str) or not isinstance(options, dict) or set(document) - {"gallery", "options"}:
-            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(document)[:80]}')
+    stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
+    if "gallery" in stored:
+        name, options = stored["gallery"], stored.get("options", {})
+        if not isinstance(name, str) or not isinstance(options, dict) or set(stored) - {"gallery", "options"}:
+            raise InputError(f'{path}: expected gallery = "name" and a table [options], got {repr(stored)[:80]}')
         return gallery.problem(name, **options)
-    if "scene" not in document:
+    if "scene" not in stored:
         raise InputError(
             f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
             "unrender.export((problem, result.parameters), out)"

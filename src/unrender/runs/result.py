@@ -15,10 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from unrender.io import files
-from unrender.core.errors import InputError
-from unrender.runs.folder.history import lines
 from unrender.backend.variant import LLVM, current, llvm_version
+from unrender.core.errors import InputError
+from unrender.io import files
+from unrender.runs.folder import schema
+from unrender.runs.folder.history import lines
+
+__all__ = ["Result", "deciding_versions", "hardware", "versions"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Result:
         warnings: one line each.
         info: of the last estimate, as NumPy arrays.
         name, method, settings, seed, command, problem: what was run.
-        resumed: the steps at which it was taken up again.
+        resumed: the steps at which it was resumed.
         truth: {key: array} where it is known.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
     """
@@ -82,22 +85,27 @@ class Result:
         folder = Path(directory)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            files.write_arrays(folder / "parameters.npz", self.parameters)
-            files.write_arrays(folder / "initial.npz", self.initial)
+            files.write_arrays(folder / schema.PARAMETERS, self.parameters)
+            files.write_arrays(folder / schema.INITIAL, self.initial)
             if self.truth:
-                files.write_arrays(folder / "truth.npz", self.truth)
+                files.write_arrays(folder / schema.TRUTH, self.truth)
             if self.pictures:
-                files.write_arrays(folder / "pictures.npz", self.pictures)
-            files.write(folder / "history.jsonl", lines(self.history))
+                files.write_arrays(folder / schema.PICTURES, self.pictures)
+            files.write(folder / schema.HISTORY, lines(self.history))
             record = json.dumps(self.record(status or self.status), indent=2) + "\n"
-            files.write(folder / "run.json", record.encode(), durable=True)
+            files.write(folder / schema.RECORD, record.encode(), durable=True)
         except OSError as error:
             raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
         return folder
 
-    def record(self, status: str) -> dict[str, Any]:
-        """What run.json says of it; `status` is "running", "finished", "interrupted" or "failed"."""
-        return {
+    def record(self, status: str, error: str = "") -> dict[str, Any]:
+        """run.json, see `schema.RunRecord`.
+
+        Args:
+            status: "running", "finished", "interrupted" or "failed".
+            error: the exception by which the run failed; "" for none.
+        """
+        fields: dict[str, Any] = {
             "status": status,
             "name": self.name,
             "method": self.method,
@@ -116,6 +124,9 @@ class Result:
             "problem": dict(self.problem),
             "resumed": list(self.resumed),
         }
+        if error:
+            fields["error"] = error
+        return schema.serialize(schema.RunRecord.model_construct(None, **fields))
 
 
 def versions() -> dict[str, str]:

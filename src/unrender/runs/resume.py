@@ -1,4 +1,4 @@
-"""Taking up a run where its last checkpoint left it."""
+"""Resuming a run from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -14,38 +14,44 @@ from unrender.optimizers.base import Optimizer
 from unrender.problem.fingerprint import differences
 from unrender.problem.problem import Problem
 from unrender.problem.serialization import origin
-from unrender.runs.folder import checkpoint, history, method_file, record
-from unrender.runs import loop
+from unrender.runs.budget import check_budget
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder import checkpoint, history, method_file, reader
 from unrender.runs.folder.checkpoint import Checkpoint
-from unrender.runs.folder.writer import HISTORY, METHOD, RunWriter
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.method_file import Method
-from unrender.runs.folder.record import Record
-from unrender.runs.result import Result, deciding_versions
-from unrender.runs.run import restore
+from unrender.runs.folder.schema import HISTORY, METHOD, RunRecord
 from unrender.runs.folder.state import check_alike, unpack
+from unrender.runs.folder.writer import RunWriter
+from unrender.runs.hooks import Hook
+from unrender.runs.loop import Descent, descend, initialize, prepare
+from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of
+from unrender.runs.optimize import assemble_hooks, check, open_writer
+from unrender.runs.result import Result, deciding_versions
+from unrender.runs.run import SNAPSHOT_COUNTS, restore
+
+__all__ = ["StoredRun", "load_run", "resume_run"]
 
 _MOST_SHOWN = 6
-_WORDS = "warnings"
+_WARNINGS = "warnings"
 
 
 @dataclass(frozen=True)
-class Stored:
-    """A run folder that may be taken up.
+class StoredRun:
+    """A run folder whose run may be resumed.
 
     Attributes:
-        folder: the place.
+        folder: the run folder.
         record: run.json.
         method: method.toml, with the budget that the run is to have now.
     """
 
     folder: Path
-    record: Record
+    record: RunRecord
     method: Method
 
 
-def load_run(directory: str | Path, steps: int | None = None, seconds: float | None = None) -> Stored:
+def load_run(directory: str | Path, steps: int | None = None, seconds: float | None = None) -> StoredRun:
     """Read what a run folder says of its run, before anything that takes time.
 
     Args:
@@ -56,114 +62,156 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
         InputError: it is no run folder, it is malformed, in use, or finished and no larger budget is given.
     """
     folder = Path(directory)
-    found = record.read(folder)
+    record = reader.read_run_record(folder)
     method = method_file.read(folder / METHOD)
-    if (busy := holder(folder)) is not None:
-        raise InputError(f"run folder {folder}: in use by {busy}")
+    if (process := holder(folder)) is not None:
+        raise InputError(f"run folder {folder}: in use by {process}")
     budget = (method.steps, method.seconds) if steps is None and seconds is None else (steps, seconds)
-    loop.check_budget(*budget)
-    done = (steps is None or steps <= found.steps) and (seconds is None or seconds <= found.seconds)
-    if found.status == "finished" and done:
-        so_far = f"finished, after {found.steps} steps and {found.seconds:.3g} s"
+    check_budget(*budget)
+    done = (steps is None or steps <= record.steps) and (seconds is None or seconds <= record.seconds)
+    if record.status == "finished" and done:
+        so_far = f"finished, after {record.steps} steps and {record.seconds:.3g} s"
         raise InputError(
             f"run folder {folder}: {so_far}; to go on, give a larger budget, in steps or seconds from its start"
         )
-    return Stored(folder, found, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))
+    return StoredRun(folder, record, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))
 
 
 def resume_run(
-    stored: Stored,
+    stored: StoredRun,
     problem: Problem,
     force: bool = False,
     callbacks: Sequence[Callback] = (),
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
 ) -> Result:
-    """Take up the run. See `unrender.resume`."""
-    folder, method, past = stored.folder, stored.method, stored.record
+    """Resume the run. See `unrender.resume`."""
+    folder, method, record = stored.folder, stored.method, stored.record
     parts = method_file.parts(method, folder / METHOD, estimator, optimizer)
-    loop.check(parts.estimator, parts.optimizer, method.steps, method.seconds)
-    run, memory = loop.prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
+    check(parts.estimator, parts.optimizer, method.steps, method.seconds)
+    run, state = prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
     run.folder = folder
-    annotations = loop.RunAnnotations(past.method, _own_settings(past), past.command, method.final_spp)
-    metadata = loop.RunMetadata(loop.describe_run(run, annotations), run.full(), method.final_spp)
-    now = loop.fingerprint_of(run)
-    metadata.facts["problem"] |= {"fingerprint": now, "origin": origin(problem)}
-    serialize = method_file.serialize(run, method.name, method.checkpoint_every, method.final_spp)
-    writer = RunWriter(folder, problem, serialize, method.checkpoint_every, lambda line: run.warnings.append(line))
-    writer.take()
-    try:
-        records, broken = history.read(folder / HISTORY) if (folder / HISTORY).exists() else ([], "")
-
-        def fits(found: Checkpoint) -> str:
-            least = f"of step {found.manifest.step}, but {HISTORY} has only {len(records)} steps"
-            return least + (f" ({broken})" if broken else "") if found.manifest.step > len(records) else ""
-
-        found, passed = checkpoint.newest(folder, fits)
-        before = past.problem.fingerprint if found is None else found.manifest.problem
-        changed = [] if before is None else differences(before, now)
-        if found is not None:
-            changed += differences(found.manifest.versions, deciding_versions())
-            changed += differences({"seed": str(found.manifest.seed)}, {"seed": str(method.seed)})
-        if changed and not force:
-            more = f" and {len(changed) - _MOST_SHOWN} more" if len(changed) > _MOST_SHOWN else ""
-            what = "; ".join(changed[:_MOST_SHOWN]) + more
-            raise InputError(f"run folder {folder}: not as it was: {what}; to go on nevertheless, force it")
-        _check_room(folder, method, found)
-        if found is not None:
-            loop.place(run, memory, max(found.manifest.step - 1, 0))
-
-        def take_up(fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-            kept = fresh if found is None else _unpacked(found, fresh, warm)
-            kept[_WORDS] = [*kept[_WORDS], *(f"passed over: {line}" for line in passed)]
-            kept[_WORDS] += (
-                [f"resumed by force though not as it was: {'; '.join(changed[:_MOST_SHOWN])}"] if changed else []
-            )
-            metadata.history[:] = records[: kept["step"]]
-            metadata.facts["resumed"] = [*past.resumed, kept["step"]]
-            metadata.warmup += past.warmup_seconds
-            restore(run, memory, kept)
-            writer.resume(metadata.history, metadata.result(run))
-
-        return loop.descend(run, memory, callbacks, metadata, writer, take_up)
-    finally:
-        writer.close()
+    annotations = RunAnnotations(record.method, _method_settings(record), record.command, method.final_spp)
+    log = RunMetadata(describe_run(run, annotations), run.full())
+    fingerprint = fingerprint_of(run)
+    log.description["problem"] |= {"fingerprint": fingerprint, "origin": origin(problem)}
+    with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
+        source = _find_checkpoint(stored)
+        changes = _changes(stored, source.checkpoint, fingerprint)
+        if changes and not force:
+            raise InputError(f"run folder {folder}: not as it was: {changes}; to go on nevertheless, force it")
+        _check_budget_left(folder, method, source.checkpoint)
+        if source.checkpoint is not None:
+            initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))
+        restoring = _Restore(record, source, changes, writer)
+        return descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer)]))
 
 
-def _own_settings(past: Record) -> dict[str, Any]:
-    """The method's, without what is said of every run."""
-    return {k: v for k, v in past.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
+@dataclass(frozen=True)
+class _Source:
+    """Where a run is resumed from.
+
+    Attributes:
+        checkpoint: None for the run's start.
+        records: the history, which may be longer.
+        passed_over: one line for each later checkpoint that cannot be used.
+    """
+
+    checkpoint: Checkpoint | None
+    records: list[dict[str, Any]]
+    passed_over: list[str]
 
 
-def _check_room(folder: Path, method: Method, found: Checkpoint | None) -> None:
+def _find_checkpoint(stored: StoredRun) -> _Source:
+    """The last checkpoint that can be read and whose steps the history has."""
+    path = stored.folder / HISTORY
+    records, malformed = history.read_records(path, stored.folder) if path.exists() else ([], "")
+
+    def reject(found: Checkpoint) -> str:
+        if found.manifest.step <= len(records):
+            return ""
+        reason = f"of step {found.manifest.step}, but {HISTORY} has only {len(records)} steps"
+        return reason + (f" ({malformed})" if malformed else "")
+
+    found, passed_over = checkpoint.latest(stored.folder, reject)
+    return _Source(found, records, passed_over)
+
+
+def _changes(stored: StoredRun, found: Checkpoint | None, fingerprint: dict[str, str]) -> str:
+    """What is not as it was when the checkpoint was written (the run was started, where there is none): phrases on one line."""
+    before = stored.record.problem.fingerprint if found is None else found.manifest.problem
+    changed = [] if before is None else differences(before, fingerprint)
+    if found is not None:
+        changed += differences(found.manifest.versions, deciding_versions())
+        changed += differences({"seed": str(found.manifest.seed)}, {"seed": str(stored.method.seed)})
+    more = f" and {len(changed) - _MOST_SHOWN} more" if len(changed) > _MOST_SHOWN else ""
+    return "; ".join(changed[:_MOST_SHOWN]) + more
+
+
+def _method_settings(record: RunRecord) -> dict[str, Any]:
+    """The settings of the method, without those that every run has."""
+    return {k: v for k, v in record.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
+
+
+def _check_budget_left(folder: Path, method: Method, found: Checkpoint | None) -> None:
     """Raise `InputError` where the budget ends before the checkpoint."""
-    at = 0 if found is None else found.manifest.step
-    if method.steps is not None and method.steps < at:
+    done = 0 if found is None else found.manifest.step
+    if method.steps is not None and method.steps < done:
         raise InputError(
-            f"run folder {folder}: {at} steps are done, expected a budget of more, got steps={method.steps}"
+            f"run folder {folder}: {done} steps are done, expected a budget of more, got steps={method.steps}"
         )
 
 
-def _unpacked(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
-    """The snapshot in a checkpoint, which must have the form of one of this run's."""
-    kept = unpack(found.packed, [fresh, warm])
+@dataclass
+class _Restore(Hook):
+    """Brings a run that is warmed up to where it was left.
+
+    Attributes:
+        record: run.json of the run so far.
+        source: where it is resumed from.
+        changes: what is not as it was, "" for nothing.
+        writer: of the run folder.
+    """
+
+    record: RunRecord
+    source: _Source
+    changes: str
+    writer: RunWriter
+
+    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        """See `Hook.on_warm_up`."""
+        log, source = descent.log, self.source
+        saved = fresh if source.checkpoint is None else _unpack(source.checkpoint, fresh, warm)
+        warnings = [f"passed over: {line}" for line in source.passed_over]
+        warnings += [f"resumed by force though not as it was: {self.changes}"] if self.changes else []
+        saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
+        log.history[:] = source.records[: saved["step"]]
+        log.description["resumed"] = [*self.record.resumed, saved["step"]]
+        log.warmup_seconds += self.record.warmup_seconds
+        restore(descent.run, descent.state, saved)
+        self.writer.resume(log.history, descent.result())
+
+
+def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
+    """The snapshot in a checkpoint, which must have the types and shapes of one of this run's."""
+    saved = unpack(found.packed, [fresh, warm])
     where = f"checkpoint of step {found.manifest.step}"
-    if not isinstance(kept, dict) or list(kept) != list(fresh):
-        raise InputError(f"{where}: expected the state of a run, got {repr(kept)[:60]}")
-    words = kept[_WORDS]
-    if not isinstance(words, list) or not all(isinstance(line, str) for line in words):
-        raise InputError(f"{where}: {_WORDS}: expected a list of lines, got {repr(words)[:60]}")
-    for name, value in kept.items():
-        if name != _WORDS:
+    if not isinstance(saved, dict) or list(saved) != list(fresh):
+        raise InputError(f"{where}: expected the state of a run, got {repr(saved)[:60]}")
+    warnings = saved[_WARNINGS]
+    if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
+        raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
+    for name, value in saved.items():
+        if name != _WARNINGS:
             check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
-    for name in ("step", "clock", "skipped", "samples", "in_a_row", "next_error"):
-        if not 0 <= kept[name] < float("inf"):
-            raise InputError(f"{where}: {name}: expected a number of at least 0, got {kept[name]}")
-    if kept["step"] != found.manifest.step:
-        raise InputError(f"{where}: step: expected {found.manifest.step}, got {kept['step']}")
+    for name in SNAPSHOT_COUNTS:
+        if not 0 <= saved[name] < float("inf"):
+            raise InputError(f"{where}: {name}: expected a number of at least 0, got {saved[name]}")
+    if saved["step"] != found.manifest.step:
+        raise InputError(f"{where}: step: expected {found.manifest.step}, got {saved['step']}")
     expected = trees.shapes(fresh["parameters"])
-    if trees.shapes(kept["parameters"]) != expected:
-        raise InputError(f"{where}: parameters: expected shapes {expected}, got {trees.shapes(kept['parameters'])}")
-    if not all(arrays.all_finite(value) for value in kept["parameters"].values()):
+    if trees.shapes(saved["parameters"]) != expected:
+        raise InputError(f"{where}: parameters: expected shapes {expected}, got {trees.shapes(saved['parameters'])}")
+    if not all(arrays.all_finite(value) for value in saved["parameters"].values()):
         raise InputError(f"{where}: parameters: not finite")
-    return kept
+    return saved

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.runs.noise import GradientNoise
-from unrender.core.trees import Tree
+
+__all__ = ["SNAPSHOT_COUNTS", "Run", "RunState", "interruptible", "restore", "snapshot"]
 
 
 @dataclass
@@ -26,7 +28,7 @@ class Run:
     Attributes:
         problem, estimator, optimizer, seed: what runs.
         steps, seconds: the budget; None where there is none.
-        folder: the run folder; None where the run keeps none.
+        folder: the run folder; None for a run without one.
         step: how many steps are done.
         clock: seconds of optimization so far.
         parameters: the current ones (the renderer's arrays), at the present resolution where they are coarse at first.
@@ -66,54 +68,58 @@ class Run:
 
 
 @dataclass
-class Memory:
+class RunState:
     """What a run carries from step to step beside what `Run` shows.
 
     Attributes:
         estimator, optimizer: their states.
-        noise: of the gradient so far.
-        silent: {key: whether its gradient has been zero so far}.
+        noise: statistics of the gradient so far.
+        zero_gradient: {key: whether its gradient has been exactly zero so far}.
         samples: paths traced so far.
-        in_a_row: steps that were not applied since the last that was.
+        skipped_in_a_row: steps that were not applied since the last that was.
         next_error: when the parameters' error is due again, on the run's clock.
     """
 
     estimator: Any
     optimizer: Any
     noise: GradientNoise
-    silent: dict[str, bool]
+    zero_gradient: dict[str, bool]
     samples: int = 0
-    in_a_row: int = 0
+    skipped_in_a_row: int = 0
     next_error: float = 0.0
 
 
-def snapshot(run: Run, memory: Memory) -> dict[str, Any]:
+def snapshot(run: Run, state: RunState) -> dict[str, Any]:
     """All that decides what the next steps do: what a checkpoint holds, for `state.pack`."""
-    noise = memory.noise
+    noise = state.noise
     return {
         "parameters": run.parameters,
         "step": run.step,
         "clock": run.clock,
         "skipped": run.skipped,
         "warnings": list(run.warnings),
-        "estimator": memory.estimator,
-        "optimizer": memory.optimizer,
-        "noise": {"mean": noise.mean, "energy": noise.energy, "weight": noise.weight},
-        "silent": dict(memory.silent),
-        "samples": memory.samples,
-        "in_a_row": memory.in_a_row,
-        "next_error": memory.next_error,
+        "estimator": state.estimator,
+        "optimizer": state.optimizer,
+        "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
+        "zero_gradient": dict(state.zero_gradient),
+        "samples": state.samples,
+        "skipped_in_a_row": state.skipped_in_a_row,
+        "next_error": state.next_error,
     }
 
 
-def restore(run: Run, memory: Memory, kept: dict[str, Any]) -> None:
+SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")
+"""Fields of a snapshot that are finite numbers of at least 0."""
+
+
+def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
     """Bring a run to where `snapshot` was taken. The snapshot has been checked to be one of this run's."""
-    run.parameters, run.step, run.clock = kept["parameters"], kept["step"], kept["clock"]
-    run.skipped, run.warnings = kept["skipped"], list(kept["warnings"])
-    memory.estimator, memory.optimizer = kept["estimator"], kept["optimizer"]
-    memory.noise = GradientNoise(**kept["noise"])
-    memory.silent, memory.samples = kept["silent"], kept["samples"]
-    memory.in_a_row, memory.next_error = kept["in_a_row"], kept["next_error"]
+    run.parameters, run.step, run.clock = saved["parameters"], saved["step"], saved["clock"]
+    run.skipped, run.warnings = saved["skipped"], list(saved["warnings"])
+    state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
+    state.noise = GradientNoise(**saved["noise"])
+    state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
+    state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
 
 
 @contextmanager
@@ -124,12 +130,12 @@ def interruptible(run: Run) -> Iterator[None]:
         return
     before = signal.getsignal(signal.SIGINT)
 
-    def ask(number: int, frame: Any) -> None:
+    def stop(number: int, frame: Any) -> None:
         del number, frame
         run.stop("interrupted")
         signal.signal(signal.SIGINT, before)
 
-    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGINT, stop)
     try:
         yield
     finally:

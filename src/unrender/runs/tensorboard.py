@@ -16,8 +16,8 @@ from unrender.io.thumbnails import reduced
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Run
     from unrender.runs.result import Result
+    from unrender.runs.run import Run
 
 _LARGEST = 512
 _VIEWS = 8

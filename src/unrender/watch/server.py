@@ -24,9 +24,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from unrender.core.errors import InputError
 from unrender.io import files
-from unrender.runs.live import COMMANDS, CONTROL
-from unrender.watch import board
-from unrender.watch.source import Source
+from unrender.runs.folder.schema import COMMANDS, CONTROL
+from unrender.watch import dashboard
+from unrender.watch.monitor import RunMonitor
 
 HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
@@ -97,16 +97,16 @@ def application(directories: Sequence[Path], address: Address) -> ASGIApp:
     """The page as an ASGI application; whatever does not carry the token is answered with 403."""
     page = _Page(directories)
     routes = [
-        Route("/", page.whole),
+        Route("/", page.full),
         Route("/update", page.update),
         Route("/picture/{name}", page.picture),
         Route("/control/{run:int}", page.control, methods=["POST"]),
         Route("/{name}", _asset),
     ]
-    return _Guard(Starlette(routes=[Mount(f"/{address.token}", routes=routes)]), address)
+    return _AccessControl(Starlette(routes=[Mount(f"/{address.token}", routes=routes)]), address)
 
 
-class _Guard:
+class _AccessControl:
     """Lets in what names this machine as its host, carries the token, and comes from no other page."""
 
     def __init__(self, app: ASGIApp, address: Address):
@@ -144,8 +144,8 @@ class _Guard:
 
 
 @dataclass(frozen=True)
-class _Made:
-    """A page that was made: from which revisions of the runs, and its number in the gallery."""
+class _RenderedPage:
+    """A page as rendered: from which revisions of the runs, and its number in the cache of pictures."""
 
     revisions: tuple[int, ...]
     page: int
@@ -157,12 +157,12 @@ class _Page:
     """What is served, from the runs as they are at that time."""
 
     def __init__(self, directories: Sequence[Path]):
-        self._sources = [Source(path) for path in directories]
-        self._gallery = board.Gallery()
+        self._monitors = [RunMonitor(path) for path in directories]
+        self._pictures = dashboard.PictureCache()
         self._lock = threading.Lock()
-        self._made: dict[tuple[str, int, int], _Made] = {}
+        self._rendered: dict[tuple[str, int, int], _RenderedPage] = {}
 
-    def whole(self, request: Request) -> Response:
+    def full(self, request: Request) -> Response:
         """The page."""
         return Response(self._render("watch.html", request)[0], media_type="text/html")
 
@@ -178,16 +178,16 @@ class _Page:
     def picture(self, request: Request) -> Response:
         """A picture, as PNG, at `stops` above its own exposure."""
         with self._lock:
-            drawing = self._gallery.find(request.path_params["name"])
-        if drawing is None:
+            picture = self._pictures.get(request.path_params["name"])
+        if picture is None:
             raise HTTPException(404)
         stops = _number(request, "stops")
-        return Response(drawing.png(2.0**stops, effort=1), media_type="image/png")
+        return Response(picture.png(2.0**stops, effort=1), media_type="image/png")
 
     async def control(self, request: Request) -> Response:
         """Write a command into the run's folder."""
         number = request.path_params["run"]
-        if not 0 <= number < len(self._sources):
+        if not 0 <= number < len(self._monitors):
             raise HTTPException(404)
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected JSON")
@@ -206,31 +206,31 @@ class _Page:
         return await run_in_threadpool(self._command, number, command)
 
     def _command(self, number: int, command: str) -> Response:
-        source = self._sources[number]
+        monitor = self._monitors[number]
         with self._lock:
-            listens = source.snapshot().listens
-        if not listens:
+            accepts_commands = monitor.snapshot().accepts_commands
+        if not accepts_commands:
             return PlainTextResponse("this run does not go on: it takes no commands", 409)
         try:
-            files.write(source.path / CONTROL, (json.dumps({"command": command}) + "\n").encode())
+            files.write(monitor.path / CONTROL, (json.dumps({"command": command}) + "\n").encode())
         except InputError as error:
             return PlainTextResponse(str(error), 409)
         return Response(status_code=204)
 
     def _render(self, template: str, request: Request) -> tuple[str, str]:
-        """The text and its digest; made anew only where a run has changed."""
+        """The text and its digest; rendered anew only where a run has changed."""
         run, view = (int(_number(request, name)) for name in ("run", "view"))
         with self._lock:
-            snapshots = [source.snapshot() for source in self._sources]
-            now = tuple(source.revision for source in self._sources)
-            made = self._made.get((template, run, view))
-            if made is None or made.revisions != now or not self._gallery.keeps(made.page):
-                text = board.render(template, snapshots, self._gallery, run, view)
+            snapshots = [monitor.snapshot() for monitor in self._monitors]
+            now = tuple(monitor.revision for monitor in self._monitors)
+            rendered = self._rendered.get((template, run, view))
+            if rendered is None or rendered.revisions != now or not self._pictures.has_page(rendered.page):
+                text = dashboard.render(template, snapshots, self._pictures, run, view)
                 digest = hashlib.blake2b(text.encode(), digest_size=12).hexdigest()
-                made = _Made(now, self._gallery.pages, text, digest)
-                self._made = {k: of for k, of in self._made.items() if self._gallery.keeps(of.page)}
-                self._made[template, run, view] = made
-            return made.text, made.digest
+                rendered = _RenderedPage(now, self._pictures.pages, text, digest)
+                self._rendered = {k: of for k, of in self._rendered.items() if self._pictures.has_page(of.page)}
+                self._rendered[template, run, view] = rendered
+            return rendered.text, rendered.digest
 
 
 def _number(request: Request, name: str) -> float:
@@ -252,7 +252,4 @@ def _asset(request: Request) -> Response:
     name = request.path_params["name"]
     if name not in _ASSETS:
         raise HTTPException(404)
-    loader = board.environment().loader
-    assert loader is not None
-    text = loader.get_source(board.environment(), name)[0]
-    return Response(text, media_type=_ASSETS[name])
+    return Response(dashboard.source(name), media_type=_ASSETS[name])

@@ -16,10 +16,12 @@ import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from unrender.io import files
 from unrender.core.errors import InputError
+from unrender.io import bounded_files
+from unrender.runs.folder.schema import LOCK
 
-NAME = "lock"
+__all__ = ["Holder", "Lock", "holder"]
+_LARGEST = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,13 @@ class Holder:
 
 
 class Lock:
-    """Holds a run folder from `take` on until `release`. The folder must be there."""
+    """Holds a run folder from `acquire` on until `release`. The folder must be there."""
 
     def __init__(self, folder: Path):
-        self.path = folder / NAME
+        self.path = folder / LOCK
         self._file: int | None = None
 
-    def take(self) -> None:
+    def acquire(self) -> None:
         """Raises `InputError` where another process holds the folder, or none can: one line that says who, or why."""
         try:
             while self._file is None:
@@ -59,8 +61,8 @@ class Lock:
         except OSError as error:
             raise InputError(f"run folder {self.path.parent}: cannot be locked: {error.strerror or error}") from error
 
-    def is_ours(self) -> bool:
-        """Whether the folder still has our lock: it may have been deleted, or deleted and taken by another."""
+    def is_held(self) -> bool:
+        """Whether the folder still holds this lock: it may have been deleted, or deleted and locked by another process."""
         if self._file is None:
             return False
         with contextlib.suppress(OSError):
@@ -72,13 +74,13 @@ class Lock:
         if self._file is None:
             return
         with contextlib.suppress(OSError):
-            if self.is_ours():
+            if self.is_held():
                 self.path.unlink()
         os.close(self._file)
         self._file = None
 
     def _try(self) -> int | None:
-        """The locked file; None where it was taken away in between, and all begins anew."""
+        """The locked file; None where it was deleted in between: then try again."""
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         locked = False
         try:
@@ -86,7 +88,7 @@ class Lock:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 locked = True
             except BlockingIOError:
-                raise InputError(self._taken(_read(self.path))) from None
+                raise InputError(self._in_use(_read(self.path))) from None
             except OSError:
                 pass  # a file system without locks: the name decides
             if not os.path.exists(self.path) or not os.path.samestat(os.stat(self.path), os.fstat(file)):
@@ -94,7 +96,7 @@ class Lock:
                 return None
             known = _read(self.path)
             if known is not None and not known.is_gone() and not (locked and known.host == platform.node()):
-                raise InputError(self._taken(known))
+                raise InputError(self._in_use(known))
             me = Holder(os.getpid(), platform.node(), _started(os.getpid()))
             os.ftruncate(file, 0)
             os.pwrite(file, (json.dumps(asdict(me)) + "\n").encode(), 0)
@@ -104,7 +106,7 @@ class Lock:
                 os.close(file)
             raise
 
-    def _taken(self, holder: Holder | None) -> str:
+    def _in_use(self, holder: Holder | None) -> str:
         who = "another process" if holder is None else str(holder)
         elsewhere = holder is not None and holder.host != platform.node()
         hint = f"; if that is no more, delete {self.path}" if elsewhere else ""
@@ -113,13 +115,13 @@ class Lock:
 
 def holder(folder: Path) -> Holder | None:
     """The process that holds a run folder, as far as can be told without asking for it; None where none does, or it has ended."""
-    found = _read(folder / NAME)
+    found = _read(folder / LOCK)
     return None if found is None or found.is_gone() else found
 
 
 def _read(path: Path) -> Holder | None:
     try:
-        given = files.parse_json(files.read_bytes(path, 1 << 12), str(path))
+        given = bounded_files.parse_json(bounded_files.read_bytes(path, _LARGEST), str(path))
         match given:
             case {"pid": int(pid), "host": str(host), "started": str(started)} if 0 < pid < 1 << 31:
                 return Holder(pid, host[:200], started)
@@ -139,8 +141,8 @@ def _started(pid: int) -> str:
         if Path("/proc/self/stat").exists():
             return ""
     with contextlib.suppress(OSError):
-        told = subprocess.run(
+        answer = subprocess.run(
             ["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False, env={"LC_ALL": "C"}
         )
-        return told.stdout.strip()
+        return answer.stdout.strip()
     return ""

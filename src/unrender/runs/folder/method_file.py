@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Stric
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
-from unrender.io import files, toml_lines
+from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
 from unrender.runs.run import Run
 
@@ -76,7 +76,7 @@ def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int 
 
 def read(path: Path) -> Method:
     """Raises `InputError` that names the field."""
-    found = toml_lines.parse(files.read_text(path, _LONGEST), str(path))
+    found = toml_lines.parse(bounded_files.read_text(path, _LONGEST, path.parent), str(path))
     try:
         return Method.model_validate(found)
     except pydantic.ValidationError as error:

@@ -8,59 +8,82 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from unrender.io import files
 from unrender.core.errors import InputError
+from unrender.io import files
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
+from unrender.runs.final_images import render_pictures
 from unrender.runs.folder import checkpoint
 from unrender.runs.folder.history import HistoryFile
 from unrender.runs.folder.lock import Lock
-from unrender.runs.result import Result, deciding_versions
-from unrender.runs.folder.state import pack
-
-METHOD, RECORD, HISTORY = "method.toml", "run.json", "history.jsonl"
-_OF_A_RUN = (
-    *(RECORD, HISTORY, METHOD, serialization.FILE, "parameters.npz", "initial.npz", "truth.npz", "pictures.npz"),
-    *("report.html", "control.json"),
+from unrender.runs.folder.schema import (
+    CONTROL,
+    HISTORY,
+    INITIAL,
+    LIVE,
+    METHOD,
+    PARAMETERS,
+    PICTURES,
+    RECORD,
+    REPORT,
+    TRUTH,
 )
-_EVERY, _AT_LEAST_EVERY = 50, 60.0
+from unrender.runs.folder.state import pack
+from unrender.runs.hooks import Hook
+from unrender.runs.result import Result, deciding_versions
+
+if TYPE_CHECKING:
+    from unrender.runs.loop import Descent
+
+__all__ = ["RunWriter"]
+
+_FILES = (
+    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES),
+    *(REPORT, CONTROL),
+)
+_STEPS, _MOST_SECONDS = 50, 60.0
 _SHARE = 1 / 50
-_WATCH_SECONDS = 1.0
+_CHECK_SECONDS = 1.0
 
 _log = logging.getLogger("unrender")
 
 
 @dataclass
-class RunWriter:
-    """Writes a run folder. What goes wrong on the way is said once and does not end the run; at the end it raises.
+class RunWriter(Hook):
+    """Writes a run folder: the history at every step, checkpoints, and the result with final pictures.
+
+    What goes wrong on the way is a warning, once, and does not end the run; at the end it raises. As a context manager it holds the
+    folder's lock; `start` or `resume` must follow before the descent.
 
     Args:
         folder: where.
         problem: what is run.
         method: method.toml, see `method_file`.
-        every: steps between checkpoints; None for 50 or so: fewer than 50 where they take over a minute, more where writing would cost
-            more than a fiftieth of the run's time.
-        complain: hears each thing that goes wrong, one line.
+        checkpoint_every: steps between checkpoints; None for 50 or so: fewer than 50 where they take over a minute, more where writing
+            would cost more than a fiftieth of the run's time.
+        final_spp: samples per pixel of the final pictures; None chooses.
+        warn: called with each thing that goes wrong, one line.
     """
 
     folder: Path
     problem: Problem
     method: Mapping[str, Any]
-    every: int | None = None
-    complain: Callable[[str], None] = lambda line: None
+    checkpoint_every: int | None = None
+    final_spp: int | None = None
+    warn: Callable[[str], None] = lambda line: None
     _lock: Lock = field(init=False)
     _history: HistoryFile = field(init=False)
-    _said: set[str] = field(default_factory=set)
-    _begun: bool = False
-    _lost: bool = False
-    _soon: bool = False
-    _watched: float = 0.0
+    _warned: set[str] = field(default_factory=set)
+    _started: bool = False
+    _taken_over: bool = False
+    _checkpoint_at_once: bool = False
+    _checked_at: float = 0.0
     _written_step: int = -1
     _written_at: float = field(default_factory=time.perf_counter)
     _cost: float = 0.0
@@ -71,124 +94,145 @@ class RunWriter:
 
     # ------------------------------------------------------------------ from start to end
 
-    def take(self) -> None:
-        """Hold the folder, made where there is none. Raises `InputError` where another process holds it, or it cannot be written."""
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"run folder {self.folder}: {error.strerror or error}") from error
-        self._lock.take()
+    def __enter__(self) -> RunWriter:
+        """Lock the folder, made where there is none. Raises `InputError` where another process holds it, or it cannot be written."""
+        self._acquire()
+        return self
 
-    def begin(self, result: Result) -> None:
+    def __exit__(self, *_: object) -> None:
+        self._history.close()
+        self._lock.release()
+
+    def start(self, result: Result) -> None:
         """Write what a new run starts with, in place of what an earlier one left. Raises `InputError` where that cannot be."""
         try:
             if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
                 _clear(self.folder)
             self._write_start(result)
-            self._begun = True
+            self._started = True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
-        """Take up a run that has come as far as `records`: the history is cut there. Raises `InputError` where that cannot be."""
+        """Go on after `records`, with which the history is rewritten. Raises `InputError` where that cannot be."""
         try:
-            checkpoint.sweep(self.folder)
-            self._history.cut(records)
-            files.write(self.folder / METHOD, method_text(self.method))
+            checkpoint.remove_partial(self.folder)
+            self._history.rewrite(records)
+            files.write(self.folder / METHOD, _method_text(self.method))
             self._write_record(result, "running")
-            self._written_step, self._begun = len(records), True
+            self._written_step, self._started = len(records), True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
-    def step(self, record: Mapping[str, Any]) -> None:
-        """Take down one step."""
+    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+        """Append the step to the history; write a checkpoint where one is due."""
+        self.append(record)
+        if self.checkpoint_due(descent.run.step):
+            self.write_checkpoint(descent)
+
+    def on_result(self, descent: Descent, result: Result) -> Result:
+        """Write the last checkpoint and the result, render the final pictures, and write the result with them."""
+        self.write_checkpoint(descent, result)
+        self._save(result, "running")  # what took long is safe before what takes seconds more
+        result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
+        self._save(result, result.status)
+        return result
+
+    def on_error(self, descent: Descent, error: BaseException) -> None:
+        """Note that the run ended by an exception; nothing where it had not started, or the folder is held by another run."""
+        if not self._started or not self._lock.is_held():
+            return
+        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        message = " ".join(str(error).split())[:300] or type(error).__name__
+        self._guarded("end", lambda: self._write_record(descent.result(), status, message))
+
+    # ------------------------------------------------------------------ the parts of a step
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Append one step to the history."""
         self._guarded("history", lambda: self._history.append(record))
         now = time.perf_counter()
-        if now - self._watched >= _WATCH_SECONDS:
-            self._watched = now
-            self._soon = self._soon or not (self._lost or self._lock.is_ours())
+        if now - self._checked_at >= _CHECK_SECONDS:
+            self._checked_at = now
+            self._checkpoint_at_once |= not (self._taken_over or self._lock.is_held())
 
-    def is_due(self, step: int) -> bool:
+    def checkpoint_due(self, step: int) -> bool:
         """Whether to write a checkpoint now."""
-        if self._soon:
+        if self._checkpoint_at_once:
             return True
-        if self.every is not None:
-            return step % self.every == 0
+        if self.checkpoint_every is not None:
+            return step % self.checkpoint_every == 0
         since = time.perf_counter() - self._written_at
-        return (step % _EVERY == 0 or since >= _AT_LEAST_EVERY) and since * _SHARE >= self._cost
+        return (step % _STEPS == 0 or since >= _MOST_SECONDS) and since * _SHARE >= self._cost
 
-    def checkpoint(self, result: Result, seed: int, state: Any) -> None:
-        """Write one of the state after `result.steps` steps, and what has been reached so far."""
-        if result.steps == self._written_step and not self._soon:
+    def write_checkpoint(self, descent: Descent, result: Result | None = None) -> None:
+        """Write a checkpoint after the last step, and `result`, by default what has been reached so far; once per step."""
+        result = result or descent.result()
+        if result.steps == self._written_step and not self._checkpoint_at_once:
             return
+        state = descent.snapshot()
         started = time.perf_counter()
-        self._soon = False
-        self._guarded("checkpoint", lambda: self._write_checkpoint(result, seed, state))
+        self._checkpoint_at_once = False
+        self._guarded("checkpoint", lambda: self._write_checkpoint(result, descent.run.seed, state))
         self._written_at = time.perf_counter()
         self._cost = self._written_at - started
 
-    def save(self, result: Result, status: str) -> None:
+    # ------------------------------------------------------------------ the writing
+
+    def _acquire(self) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"run folder {self.folder}: {error.strerror or error}") from error
+        self._lock.acquire()
+
+    def _save(self, result: Result, status: str) -> None:
         """Write the result. Raises `InputError` where it cannot be written."""
-        self._stand_fast(result)
-        if self._lost:
+        self._restore_folder(result)
+        if self._taken_over:
             raise InputError(f"run folder {self.folder}: another run has taken its place; the result is not saved")
         result.save(self.folder, status)
 
-    def fail(self, result: Result, error: BaseException) -> None:
-        """Note that the run ended by an exception; nothing where it had not begun, or the folder is no longer ours."""
-        if not self._begun or not self._lock.is_ours():
-            return
-        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        serialize = " ".join(str(error).split())[:300] or type(error).__name__
-        self._guarded("end", lambda: self._write_record(result, status, serialize))
-
-    def close(self) -> None:
-        """Let the folder go."""
-        self._history.close()
-        self._lock.release()
-
-    # ------------------------------------------------------------------ the writing
-
     def _write_start(self, result: Result) -> None:
         serialization.save(self.problem, self.folder)
-        files.write(self.folder / METHOD, method_text(self.method))
-        files.write_arrays(self.folder / "initial.npz", result.initial)
+        files.write(self.folder / METHOD, _method_text(self.method))
+        files.write_arrays(self.folder / INITIAL, result.initial)
         if result.truth:
-            files.write_arrays(self.folder / "truth.npz", result.truth)
-        files.write_arrays(self.folder / "parameters.npz", result.parameters)
-        self._history.cut(result.history)
+            files.write_arrays(self.folder / TRUTH, result.truth)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters)
+        self._history.rewrite(result.history)
         self._write_record(result, "running")
 
     def _write_record(self, result: Result, status: str, error: str = "") -> None:
-        text = json.dumps(result.record(status) | ({"error": error} if error else {}), indent=2) + "\n"
+        text = json.dumps(result.record(status, error), indent=2) + "\n"
         files.write(self.folder / RECORD, text.encode())
 
     def _write_checkpoint(self, result: Result, seed: int, state: Any) -> None:
-        self._stand_fast(result)
-        if self._lost:
+        self._restore_folder(result)
+        if self._taken_over:
             return
         self._history.sync()
         problem = result.problem["fingerprint"]
         checkpoint.write(self.folder, result.steps, seed, pack(state), deciding_versions(), problem)
-        files.write_arrays(self.folder / "parameters.npz", result.parameters, compress=False)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False)
         self._write_record(result, "running")
         self._written_step = result.steps
 
-    def _stand_fast(self, result: Result) -> None:
-        """See that the folder is still there and ours; make it again where it was deleted."""
-        if self._lost or self._lock.is_ours():
+    def _restore_folder(self, result: Result) -> None:
+        """See that the folder is still there and locked; make it again where it was deleted."""
+        if self._taken_over or self._lock.is_held():
             return
         if self._lock.path.exists():
-            self._lost = True
-            self._say(
+            self._taken_over = True
+            self._warn_once(
                 f"run folder {self.folder}: deleted, and another run has taken its place; nothing more is written"
             )
             return
         self._history.close()
         self._lock.release()
-        self.take()
+        self._acquire()
         self._write_start(result)
-        self._say(
+        self._warn_once(
             f"run folder {self.folder}: deleted while the run goes; it was made again, without the earlier checkpoints"
         )
 
@@ -196,28 +240,28 @@ class RunWriter:
         try:
             write()
         except (OSError, InputError, TypeError) as error:
-            serialize = (error.strerror if isinstance(error, OSError) else "") or str(error)
-            self._say(f"run folder {self.folder}: {what} not written: {serialize}; the run goes on", f"{what} {serialize[-60:]}")
+            reason = (error.strerror if isinstance(error, OSError) else "") or str(error)
+            line = f"run folder {self.folder}: {what} not written: {reason}; the run goes on"
+            self._warn_once(line, f"{what} {reason[-60:]}")
 
-    def _say(self, line: str, once: str = "") -> None:
-        if (once or line) not in self._said:
-            self._said.add(once or line)
-            self.complain(line)
+    def _warn_once(self, line: str, topic: str = "") -> None:
+        if (topic or line) not in self._warned:
+            self._warned.add(topic or line)
+            self.warn(line)
             _log.warning(line)
 
 
-def method_text(method: Mapping[str, Any]) -> bytes:
-    """method.toml."""
+def _method_text(method: Mapping[str, Any]) -> bytes:
     return ("# The run: its method, budget and seed\n" + tomli_w.dumps(dict(method))).encode()
 
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left, and nothing else."""
-    for name in _OF_A_RUN:
+    for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     checkpoint.clear(folder)
-    checkpoint.sweep(folder)
-    for name in (serialization.ARRAYS, "live"):
+    checkpoint.remove_partial(folder)
+    for name in (serialization.ARRAYS, LIVE):
         place = folder / name
         if place.is_dir() and not place.is_symlink() and not os.path.ismount(place):
             shutil.rmtree(place, ignore_errors=True)

@@ -7,45 +7,23 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
-from unrender.runs.folder.history_reader import History, Reader
+from unrender.runs.folder import schema
+from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.reader import RunFolder, ViewPictures, pictures_by_view, read, read_record
-from unrender.runs.live import FOLDER
+from unrender.runs.folder.schema import HISTORY, LIVE, LIVE_STATUS, RECORD, LiveStatus
 
-_FILES = ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz")
-_LIVE_FILES = ("status.json", "start.npz", "views.npz", *_FILES)
-_Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Count = Annotated[int, Field(ge=0, lt=2**63)]
+_FILES = (RECORD, HISTORY, schema.PARAMETERS, schema.INITIAL, schema.TRUTH, schema.PICTURES)
+_LIVE_FILES = (LIVE_STATUS, schema.LIVE_START, schema.LIVE_VIEWS, *_FILES)
 
 WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"
 FINISHED, LOST, VANISHED = "finished", "lost", "vanished"
-"""What a run may be doing. Lost: its process ended without a word."""
-
-
-class Status(BaseModel):
-    """live/status.json. Fields beyond these are ignored."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    status: str
-    stopped: str = ""
-    step: _Count = 0
-    steps: _Count | None = None
-    seconds: _Number = 0.0
-    budget_seconds: _Number | None = None
-    skipped: _Count = 0
-    warnings: list[str] = []
-    control: str = "run"
-    process: Annotated[int, Field(gt=0, lt=2**31)] | None = None
-    host: str = ""
-    initial_error: dict[str, float] = {}
-    shapes: dict[str, list[_Count]] = {}
+"""States of a run. Lost: its process ended before the run did."""
 
 
 @dataclass(frozen=True)
@@ -63,45 +41,45 @@ class Snapshot:
     path: Path
     state: str
     run: RunFolder | None = None
-    status: Status | None = None
+    status: LiveStatus | None = None
     problems: tuple[str, ...] = ()
 
     @property
-    def listens(self) -> bool:
-        """Whether commands reach it."""
+    def accepts_commands(self) -> bool:
+        """Whether the run reads commands."""
         return self.state in (RUNNING, PAUSED)
 
 
-class Source:
+class RunMonitor:
     """Follows a run folder. Nothing in it is trusted, nothing of it is required.
 
     Attributes:
         path: the folder.
-        revision: how often something new was seen.
+        revision: how often a change was found.
     """
 
     def __init__(self, path: Path):
         self.path = path
-        self._seen: tuple = ()
+        self._last_stamps: tuple = ()
         self._last = Snapshot(path, WAITING)
-        self._histories: dict[Path, Reader] = {}
+        self._histories: dict[Path, HistoryReader] = {}
         self.revision = 0
 
     def snapshot(self) -> Snapshot:
         """What is there now; the same object as before where nothing has changed. Never raises for what is in the folder."""
         stamps = self._stamps()
-        if stamps != self._seen:
-            found = self._look()
+        if stamps != self._last_stamps:
+            found = self._read()
             if found.run is None and self._last.run is not None and found.state in (VANISHED, WAITING):
                 found = Snapshot(self.path, VANISHED, self._last.run, self._last.status, found.problems)
-            self._seen, self._last = stamps, found
+            self._last_stamps, self._last = stamps, found
             self.revision += 1
         return self._last
 
     def _stamps(self) -> tuple:
-        """Of every file that is read, and of whether the run's process lives."""
+        """Change times, sizes and inodes of every file that is read, and whether the run's process lives."""
         found: list[Any] = []
-        for path in [self.path / name for name in _FILES] + [self.path / FOLDER / name for name in _LIVE_FILES]:
+        for path in [self.path / name for name in _FILES] + [self.path / LIVE / name for name in _LIVE_FILES]:
             try:
                 status = os.stat(path, follow_symlinks=False)
                 found.append((status.st_mtime_ns, status.st_size, status.st_ino))
@@ -110,44 +88,34 @@ class Source:
         status = self._last.status
         return (self.path.is_dir(), status is not None and _alive(status), *found)
 
-    def _look(self) -> Snapshot:
+    def _read(self) -> Snapshot:
         if not self.path.is_dir():
             return Snapshot(self.path, VANISHED)
         problems: list[str] = []
         status = self._try(problems, self._status)
-        if status is not None and (
-            status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / "run.json")
-        ):
+        if status is not None and (status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / RECORD)):
             run = self._try(problems, lambda: self._live(status, problems))
             state = SAVING if status.status not in (RUNNING, PAUSED) else status.status
             return Snapshot(self.path, state if _alive(status) else LOST, run, status, tuple(problems))
-        if status is None and not bounded_files.exists(self.path / "run.json"):
+        if status is None and not bounded_files.exists(self.path / RECORD):
             return Snapshot(self.path, WAITING, problems=tuple(problems))
         run = self._try(problems, lambda: read(self.path))
         if run is None and status is not None:
             run = self._try(problems, lambda: self._live(status, problems))
         return Snapshot(self.path, FINISHED if run is not None else WAITING, run, status, tuple(problems))
 
-    def _status(self) -> Status | None:
-        path = self.path / FOLDER / "status.json"
+    def _status(self) -> LiveStatus | None:
+        path = self.path / LIVE / LIVE_STATUS
         if not bounded_files.exists(path):
             return None
-        found = bounded_files.parse(bounded_files.text(path, self.path), str(path))
-        try:
-            return Status.model_validate(found)
-        except ValidationError as error:
-            first = error.errors()[0]
-            name = bounded_files.shown(".".join(str(part) for part in first["loc"]))
-            raise InputError(
-                f"{path}: {name}: {first['msg']}, got {bounded_files.shown(repr(first['input']))}"
-            ) from error
+        return schema.validate(LiveStatus, bounded_files.read_object(path, self.path), str(path))
 
-    def _live(self, status: Status, problems: list[str]) -> RunFolder:
-        """A run that goes on, from live/. What is missing is left out; what cannot be read is told in `problems`."""
-        live = self.path / FOLDER
-        record = read_record(live / "run.json", self.path)
-        told = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
-        record = record.model_copy(update={**told, "skipped": status.skipped, "warnings": status.warnings})
+    def _live(self, status: LiveStatus, problems: list[str]) -> RunFolder:
+        """A run under way, from live/. What is missing is left out; what cannot be read is fields in `problems`."""
+        live = self.path / LIVE
+        record = read_record(live / RECORD, self.path)
+        fields = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
+        record = record.model_copy(update={**fields, "skipped": status.skipped, "warnings": status.warnings})
         parameters, initial, truth, start, views = (
             self._arrays(live / f"{name}.npz", problems)
             for name in ("parameters", "initial", "truth", "start", "views")
@@ -169,15 +137,15 @@ class Source:
 
     def _history(self) -> History | None:
         """The one that grows: in live/ where there is one, else the folder's own."""
-        for path in (self.path / FOLDER / "history.jsonl", self.path / "history.jsonl"):
+        for path in (self.path / LIVE / HISTORY, self.path / HISTORY):
             if bounded_files.exists(path):
-                return self._histories.setdefault(path, Reader(path, self.path)).read(to_the_end=False)
+                return self._histories.setdefault(path, HistoryReader(path, self.path)).read(to_the_end=False)
         return None
 
     def _arrays(self, path: Path, problems: list[str]) -> dict[str, np.ndarray]:
         if not bounded_files.exists(path):
             return {}
-        return self._try(problems, lambda: bounded_files.arrays(path, self.path)) or {}
+        return self._try(problems, lambda: bounded_files.read_float_arrays(path, self.path)) or {}
 
     def _try(self, problems: list[str], function: Callable[[], Any]) -> Any:
         """What `function` returns; None, and a line in `problems`, where what it reads is malformed."""
@@ -186,7 +154,7 @@ class Source:
         except InputError as error:
             problems.append(str(error))
         except FileNotFoundError:
-            pass  # replaced or removed while it was read: the next look will tell
+            pass  # replaced or removed while it was read: the next snapshot will show
         except OSError as error:
             problems.append(f"{self.path}: cannot be read: {error.strerror or error}")
         return None
@@ -209,7 +177,7 @@ def _views(start: dict[str, np.ndarray], now: dict[str, np.ndarray], where: Path
     return pictures_by_view(found, where / "views.npz")
 
 
-def _alive(status: Status) -> bool:
+def _alive(status: LiveStatus) -> bool:
     """Whether the run's process lives, as far as this machine can tell."""
     if status.process is None or status.host != platform.node():
         return True

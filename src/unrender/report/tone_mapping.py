@@ -18,26 +18,26 @@ _LARGEST = 1024
 _PIXELATED_BELOW = 400
 
 __all__ = [
-    "ERRORS",
+    "ERROR_COLORMAP",
     "INLINE",
-    "VALUES",
+    "VALUE_COLORMAP",
     "ColourBar",
-    "Drawing",
-    "Painter",
     "Picture",
+    "PictureData",
+    "PictureEncoder",
     "absolute_error",
+    "apply_colormap",
     "colour_bar",
+    "colour_limit",
     "error_bar",
     "exposure",
     "inline",
-    "mapped",
     "srgb",
-    "top",
 ]
 
-ERRORS = "inferno"
+ERROR_COLORMAP = "inferno"
 """Colour map of error images."""
-VALUES = "viridis"
+VALUE_COLORMAP = "viridis"
 """Colour map of weights and of one-channel parameters."""
 
 
@@ -65,7 +65,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class PictureData:
     """What a picture shows, not yet encoded.
 
     Attributes:
@@ -93,7 +93,7 @@ class Drawing:
         if self.map:
             shown = np.sqrt(np.maximum(shown, 0.0)) if self.root else shown
             high = np.sqrt(self.high) if self.root else self.high
-            colours = mapped(shown, self.low, high, self.map)
+            colours = apply_colormap(shown, self.low, high, self.map)
         else:
             with np.errstate(over="ignore"):
                 colours = srgb(shown * (self.factor * exposure))
@@ -102,39 +102,39 @@ class Drawing:
         return buffer.getvalue()
 
 
-def inline(drawing: Drawing) -> str:
-    """The drawing as a data URI, for a page that is complete in itself."""
-    return f"data:image/png;base64,{base64.b64encode(drawing.png()).decode('ascii')}"
+def inline(picture: PictureData) -> str:
+    """The picture as a data URI, for a page that is complete in itself."""
+    return f"data:image/png;base64,{base64.b64encode(picture.png()).decode('ascii')}"
 
 
 @dataclass(frozen=True)
-class Painter:
+class PictureEncoder:
     """Makes pictures for a page.
 
     Attributes:
-        source: what an `img` element takes for a drawing: the data itself (`inline`), or where it is served.
+        source: what an `img` element takes for a picture: the data itself (`inline`), or where it is served.
     """
 
-    source: Callable[[Drawing], str] = field(default=inline)
+    source: Callable[[PictureData], str] = field(default=inline)
 
     def colour(self, linear: np.ndarray, factor: float, alt: str) -> Picture:
         """(H, W, 3) linear RGB, times the exposure `factor`, in sRGB."""
-        return self._picture(Drawing(linear, factor), alt)
+        return self._picture(PictureData(linear, factor), alt)
 
     def false_colour(self, values: np.ndarray, low: float, high: float, name: str, alt: str) -> Picture:
         """(H, W) values from `low` to `high` in the colours of the map `name`."""
-        return self._picture(Drawing(values, 1.0, low, high, name), alt)
+        return self._picture(PictureData(values, 1.0, low, high, name), alt)
 
     def error(self, error: np.ndarray, high: float, alt: str) -> Picture:
         """(H, W) errors from 0 to `high`, the colour by the square root, so that a tenth of `high` is still seen."""
-        return self._picture(Drawing(error, 1.0, 0.0, high, ERRORS, True), alt)
+        return self._picture(PictureData(error, 1.0, 0.0, high, ERROR_COLORMAP, True), alt)
 
-    def _picture(self, drawing: Drawing, alt: str) -> Picture:
-        height, width = drawing.values.shape[:2]
-        return Picture(self.source(drawing), width, height, alt, not drawing.map)
+    def _picture(self, picture: PictureData, alt: str) -> Picture:
+        height, width = picture.values.shape[:2]
+        return Picture(self.source(picture), width, height, alt, not picture.map)
 
 
-INLINE = Painter()
+INLINE = PictureEncoder()
 """Makes pictures that are part of the page."""
 
 
@@ -155,7 +155,7 @@ class ColourBar:
     label: str
 
 
-def mapped(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
+def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
     """Values from `low` to `high` through the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
     span = high - low
     place = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (span if span > 0 else 1.0)
@@ -163,12 +163,12 @@ def mapped(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray
 
 
 def error_bar(high: float) -> ColourBar:
-    """The legend of `Painter.error`."""
-    return replace(colour_bar(0.0, high, ERRORS, "Mean |difference| over channels"), middle=high / 4)
+    """The legend of `PictureEncoder.error`."""
+    return replace(colour_bar(0.0, high, ERROR_COLORMAP, "Mean |difference| over channels"), middle=high / 4)
 
 
 def colour_bar(low: float, high: float, name: str, label: str) -> ColourBar:
-    """The legend of `Painter.false_colour` with the same arguments."""
+    """The legend of `PictureEncoder.false_colour` with the same arguments."""
     stops = (matplotlib.colormaps[name](np.linspace(0.0, 1.0, 9))[:, :3] * 255 + 0.5).astype(int)
     return ColourBar(tuple(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops), low, (low + high) / 2, high, label)
 
@@ -179,7 +179,7 @@ def absolute_error(shown: np.ndarray, reference: np.ndarray) -> np.ndarray:
         return np.mean(np.abs(shown - reference), axis=-1)
 
 
-def top(error: np.ndarray) -> float:
+def colour_limit(error: np.ndarray) -> float:
     """The end of an error's colour scale: its 99th percentile (its maximum where that is 0)."""
     finite = error[np.isfinite(error)]
     if finite.size == 0:

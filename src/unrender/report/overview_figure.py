@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from unrender.report import images, panels, plots, words
+from unrender.report import formatting, panels, plots, tone_mapping
 from unrender.report.curves import Band
 from unrender.report.equal_time import Comparison, Metric
 
@@ -20,7 +20,7 @@ _WIDTH = 10.0
 _CURVES_HEIGHT = 3.4
 
 
-def poster(comparison: Comparison) -> bytes:
+def overview_figure(comparison: Comparison) -> bytes:
     """A PNG on white ground: a row of pictures, a row of maps (where there are any), a row of curves."""
     rows = [row[:_COLUMNS] for row in (_pictures(comparison), _maps(comparison)) if row]
     heights = [_WIDTH / len(row) * row[0][1].shape[0] / row[0][1].shape[1] + 0.3 for row in rows] + [_CURVES_HEIGHT]
@@ -49,31 +49,31 @@ def poster(comparison: Comparison) -> bytes:
 
 
 def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
-    first = next(iter(comparison.chosen.values()))
+    first = next(iter(comparison.representatives.values()))
     if not first.views:
         return []
     view, of = next(iter(first.views.items()))
-    factor = images.exposure(of.reference)
+    factor = tone_mapping.exposure(of.reference)
     found = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
-    found += [(label, run.views[view].result) for label, run in comparison.chosen.items()]
-    return [(title, images.srgb(picture * factor)) for title, picture in found]
+    found += [(label, run.views[view].result) for label, run in comparison.representatives.items()]
+    return [(title, tone_mapping.srgb(picture * factor)) for title, picture in found]
 
 
 def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
-    first = next(iter(comparison.chosen.values()))
+    first = next(iter(comparison.representatives.values()))
     key = next((key for key, truth in first.truth.items() if panels.is_map(truth)), None)
     if key is None:
         return []
     found = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
-    found += [(label, run.parameters[key]) for label, run in comparison.chosen.items()]
-    show = panels.Scale(first.truth[key])
+    found += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
+    show = panels.ColourScale(first.truth[key])
     return [(title, show.colours(plane)) for title, array in found if (plane := panels.plane(array)) is not None]
 
 
-def _draw(axes: Axes, metric: Metric, over: str) -> None:
+def _draw(axes: Axes, metric: Metric, axis: str) -> None:
     drawn = []
-    for i, (name, standing) in enumerate(metric.standings.items()):
-        band: Band = getattr(standing, f"over_{over}")
+    for i, (name, outcome) in enumerate(metric.methods.items()):
+        band: Band = getattr(outcome, f"over_{axis}")
         finite = np.where(np.isfinite(band.median), band.median, np.nan)
         high = np.where(np.isfinite(band.high), band.high, finite)
         colour = _COLOURS[i % len(_COLOURS)]
@@ -86,9 +86,9 @@ def _draw(axes: Axes, metric: Metric, over: str) -> None:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: words.number(value)))
-    label, mark = plots.over(over)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: mark(value)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: formatting.number(value)))
+    label, format_value = plots.axis_format(axis)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: format_value(value)))
     axes.set_xlim(left=0.0)
     axes.set_xlabel(label, fontsize=9)
     axes.tick_params(labelsize=8)

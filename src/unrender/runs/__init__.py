@@ -1,0 +1,1 @@
+"""The descent, its callbacks, and how a run is resumed."""

@@ -1,0 +1,129 @@
+"""`unrender.optimize` and `unrender.estimate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.estimators.base import Estimate, Estimator, as_numpy
+from unrender.optimizers.base import Optimizer
+from unrender.problem.problem import Problem
+from unrender.problem.render import as_tree
+from unrender.problem.serialization import origin
+from unrender.runs.budget import Budget, check_budget
+from unrender.runs.callbacks import Callback
+from unrender.runs.folder import method_file
+from unrender.runs.folder.writer import RunWriter
+from unrender.runs.hooks import CallbackHook, Hook
+from unrender.runs.influence import InfluenceWatch
+from unrender.runs.loop import Descent, descend, prepare
+from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
+from unrender.runs.refinement import Refinement
+from unrender.runs.result import Result
+from unrender.runs.run import Run
+
+__all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
+
+
+def optimize(
+    problem: Problem,
+    estimator: Estimator,
+    optimizer: Optimizer,
+    steps: int | None = None,
+    seconds: float | None = None,
+    seed: int = 0,
+    callbacks: Sequence[Callback] = (),
+    run_directory: str | Path | None = None,
+    checkpoint_every: int | None = None,
+    annotations: RunAnnotations | None = None,
+) -> Result:
+    """Recover the problem's parameters by descent.
+
+    Args:
+        problem: what to recover, from which images.
+        estimator: where gradients come from.
+        optimizer: what becomes of them.
+        steps: how many steps at most, >= 1.
+        seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
+        seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
+            threads add to a gradient in the order they finish, and results agree to rounding.
+        callbacks: listeners.
+        run_directory: the run folder: history and checkpoints as the run goes, the result with final pictures of every view at its end; in
+            place of an earlier run's. `resume` continues a run that ended early. None for no run folder.
+        checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a fiftieth of the time. There
+            is one at the end, too.
+        annotations: what else the run folder should say.
+
+    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. A step whose loss or
+    gradient is not finite is not applied, nor remembered by the estimator; it is counted in `Result.skipped`.
+
+    What goes wrong with the run folder while the run goes is a line among the warnings (and in the log), and the run goes on.
+
+    Raises:
+        InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
+            cannot be begun, or cannot be written in the end.
+    """
+    check(estimator, optimizer, steps, seconds)
+    if checkpoint_every is not None:
+        checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
+    annotations = annotations or RunAnnotations()
+    run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
+    log = RunMetadata(describe_run(run, annotations), run.full())
+    if run_directory is None:
+        return descend(Descent(run, state, log, assemble_hooks(callbacks)))
+    run.folder = Path(run_directory)
+    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
+    with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
+        writer.start(log.result(run))
+        return descend(Descent(run, state, log, assemble_hooks(callbacks, writer)))
+
+
+def assemble_hooks(callbacks: Sequence[Callback], *folder: Hook) -> list[Hook]:
+    """What takes part in every run, then what keeps its run folder, then the user's callbacks."""
+    return [InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
+
+
+def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:
+    """The writer of a run's folder, to be used as a context manager. What goes wrong with the folder goes to the run's warnings."""
+    table = method_file.serialize(run, method, checkpoint_every, final_spp)
+    # By a closure: resuming replaces the list of warnings.
+    return RunWriter(folder, run.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line))
+
+
+def estimate(
+    problem: Problem, estimator: Estimator, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
+) -> Estimate:
+    """One estimate from a fresh state, its arrays as NumPy: to look at a gradient.
+
+    Args:
+        problem: what to recover.
+        estimator: where gradients come from.
+        parameters: {key: array} for all parameters of the problem, or None for the initial ones.
+        seed: of its random numbers.
+    """
+    point = as_tree(problem, parameters)
+    state = estimator.init(problem, point)
+    found, _ = estimator.estimate(problem, point, state, Key(seed))
+    return replace(as_numpy(found), info=to_numpy(found.info))
+
+
+def check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:
+    """Raise `InputError` where the optimizer requires what the estimator does not provide, or the budget makes no sense."""
+    missing = optimizer.requires - estimator.provides
+    if missing:
+        raise InputError(
+            f"{type(optimizer).__name__} requires {_list(missing)}, which {describe(estimator)} does not provide "
+            f"(it provides {_list(estimator.provides)}); choose an estimator that does, or an optimizer that requires "
+            "the gradient alone, such as Adam"
+        )
+    check_budget(steps, seconds)
+
+
+def _list(names: Set[str]) -> str:
+    return ", ".join(f'"{name}"' for name in sorted(names)) or "nothing"
