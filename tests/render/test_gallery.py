@@ -11,8 +11,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
-from unrender.gallery import specification
-from unrender.gallery import boxes, mesh_files, meshes, textures
+from unrender.gallery import boxes, mesh_files, meshes, specification, textures
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.numpy.quadratic import QuadraticRenderer
 from unrender.rendering.renderer import SampleRequest

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from kernels import recorded
 
 import unrender as ur
+from kernels import recorded
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_pair import from_tensor, to_tensor
 from unrender.rendering.renderer import SampleRequest
