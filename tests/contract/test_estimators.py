@@ -13,6 +13,7 @@ from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
+from tiers import slow
 from unrender.core.random import Key
 from unrender.images.base import ImageEstimate
 from unrender.problem.batches import WholeView
@@ -98,7 +99,44 @@ FITTING = [
 ]
 
 
+def in_turn() -> list[tuple[str, str]]:
+    """Of each estimator one whole run in the quick tier, with the optimizer that fits and had the fewest before."""
+    used = dict.fromkeys(OPTIMIZERS, 0)
+    found = []
+    for name in ESTIMATORS:
+        fitting = [optimizer for estimator, optimizer in FITTING if estimator == name]
+        if fitting:
+            chosen = min(fitting, key=used.__getitem__)
+            used[chosen] += 1
+            found.append((name, chosen))
+    return found
+
+
+IN_TURN = in_turn()
+
+
+def test_every_optimizer_has_its_turn() -> None:
+    assert {optimizer for _, optimizer in IN_TURN} == set(OPTIMIZERS)
+
+
 @pytest.mark.parametrize(("estimator", "optimizer"), FITTING)
+def test_a_few_steps_of_every_pair(estimator: str, optimizer: str) -> None:
+    """What they hand one another fits: parameters move, stay finite and in their bounds, and equal seeds give equal runs."""
+    found, again = (
+        ur.optimize(problem(views=2), ESTIMATORS[estimator](), OPTIMIZERS[optimizer](), steps=4, seed=5)
+        for _ in range(2)
+    )
+    assert (found.steps, found.stopped, found.skipped, found.warnings) == (4, "steps", 0, [])
+    assert any((value != found.initial[key]).any() for key, value in found.parameters.items())
+    for key, value in found.parameters.items():
+        assert value.shape == found.initial[key].shape
+        assert np.isfinite(value).all()
+        assert (value >= 0).all()
+        assert (value <= 1).all()
+        np.testing.assert_array_equal(value, again.parameters[key])
+
+
+@pytest.mark.parametrize(("estimator", "optimizer"), [pair if pair in IN_TURN else slow(*pair) for pair in FITTING])
 def test_the_truth_is_recovered(estimator: str, optimizer: str) -> None:
     steps = 100 if optimizer in ("Newton", "NewtonCG") else 600
     found = ur.optimize(problem(views=2), ESTIMATORS[estimator](), OPTIMIZERS[optimizer](), steps=steps)

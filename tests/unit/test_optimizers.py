@@ -141,6 +141,7 @@ def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(optimizer, 
     assert not any(kernels_per_step(optimizer, gradients)[3:])
 
 
+@pytest.mark.mitsuba
 def test_a_changing_python_number_would_be_noticed(gradients, monkeypatch):
     """The test above is able to fail: with plain numbers, every step's kernel is a new one."""
     monkeypatch.setattr(arrays, "scalar", lambda value, like: value)
