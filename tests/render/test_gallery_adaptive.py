@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tiers import quick
 from unrender.gallery import skies, two_planets
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -34,7 +35,7 @@ VIEWS = {"mirror-trio": 1, "sun-glossy": 4, "plain-and-textured": 1, "two-planet
 NAMES = list(UNKNOWN)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=quick(NAMES, "sun-glossy"))
 def small(request) -> ur.Problem:
     return ur.gallery.problem(request.param, **SMALL[request.param], reference_spp=SPP)
 
