@@ -1,26 +1,29 @@
 # make demo        recover a scene from images, this library against the plain loop, at equal time; a page with the result
-# make test        lint, types, and every test but the slow ones
-# make test-all    the slow ones too
+# make test        lint, types, and the quick tests: every feature, in a few minutes
+# make test-all    every test
+# make test-slow   the tests that `make test` leaves out
+# make test-unit   the tests that need no Mitsuba alone, in about a minute
 # make lint        lint and types alone
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
 #   PYTHON=python3.12   the interpreter, 3.10 to 3.14
-#   WORKERS=4           test processes, worth it from four cores on
+#   WORKERS=4           test processes; one for each core, at most 4, unless said otherwise
+#   DRJIT_CACHE_DIR=x   the folder that keeps compiled kernels, .pytest_cache/kernels; in an empty one a run takes twice the time
 #   SECONDS=30          of the demo, per method
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all lint clean
+.PHONY: help demo test test-all test-slow test-unit lint clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
 PYTHON ?= $(shell $(FIND_PYTHON))
 BIN := .venv/bin
 SECONDS := 30
-# One test process unless WORKERS says otherwise: two of them on two cores compile many kernels twice, and took 1.4 times the
-# processor time of one. With more cores they pay.
-PYTEST = $(BIN)/python -m pytest -q $(if $(WORKERS),-n $(WORKERS))
+# LLVM compiles a kernel on one core, so a process for each. The tests of a file stay in one process, since they share kernels.
+WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
+PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile
 # What does best on this problem in this time, for each: benchmarks/rcv/fig9_reconstruction.
 TUNED := --set plain.spp=32 --set plain.learning_rate=0.03 --set rcv.spp=4 --set rcv.learning_rate=0.02
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
@@ -37,6 +40,12 @@ test: lint
 
 test-all: lint
 	$(PYTEST)
+
+test-slow: .venv/ready
+	$(PYTEST) -m slow
+
+test-unit: .venv/ready
+	$(PYTEST) -m "not mitsuba and not slow" tests/unit
 
 lint: .venv/ready
 	$(BIN)/ruff check .

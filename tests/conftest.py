@@ -1,8 +1,14 @@
-"""What every test starts from: a Mitsuba variant that works, and the folder of assets where there is one."""
+"""What the tests share: one folder of compiled kernels, a Mitsuba variant for the tests that need it, and the folder of assets.
+
+Tests of `tests/unit` do without Mitsuba: they run in seconds. One of them that needs it says so by `@pytest.mark.mitsuba`; those of the
+other folders have the mark without saying so.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,10 +16,26 @@ import pytest
 from unrender.backend import variant
 from unrender.core.errors import VariantError
 
+HERE = Path(__file__).resolve().parent
+KERNELS = "DRJIT_CACHE_DIR"
+"""Where Dr.Jit keeps compiled kernels on disk; it reads this once, when it is imported."""
+
+# Every process of the run shares one folder, the commands that tests start too. `make clean` empties it.
+os.environ.setdefault(KERNELS, str(HERE.parent / ".pytest_cache" / "kernels"))
+os.makedirs(os.environ[KERNELS], exist_ok=True)
 variant.prepare()  # before any test module imports Dr.Jit
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by mark
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if HERE / "unit" not in item.path.parents:
+            item.add_marker("mitsuba")
+        if item.get_closest_marker("mitsuba") and isinstance(item, pytest.Function):
+            item.fixturenames.insert(0, "mitsuba_variant")
+
+
+@pytest.fixture(scope="session")
 def mitsuba_variant() -> str:
     """The variant of this test session: the CPU's, so that numbers are the same everywhere, or `UNRENDER_VARIANT`."""
     import drjit as dr
@@ -29,12 +51,21 @@ def mitsuba_variant() -> str:
     return name
 
 
+@pytest.fixture(autouse=True)
+def no_mitsuba_unless_marked(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test without the mark must not be the one that imports Mitsuba. Seen where tests with the mark are not collected beside it."""
+    loaded = "mitsuba" in sys.modules
+    yield
+    if not loaded and "mitsuba" in sys.modules and not request.node.get_closest_marker("mitsuba"):
+        pytest.fail("the test imported Mitsuba: mark it with @pytest.mark.mitsuba, or move it to tests/render")
+
+
 @pytest.fixture(scope="session")
 def assets() -> Path:
     """Assets made by others (meshes, environment maps, Mitsuba's tutorial scenes): the folder `UNRENDER_ASSETS`, else
     `shared/assets` beside the repository."""
     given = os.environ.get("UNRENDER_ASSETS")
-    folder = Path(given) if given else Path(__file__).resolve().parents[2] / "shared" / "assets"
+    folder = Path(given) if given else HERE.parents[1] / "shared" / "assets"
     if not folder.is_dir():
         pytest.skip(f"no assets: {folder} is not a folder; set UNRENDER_ASSETS to one")
     return folder

@@ -321,7 +321,7 @@ def test_no_module_is_imported_because_a_file_names_it(tmp_path: Path, monkeypat
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match="is no state"):
         unpack(Packed({"class": "trap.State", "fields": {}}, {}))
-    with pytest.raises(InputError, match="unknown type .trap.State."):
+    with pytest.raises(InputError, match=r'unknown type "trap\.State"'):
         tables.component({"type": "trap.State"})
     assert "trap" not in sys.modules
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_adjoint import STEP, total
-from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
+from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, SUBJECTS, scene, size, spp, subject, two_states
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -22,15 +22,15 @@ def close(a: Any, b: Any, rel: float) -> bool:
     return bool(np.abs(a - b).max() <= rel * np.abs(b).max())
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shared_paths(name: str) -> None:
-    material, changes = MATERIALS[name]
-    renderer = MitsubaRenderer(scene(material()), DEPTH)
-    current, previous = two_states(renderer, {**changes, **LIGHTS})
+    description, changes = subject(name)
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, previous = two_states(renderer, changes)
     session = renderer.prepare(list(current), "path")
-    request = SampleRequest(0, 64, 7)
+    request = SampleRequest(0, spp(name), 7)
     rng = np.random.default_rng(2)
-    weight, weight_previous = rng.uniform(0.5, 1.5, (2, SIZE, SIZE, 3))
+    weight, weight_previous = rng.uniform(0.5, 1.5, (2, size(name), size(name), 3))
     pair = session.image_pair(current, previous, request, "path")
     arrays = renderer.array(weight[None]), renderer.array(weight_previous[None])
     gradient, gradient_previous = session.adjoint_pair(current, previous, pair.paths, *arrays)
@@ -61,14 +61,14 @@ def test_equal_states_have_equal_gradients() -> None:
         assert all(close(a[key], b[key], 1e-4) for key in current), space
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
     """That of the previous scene is what the current one gives at the same parameters and random numbers, to rounding."""
-    material, changes = MATERIALS[name]
-    renderer = MitsubaRenderer(scene(material()), DEPTH)
-    current, previous = two_states(renderer, {**changes, **LIGHTS})
+    description, changes = subject(name)
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, previous = two_states(renderer, changes)
     session = renderer.prepare(list(current), "primary")
-    weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, SIZE, SIZE, 3)))
+    weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, size(name), size(name), 3)))
     request = SampleRequest(0, 8, 5, groups=2)
     pair = session.image_pair(current, previous, request, "primary")
     _, found = session.adjoint_pair(current, previous, pair.paths, weight, weight)
@@ -78,6 +78,7 @@ def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
         assert close(found[key], alone[key], 2e-3), key
 
 
+@pytest.mark.slow
 def test_in_path_space_the_mean_is_the_previous_scene_s_own() -> None:
     """Per parameter, over many seeds, against the ordinary adjoint at the previous state; a planted tenth is seen."""
     material, changes = MATERIALS["rough conductor"]

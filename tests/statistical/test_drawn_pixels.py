@@ -14,6 +14,7 @@ from zoo import scene
 from zscores import z_scores
 
 import unrender as ur
+from tiers import quick
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -72,12 +73,7 @@ def whole() -> tuple[ur.Problem, np.ndarray]:
     return asked, gradients(asked, ur.PathGradient(spp=16), 400)
 
 
-PLAINEST = ("uniform", "loss")  # the contract's tests see these every time, of fewer steps
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in PLAINEST else []) for name in SCHEMES]
-)
+@pytest.mark.parametrize("name", quick(SCHEMES, "adaptive"))
 def test_mini_batches_are_unbiased(name: str, whole: tuple[ur.Problem, np.ndarray]) -> None:
     asked, expected = whole
     rows = gradients(asked, SCHEMES[name](), RUNS)

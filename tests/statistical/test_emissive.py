@@ -13,6 +13,7 @@ import pytest
 from fog import DARK, KIND, LEVELS, fog, grid, scene
 from test_volume_gradients import limit, own, scores
 
+from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -36,7 +37,7 @@ def before_the_sky(medium: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("depth", [1, 4])
+@pytest.mark.parametrize("depth", quick([1, 4], 4))
 def test_a_constant_glow_is_what_its_closed_form_says(depth: int) -> None:
     """e (1 - exp(-2 σ)) + sky exp(-2 σ), whatever the depth: emission is seen directly."""
     extinction, emission = 0.6, np.array([1.5, 0.3, 0.0])
@@ -74,7 +75,7 @@ def seen_through(extinction: np.ndarray, emission: np.ndarray) -> np.ndarray:
     return (found + passed * SKY).mean(axis=0)
 
 
-@pytest.mark.parametrize("voxels", [8, 20])
+@pytest.mark.parametrize("voxels", quick([8, 20], 20))
 def test_slabs_that_glow_are_what_their_closed_form_says(voxels: int) -> None:
     """With one majorant and with a coarse grid of them; alone, and both images of a pair."""
     extinction, emission = slabs(voxels)
@@ -105,6 +106,7 @@ def test_gradients_of_glowing_voxels_agree_with_finite_differences() -> None:
     assert max(map(abs, found.values())) < limit(len(found)), found
 
 
+@pytest.mark.slow
 def test_both_states_of_a_glow_agree_with_separate_renders() -> None:
     rng = np.random.default_rng(4)
     medium = glow(rng.uniform(0, 3, (4, 4, 4, 1)), rng.uniform(0, 2, (4, 4, 4, 3)))

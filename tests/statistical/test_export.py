@@ -12,6 +12,7 @@ import pytest
 from zscores import agree
 
 import unrender as ur
+from tiers import quick
 from unrender.gallery import meshes
 from unrender.problem.problem import Problem
 
@@ -65,6 +66,7 @@ def test_of_an_emissive_medium_there_are_the_grids(tmp_path: Path) -> None:
         np.testing.assert_array_equal(grid.reshape(value.shape), value)
 
 
+@pytest.mark.slow
 def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
     def scene() -> dict[str, Any]:
         rgb = lambda *x: {"type": "rgb", "value": list(x)}  # noqa: E731
@@ -88,7 +90,7 @@ def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
     assert verdict, figures
 
 
-@pytest.mark.parametrize("name", RENDERED)
+@pytest.mark.parametrize("name", quick(RENDERED, "glossy-room", "smoke", "mug"))
 def test_plain_mitsuba_renders_the_runs_picture(name: str, tmp_path: Path) -> None:
     problem = small(name)
     parameters = elsewhere(problem)
@@ -112,6 +114,7 @@ def test_a_wrong_texture_is_seen(tmp_path: Path) -> None:
     assert not verdict, figures
 
 
+@pytest.mark.slow
 def test_the_tutorials_cornell_box(assets: Path, tmp_path: Path) -> None:
     """XML that others wrote: colours, an emitter on a mesh, vertices, a mirror's metal, the camera's angle; posed shapes apart."""
     text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
@@ -204,6 +207,7 @@ def test_ready_made_objects_and_parameters_of_every_kind(still: Any, tmp_path: P
     assert verdict, figures
 
 
+@pytest.mark.slow
 def test_an_exported_scene_exports_as_itself(still: Any, tmp_path: Path) -> None:
     """Its XML is a problem's scene with the same keys and values; exported once more, meshes and pictures are the same."""
     first = ur.export(still, tmp_path / "first").folder

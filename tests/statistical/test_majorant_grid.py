@@ -91,6 +91,7 @@ def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
             assert verdict, figures
 
 
+@pytest.mark.slow
 def test_gradients_of_voxels_agree_with_finite_differences_cell_by_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     """Empty, thin, dense ones, and those at the majorant of their cell."""
     monkeypatch.setattr(majorant_grid, "_FINE", 2)
@@ -100,6 +101,7 @@ def test_gradients_of_voxels_agree_with_finite_differences_cell_by_cell(monkeypa
     assert max(map(abs, found.values())) < limit(len(found)), found
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_one_majorant(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a sparse grid, summed over empty cells, borders of density, and the core; both states of a pair."""
     weight = np.random.default_rng(2).uniform(0.2, 1.8, (1, SIZE, SIZE, 3))

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from zoo import DEPTH, LIGHTS, MATERIALS, everything, scene, texture, two_states
+from zoo import DEPTH, LIGHTS, SUBJECTS, everything, scene, subject, texture, tiles, two_states
 from zscores import agree
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -23,33 +23,36 @@ def runs(images: tuple[Any, ...]) -> np.ndarray:
     return np.stack([np.array(image) for image in images]).astype(np.float64)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
-    material, changes = MATERIALS[name]
-    renderer = MitsubaRenderer(scene(material()), DEPTH)
-    current, previous = two_states(renderer, {**changes, **LIGHTS})
+    description, changes = subject(name)
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, previous = two_states(renderer, changes)
     session = renderer.prepare(list(current), "path")
     pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
     assert pair.previous is not None
     for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
         alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
-        verdict, figures = agree(runs(images), runs(alone.images))
-        assert verdict, figures
+        for both, single in zip(tiles(runs(images)), tiles(runs(alone.images)), strict=True):
+            verdict, figures = agree(both, single)
+            assert verdict, figures
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
-    renderer = MitsubaRenderer(scene(MATERIALS[name][0]()), DEPTH)
+    renderer = MitsubaRenderer(subject(name)[0], DEPTH)
     session = renderer.prepare(["floor.bsdf.reflectance.data"], None)
     ours = session.image(renderer.values(["floor.bsdf.reflectance.data"]), SampleRequest(0, RUNS * SPP, 1, RUNS))
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
     theirs = [
         np.array(mi.render(renderer.pair.current, integrator=path, spp=SPP, seed=100 + run)) for run in range(RUNS)
     ]
-    verdict, figures = agree(runs(ours.images), np.stack(theirs).astype(np.float64))
-    assert verdict, figures
+    for a, b in zip(tiles(runs(ours.images)), tiles(np.stack(theirs).astype(np.float64)), strict=True):
+        verdict, figures = agree(a, b)
+        assert verdict, figures
 
 
+@pytest.mark.slow
 def test_a_planted_bias_of_one_percent_is_seen() -> None:
     renderer = MitsubaRenderer(everything(), DEPTH)
     changes = {"specular_transmittance.value": 0.9, "alpha.data": 1.2, "floor.bsdf.reflectance.data": 0.9, **LIGHTS}

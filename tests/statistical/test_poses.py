@@ -88,6 +88,7 @@ def test_a_posed_sensor_sees_as_if_it_had_been_moved() -> None:
     assert verdict, figures
 
 
+@pytest.mark.slow
 def test_a_pose_beside_other_parameters() -> None:
     """Those are the scene's: one launch for each state."""
     key = "block.bsdf.alpha_u.value"

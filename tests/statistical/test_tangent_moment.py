@@ -10,21 +10,22 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from zoo import DEPTH, LIGHTS, MATERIALS, SIZE, scene, two_states
+from zoo import DEPTH, SIZE, SUBJECTS, scene, size, subject, tiles, two_states
 
 import unrender as ur
+from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
 STEP = 4e-3
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
     """One sample per pixel, so that an image is its paths; all parameters grow together."""
-    material, changes = MATERIALS[name]
-    renderer = MitsubaRenderer(scene(material()), DEPTH)
-    current, _ = two_states(renderer, {**changes, **LIGHTS})
+    description, changes = subject(name)
+    renderer = MitsubaRenderer(description, DEPTH)
+    current, _ = two_states(renderer, changes)
     session = renderer.prepare(list(current), "path")
     request = SampleRequest(0, 1, 11)
     sides = []
@@ -34,11 +35,12 @@ def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
         sides.append(np.array(pair.previous[0]).astype(np.float64))
     expected = ((sides[0] - sides[1]) / (2 * STEP)) ** 2
     found = np.array(session.tangent_moment(current, session.image(current, request).paths, current))
-    assert found.shape == (SIZE, SIZE, 3)
-    assert expected.sum() > 0
-    close = np.abs(found - expected) < 0.05 * expected + 1e-3 * expected.mean()
-    assert close.mean() > 0.99
-    assert found.sum() == pytest.approx(expected.sum(), rel=0.03)
+    assert found.shape == (size(name), size(name), 3)
+    for one, exact in zip(tiles(found), tiles(expected), strict=True):
+        assert exact.sum() > 0
+        close = np.abs(one - exact) < 0.05 * exact + 1e-3 * exact.mean()
+        assert close.mean() > 0.99
+        assert one.sum() == pytest.approx(exact.sum(), rel=0.03)
 
 
 def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
@@ -59,6 +61,7 @@ def twelve() -> tuple[MitsubaRenderer, dict[str, Any]]:
     return renderer, values
 
 
+@pytest.mark.slow
 def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     """On the same paths: the mean over sign patterns against one pass per parameter, per block of pixels and channel."""
     renderer, values = twelve()
@@ -92,7 +95,7 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     assert np.abs((wrong - single)[known] / error[known]).max() > limit
 
 
-@pytest.mark.parametrize("name", ["smoke", "three-bodies", "nerf-volume"])
+@pytest.mark.parametrize("name", quick(["smoke", "three-bodies", "nerf-volume"], "nerf-volume"))
 def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str) -> None:
     """Collisions are chosen by chance apart from what they bring, so no finite difference sees a path's derivative; its adjoint does."""
     problem = ur.gallery.problem(name, resolution=5, reference_spp=1)
@@ -112,6 +115,7 @@ def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-4 * expected.max())
 
 
+@pytest.mark.slow
 def test_gradients_after_a_tangent_pass_are_what_they_were() -> None:
     """The pass cuts what ties the scenes to their parameters; the next rendering ties them anew, in every scene of the process."""
     renderer, values = twelve()

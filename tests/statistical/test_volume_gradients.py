@@ -133,6 +133,7 @@ def test_gradients_of_voxels_agree_with_finite_differences() -> None:
     assert max(map(abs, found.values())) < limit(len(found)), found
 
 
+@pytest.mark.slow
 def test_without_differential_ratio_tracking_black_and_empty_voxels_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """So the test above can fail: collisions alone find no derivative where nothing collides or scatters."""
     monkeypatch.setattr(tracking, "balance", lambda near, far: near * 0)
@@ -144,6 +145,7 @@ def test_without_differential_ratio_tracking_black_and_empty_voxels_are_wrong(mo
     assert not any("middling" in name for name in wrong), found
 
 
+@pytest.mark.slow
 def test_the_variance_of_a_difference_of_gradients_falls_with_the_square_of_the_step() -> None:
     """Both states share a path, collisions and all, and the point that differential ratio tracking keeps."""
     renderer = MitsubaRenderer(scene(cloud(), lights="sky"), 4)
@@ -162,6 +164,7 @@ def test_the_variance_of_a_difference_of_gradients_falls_with_the_square_of_the_
     assert float(np.polyfit(np.log(steps), np.log(variances), 1)[0]) == pytest.approx(2, abs=0.25)
 
 
+@pytest.mark.slow
 def test_the_previous_state_s_gradient_is_its_own() -> None:
     """In the mean over seeds, against the ordinary adjoint there; a planted tenth is seen."""
     renderer = MitsubaRenderer(scene(cloud(), lights="sky"), 4)

@@ -13,6 +13,7 @@ import pytest
 from fog import DEPTH, SCENES, cloud, media_keys, scene, two_media
 from zscores import agree
 
+from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -39,7 +40,7 @@ def changed(renderer: MitsubaRenderer, keys: list[str]) -> tuple[dict[str, Any],
     return current, previous
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", quick(SCENES, "fog in rough glass"))
 def test_the_kernel_agrees_with_volpath(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
@@ -47,7 +48,7 @@ def test_the_kernel_agrees_with_volpath(name: str) -> None:
     assert verdict, figures
 
 
-@pytest.mark.parametrize("depth", [1, 2, 12])
+@pytest.mark.parametrize("depth", quick([1, 2, 12], 12))
 def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
     """Roulette included: at 12 it has ended most paths."""
     renderer = MitsubaRenderer(two_media(), depth)
@@ -56,7 +57,7 @@ def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
     assert verdict, figures
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", quick(SCENES, "cloud, all lights"))
 def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     keys = [*media_keys(renderer), "floor.bsdf.reflectance.value"]
@@ -72,6 +73,7 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
 
 
 @pytest.mark.parametrize("ending", ["sigma_t.data", "albedo.data"])
+@pytest.mark.slow
 def test_what_is_empty_or_black_now_but_was_not_before_is_not_lost(ending: str) -> None:
     """The majorant bounds both states, and a path goes on while either is alive; the reverse as well."""
     renderer = MitsubaRenderer(scene(cloud()), DEPTH)

@@ -1,12 +1,15 @@
-"""Small scenes that hold one material each, and how its parameters change."""
+"""Materials, each in a small scene of its own and all of them in one, and how their parameters change."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from fnmatch import fnmatch
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 SIZE = 24
@@ -141,6 +144,63 @@ MATERIALS: dict[str, tuple[Any, dict[str, float]]] = {
 LIGHTS = {"lamp.emitter.radiance.value": 0.9, "sky.data": 1.1}
 
 
+ALL = "all materials"
+ROW = 4
+"""Balls in a row of the scene that holds all materials."""
+
+# What a test over materials is run for: the scene of all of them, whose kernels are compiled once, and with more time each alone.
+SUBJECTS = quick([ALL, *MATERIALS], ALL)
+
+
+def subject(name: str) -> tuple[dict[str, Any], dict[str, float]]:
+    """The scene of the material `name`, or of all of them, and {pattern of a key: factor of its change}, lights included."""
+    if name != ALL:
+        material, changes = MATERIALS[name]
+        return scene(material()), {**changes, **LIGHTS}
+    changes = {}
+    for number, (_, each) in enumerate(MATERIALS.values()):
+        for end, factor in each.items():
+            own = not end.startswith("floor.")
+            changes[f"ball_{number}.*{end.removeprefix('ball.')}" if own else end] = factor
+    return all_materials(), {**changes, **LIGHTS}
+
+
+def all_materials() -> dict[str, Any]:
+    """A ball of each material, in rows: each in the middle of its tile of SIZE x SIZE pixels."""
+    to = mi.ScalarTransform4f
+    found = scene({"type": "diffuse"})
+    del found["ball"]
+    spacing, slope = 2.2, np.sqrt(0.5)  # seen from above, by 45 degrees: rows look nearer to each other than they are
+    for number, (material, _) in enumerate(MATERIALS.values()):
+        row, column = divmod(number, ROW)
+        x, y = spacing * (column - (ROW - 1) / 2), spacing / slope * ((ROW - 1) / 2 - row)
+        found[f"ball_{number}"] = {"type": "sphere", "center": [x, y, 0.8], "radius": 0.8, "thing": material()}
+    found["floor"]["to_world"] = to().scale(12)
+    found["lamp"]["to_world"] = to().look_at([9, -6, 9], [0, 0, 0], [0, 1, 0]) @ to().scale(2.4)
+    view = to().look_at([0, -20, 20.8], [0, 0, 0.8], [0, 0, 1]) @ to().scale([spacing * ROW / 2, spacing * ROW / 2, 1])
+    film = {**found["sensor"]["film"], "width": ROW * SIZE, "height": ROW * SIZE}
+    found["sensor"] = {"type": "orthographic", "to_world": view, "film": film}
+    return found
+
+
+def size(name: str) -> int:
+    """Width and height of a subject's image."""
+    return ROW * SIZE if name == ALL else SIZE
+
+
+def spp(name: str) -> int:
+    """Samples per pixel of a comparison without noise."""
+    return 16 if name == ALL else 64
+
+
+def tiles(image: np.ndarray) -> Iterator[np.ndarray]:
+    """The parts of a subject's image (..., H, W, 3) that show one material each, (..., SIZE, SIZE, 3)."""
+    height, width = image.shape[-3:-1]
+    for y in range(0, height, SIZE):
+        for x in range(0, width, SIZE):
+            yield image[..., y : y + SIZE, x : x + SIZE, :]
+
+
 def everything() -> dict[str, Any]:
     """Glass, rough metal, textures and an environment map in one scene."""
     found = scene(MATERIALS["glass"][0]())
@@ -149,7 +209,7 @@ def everything() -> dict[str, Any]:
 
 
 def two_states(renderer: MitsubaRenderer, changes: dict[str, float]) -> tuple[dict[str, Any], dict[str, Any]]:
-    keys = [key for end in changes for key in renderer.parameters() if key.endswith(end)]
+    keys = [key for end in changes for key in renderer.parameters() if fnmatch(key, f"*{end}")]
     assert len(keys) == len(changes), f"{changes} -> {keys}"
     current = renderer.values(keys)
     return current, {key: current[key] * factor for key, factor in zip(keys, changes.values(), strict=True)}

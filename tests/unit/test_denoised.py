@@ -148,6 +148,7 @@ def test_what_makes_no_sense_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
         ur.estimate(problem(), ur.PathGradient(Denoised(by="oidn")))
 
 
+@pytest.mark.mitsuba
 def test_mitsuba_images_too() -> None:
     """On the device: image, adjoint and memory of a path-traced scene."""
     asked = ur.gallery.problem("poster", resolution=16, texture_resolution=4, reference_spp=16)

@@ -1,13 +1,12 @@
 """LargeSteps against a direct sparse solve, and the properties that descent relies on."""
 
 import drjit as dr
-import kernels
-import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
+import kernels
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps
@@ -89,8 +88,11 @@ def test_channels_do_not_mix():
     np.testing.assert_allclose(smooth[..., 2:], LargeSteps(5.0).apply(x[..., 2:]), atol=1e-6)
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("shape", [(7, 5, 3), (4, 5, 6, 1)])
 def test_device_agrees_with_numpy(shape):
+    import mitsuba as mi
+
     x = data(shape)
     actual = LargeSteps(10.0).apply(mi.TensorXf(x))
     assert isinstance(actual, mi.TensorXf)
@@ -98,8 +100,11 @@ def test_device_agrees_with_numpy(shape):
     np.testing.assert_array_equal(arrays.numpy(actual), LargeSteps(10.0).apply(x))
 
 
+@pytest.mark.mitsuba
 def test_where_numpy_puts_the_result_compiles_no_kernels():
     """Dr.Jit shares NumPy's memory and tells aligned from unaligned."""
+    import mitsuba as mi
+
     x, compiled, rooms = mi.TensorXf(data((7, 5, 3))), [], []
     for step in range(24):
         rooms.append(np.empty(5 + 16 * step, np.uint8))  # so that the next array lies elsewhere

@@ -1,6 +1,5 @@
 """Losses against closed forms and finite differences, in NumPy and on the device."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -50,8 +49,11 @@ def test_linear_says_whether_image_noise_biases_the_derivative(loss):
     assert unbiased == loss.linear
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("loss", ALL, ids=repr)
 def test_device_agrees_with_numpy(loss):
+    import mitsuba as mi
+
     random = np.random.default_rng(2)
     image, reference = random.uniform(0, 4, (2, 5, 4, 3)).astype(np.float32)
     image[0] = reference[0]

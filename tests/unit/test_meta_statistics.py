@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
-import kernels
 import numpy as np
 import pytest
 
+import kernels
 from unrender.core import arrays
 from unrender.statistics import meta
 
@@ -133,6 +133,7 @@ def test_longer_steps_are_foreseen_by_decoupling() -> None:
     assert alphas[True] < alphas[False] - 0.1
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("options", [{}, {"clip": False}, {"centred": True}, {"decouple": False}, {"observed": True}])
 def test_the_same_on_the_device(form: str, options: dict[str, Any]) -> None:
@@ -158,6 +159,7 @@ def test_the_same_on_the_device(form: str, options: dict[str, Any]) -> None:
         )
 
 
+@pytest.mark.mitsuba
 def test_no_step_compiles_a_kernel_of_its_own() -> None:
     """Dr.Jit orders the inputs of one and the same kernel in a handful of ways; a number that became a literal would make one per step."""
     F, D, norms = stream(60, (64,))

@@ -3,11 +3,10 @@
 import dataclasses
 
 import drjit as dr
-import kernels
-import mitsuba as mi
 import numpy as np
 import pytest
 
+import kernels
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
@@ -118,6 +117,8 @@ def test_pure_and_of_the_parameters_kind(optimizer, gradients):
 
 def kernels_per_step(optimizer, gradients):
     """Number of kernels that each step on the device compiles; also checks the steps against NumPy's."""
+    import mitsuba as mi
+
     shared = {key: kernels.on_device(np.stack([g[key] for g in gradients])) for key in gradients[0]}
     state, compiled = optimizer.init({key: shared[key][0] for key in shared}), []
     for n, expected in enumerate(take(optimizer, gradients)):
@@ -134,12 +135,14 @@ def kernels_per_step(optimizer, gradients):
     return compiled
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("optimizer", OPTIMIZERS, ids=repr)
 def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(optimizer, gradients):
     optimizer = dataclasses.replace(optimizer, schedule=Warmup(5, Cosine(20)))
     assert not any(kernels_per_step(optimizer, gradients)[3:])
 
 
+@pytest.mark.mitsuba
 def test_a_changing_python_number_would_be_noticed(gradients, monkeypatch):
     """The test above is able to fail: with plain numbers, every step's kernel is a new one."""
     monkeypatch.setattr(arrays, "scalar", lambda value, like: value)
@@ -214,6 +217,7 @@ def test_meta_adams_longest_step():
     np.testing.assert_allclose(step["a"], [-0.5, 0.2, -0.01])
 
 
+@pytest.mark.mitsuba
 def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
     variances = [{key: np.square(g) + 0.1 for key, g in tree.items()} for tree in gradients]
     optimizer = MetaAdam(0.1, schedule=Exponential(7))

@@ -119,6 +119,7 @@ def test_batches_are_images_one_by_one(loss: losses.Perceptual) -> None:
         np.testing.assert_allclose(slope, loss.derivative(image, reference), rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.mitsuba
 def test_the_device_agrees_with_numpy(loss: losses.Perceptual) -> None:
     import mitsuba as mi
 
@@ -262,6 +263,7 @@ def test_without_pytorch_or_torchvision_one_line_says_so(monkeypatch: pytest.Mon
         losses.Perceptual()
 
 
+@pytest.mark.mitsuba
 def test_a_problem_file_names_it(weights: Path, tmp_path: Path) -> None:
     made = tables.component({"type": "Perceptual", "weights": str(weights), "layers": ["relu1_2"]}, "loss")
     assert made == losses.Perceptual(str(weights), ("relu1_2",))

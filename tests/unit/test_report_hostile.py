@@ -333,6 +333,7 @@ def test_a_good_folder_reached_by_a_link_is_read(tmp_path):
     assert KEY in Page(report.page(tmp_path / "link")).words
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("where", ["label", "notice", "error"])
 def test_a_terminal_is_not_told_what_to_do(tmp_path, capsys, monkeypatch, where):
     """Escape sequences in names: they could move the cursor, retitle the window, or hide what went before."""

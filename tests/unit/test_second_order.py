@@ -5,11 +5,10 @@ import math
 from typing import Any
 
 import drjit as dr
-import kernels
-import mitsuba as mi
 import numpy as np
 import pytest
 
+import kernels
 import unrender as ur
 from unrender.core import vectors
 from unrender.core.errors import InputError
@@ -553,7 +552,10 @@ def test_a_long_search_survives_its_own_success():
 # ---------------------------------------------------------------------------------------------------- all of them
 
 
+@pytest.mark.mitsuba
 def test_states_and_steps_on_the_device_are_those_of_numpy():
+    import mitsuba as mi
+
     hessian, minimum = bowl()
     device = {key: kernels.on_device(x) for key, x in LIKE.items()}
     optimizers: list[Any] = [*FIRST_STEPS, Newton(inner_optimizer=Adam()), CMAES()]
@@ -576,7 +578,10 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
         assert sum(compiled[2:]) <= 1, f"a kernel in each step: {optimizer} {compiled}"
 
 
+@pytest.mark.mitsuba
 def test_steps_have_the_parameters_type_and_memory_of_their_own():
+    import mitsuba as mi
+
     single = {"x": np.ones((2, 3), np.float32)}
     vector = np.arange(6.0)
     found = vectors.unravel(vector, single)

@@ -63,6 +63,7 @@ def test_problems_that_it_cannot_take() -> None:
         ur.optimize(problem(), ur.LossValues(), ur.optimizers.Adam(), steps=1)
 
 
+@pytest.mark.mitsuba
 def test_a_parameter_that_cannot_be_perturbed_is_refused() -> None:
     asked = ur.gallery.problem("mug", resolution=8, reference_spp=1)
     with pytest.raises(ur.InputError, match=r"mug\.faces cannot be recovered: Mitsuba marks it as not differentiable"):

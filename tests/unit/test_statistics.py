@@ -1,10 +1,9 @@
 """Running covariance, control weight and recursion against closed forms, in NumPy and on the device."""
 
-import kernels
-import mitsuba as mi
 import numpy as np
 import pytest
 
+import kernels
 from unrender import statistics
 from unrender.core import arrays
 from unrender.statistics import welford
@@ -168,6 +167,7 @@ def step(state, memory, x, y):
     return welford.update(state, x, y), advance(memory, x, y, w), w, variance
 
 
+@pytest.mark.mitsuba
 def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(stream):
     xs, ys = (s.astype(np.float32) for s in stream)
     host = welford.init(xs[0].astype(float)), xs[0].astype(float)
@@ -189,7 +189,10 @@ def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(stream):
     )
 
 
+@pytest.mark.mitsuba
 def test_device_treats_the_unknown_as_numpy_does():
+    import mitsuba as mi
+
     nan, inf = float("nan"), float("inf")
     cov = np.array([2.0, -1.0, nan, 1.0, 1.0, 0.0], np.float32)
     var_previous = np.array([1.0, 1.0, 1.0, nan, 1.0, 0.0], np.float32)

@@ -12,6 +12,7 @@ from unrender.runs.tensorboard import TensorBoard
 PACKAGE = "needs tensorboardX: pip install 'unrender[tensorboard]'"
 
 
+@pytest.mark.mitsuba
 def test_events_hold_the_history_and_the_pictures(tmp_path):
     pytest.importorskip("tensorboardX", reason=PACKAGE)
     proto = pytest.importorskip("tensorboardX.proto.event_pb2")

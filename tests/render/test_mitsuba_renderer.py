@@ -9,9 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from kernels import recorded
 
 import unrender as ur
+from kernels import recorded
+from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.renderer import SampleRequest
@@ -106,7 +107,7 @@ STEADY: dict[str, tuple[Any, int]] = {
 }
 
 
-@pytest.mark.parametrize("name", STEADY)
+@pytest.mark.parametrize("name", quick(STEADY, "rcv", "meta"))
 def test_no_kernel_is_compiled_after_warm_up(name: str) -> None:
     estimator, spare = STEADY[name]
     optimizer = ur.optimizers.MetaAdam() if isinstance(estimator, ur.MetaEstimator) else ur.optimizers.Adam()

@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tiers import quick, slow
 from unrender.gallery import boxes, mesh_files, meshes, specification, textures
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.numpy.quadratic import QuadraticRenderer
@@ -59,7 +60,7 @@ DRAWN = ["mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caus
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 
-@pytest.fixture(scope="module", params=RENDERED)
+@pytest.fixture(scope="module", params=quick(RENDERED, "indirect-room"))
 def small(request) -> ur.Problem:
     return ur.gallery.problem(request.param, **SMALL)
 
@@ -269,6 +270,7 @@ def test_every_parameter_follows_a_path_of_another_state_and_is_seen(small):
         ("glossy-room", "ball.bsdf.metallic.data", 0.9),
     ],
 )
+@pytest.mark.slow
 def test_the_descent_approaches_the_truth(recovered, name, key, factor):
     problem, result = recovered(name)
     before, after = problem.parameter_error(result.initial)[key], problem.parameter_error(result.parameters)[key]
@@ -289,6 +291,7 @@ def recovered():
     return recover
 
 
+@pytest.mark.slow
 def test_the_spiral_is_five_numbers_by_default():
     problem = ur.gallery.problem("spiral", resolution=8, reference_spp=1)
     assert {key: value.shape for key, value in problem.truth.items()} == {
@@ -316,6 +319,7 @@ def test_the_exponential_has_the_mean_that_it_shows():
     assert slope == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_room_of_ajar_is_lit_through_the_gap_alone():
     """No emitter can be sampled from most of what the camera sees, and yet it is not dark."""
     problem = ur.gallery.problem("ajar", resolution=32, texture_resolution=8, reference_spp=256)
@@ -329,6 +333,7 @@ def test_the_room_of_ajar_is_lit_through_the_gap_alone():
     assert np.mean(reference.max(-1) > 0.01) > 0.9
 
 
+@pytest.mark.slow
 def test_nothing_but_the_ceiling_sees_the_lamp_of_the_indirect_room():
     problem = ur.gallery.problem("indirect-room", resolution=4, texture_resolution=4, reference_spp=1)
     scene = problem.renderer.pair.current  # pyright: ignore[reportAttributeAccessIssue]
@@ -349,7 +354,7 @@ def test_nothing_but_the_ceiling_sees_the_lamp_of_the_indirect_room():
 # ---------------------------------------------------------------------------------------------------- poses
 
 
-@pytest.fixture(scope="module", params=POSES)
+@pytest.fixture(scope="module", params=quick(POSES, "box2"))
 def posed(request) -> ur.Problem:
     return ur.gallery.problem(request.param, reference_spp=256)
 
@@ -391,7 +396,7 @@ def test_the_true_poses_render_to_the_reference_and_the_starts_do_not(posed):
     assert false > 100 * least
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", quick(POSES, "box2"))
 def test_a_plateau_is_flat_and_there_is_none_for_the_bunny(name):
     problem = ur.gallery.problem(name, reference_spp=256)
     start = start_of(problem)
@@ -404,6 +409,7 @@ def test_a_plateau_is_flat_and_there_is_none_for_the_bunny(name):
         assert change[[0, 1, 3, 4]].min() > 0.02
 
 
+@pytest.mark.slow
 def test_a_cup_with_its_handle_hidden_looks_the_same_whichever_way_it_is_turned():
     problem = ur.gallery.problem("mug", reference_spp=64)
     start = start_of(problem)
@@ -422,6 +428,7 @@ def test_the_pose_of_the_cup_turns_it_about_its_axis():
 
 
 @pytest.mark.parametrize("name", ["box2", "shadow"])
+@pytest.mark.slow
 def test_what_moves_stays_in_the_picture_within_its_bounds(name):
     problem = ur.gallery.problem(name, reference_spp=1)
     corners = np.array(list(problem.bounds.values()), float)
@@ -450,7 +457,12 @@ def test_the_ball_itself_is_never_in_the_picture():
 
 @pytest.mark.parametrize(
     ("name", "sigma", "rate", "steps"),
-    [("box2", 0.35, 0.05, 90), ("mug", 0.6, 0.05, 100), ("shadow", 0.35, 0.05, 90), ("bunny", 0.15, 0.03, 90)],
+    [
+        slow("box2", 0.35, 0.05, 90),
+        slow("mug", 0.6, 0.05, 100),
+        slow("shadow", 0.35, 0.05, 90),
+        slow("bunny", 0.15, 0.03, 90),
+    ],
 )
 def test_smoothed_derivatives_find_the_pose(name, sigma, rate, steps):
     problem = ur.gallery.problem(name, resolution=24, reference_spp=256)
@@ -467,6 +479,7 @@ def test_smoothed_derivatives_find_the_pose(name, sigma, rate, steps):
 SPHERE = {"resolution": 16, "reference_spp": 64, "subdivisions": 1, "views": 3}
 
 
+@pytest.mark.slow
 def test_the_sphere_has_the_vertices_that_were_asked_for_and_no_truth():
     for subdivisions, count in ((1, 42), (3, 642)):
         problem = ur.gallery.problem("sphere-to-mesh", **SPHERE | {"subdivisions": subdivisions, "reference_spp": 1})
@@ -477,6 +490,7 @@ def test_the_sphere_has_the_vertices_that_were_asked_for_and_no_truth():
         assert [view.sensor for view in problem.views] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_every_view_tells_the_sphere_from_the_body():
     problem = ur.gallery.problem("sphere-to-mesh", **SPHERE)
     ball = {key: np.array(value) for key, value in problem.initial().items()}
@@ -487,6 +501,7 @@ def test_every_view_tells_the_sphere_from_the_body():
         assert false.max() > 1.3 * limit(false.size)
 
 
+@pytest.mark.slow
 def test_smoothed_derivatives_bring_the_sphere_nearer_to_the_body():
     problem = ur.gallery.problem("sphere-to-mesh", **SPHERE)
     estimator = ur.SmoothedDerivatives(sigma=0.05, samples=32, spp=2)
@@ -547,7 +562,7 @@ def test_a_mesh_is_given_by_its_path(given):
         ur.gallery.problem("bunny", mesh=given)
 
 
-@pytest.mark.parametrize("name", [*POSES, "poster", "sphere-to-mesh"])
+@pytest.mark.parametrize("name", [*RENDERED, *POSES, *VOLUMES, "sphere-to-mesh"])
 def test_equal_calls_give_equal_problems(name):
     first, second = (ur.gallery.problem(name, resolution=8, reference_spp=4) for _ in range(2))
     for a, b in zip(first.views, second.views, strict=True):

@@ -11,9 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from kernels import on_device, recorded
 
 import unrender as ur
+from kernels import on_device, recorded
 from unrender.rendering.mitsuba import emissive
 from unrender.rendering.mitsuba.integrators import majorant_grid
 from unrender.rendering.mitsuba.integrators.majorant_grid import Cells, MajorantSupergrids

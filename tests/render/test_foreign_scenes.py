@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import pytest
 
 import unrender as ur
 
@@ -37,6 +38,7 @@ def test_the_tutorials_cornell_box(assets: Path, tmp_path: Path) -> None:
     assert not found.warnings
 
 
+@pytest.mark.slow
 def test_spot_under_the_museum(assets: Path) -> None:
     """A textured mesh from an OBJ file under a measured environment map: its mean colour comes near."""
     to = mi.ScalarTransform4f

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from unrender.core import arrays
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 
 def on_device(x: Any) -> mi.TensorXf:
     """The numbers in the device's own memory: NumPy's would be shared, and compile other kernels where it is not aligned."""
+    import mitsuba as mi
+
     return mi.TensorXf(arrays.owned(x, mi.Float), np.shape(x))
 
 

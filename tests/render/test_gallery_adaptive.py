@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tiers import quick
 from unrender.gallery import skies, two_planets
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -34,7 +35,7 @@ VIEWS = {"mirror-trio": 1, "sun-glossy": 4, "plain-and-textured": 1, "two-planet
 NAMES = list(UNKNOWN)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=quick(NAMES, "sun-glossy"))
 def small(request) -> ur.Problem:
     return ur.gallery.problem(request.param, **SMALL[request.param], reference_spp=SPP)
 
@@ -95,6 +96,7 @@ def at_depth(problem: ur.Problem, depth: int, spp: int = 256, sensor: int = 0) -
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.slow
 def test_pictures_have_the_size_and_number_that_were_promised(name):
     problem = ur.gallery.problem(name, reference_spp=1)
     side = 48 if name == "two-planets" else 64
@@ -152,6 +154,7 @@ DESCENTS = {
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("drawn", [False, True], ids=["all", "uniform"])
+@pytest.mark.slow
 def test_a_plain_descent_approaches_the_truth(name, drawn):
     options, rate, spp, steps = DESCENTS[name]
     problem = ur.gallery.problem(name, **SMALL[name] | options, reference_spp=512)
@@ -199,6 +202,7 @@ def test_a_bad_option_is_one_clear_line(name, options, message):
 # ---------------------------------------------------------------------------------------------------- their difficulties
 
 
+@pytest.mark.slow
 def test_the_roughness_shows_in_the_mirror_alone_which_fills_a_part_of_the_picture():
     problem = ur.gallery.problem("mirror-trio", resolution=48, reference_spp=256)
     mirror = seen(problem) == "mirror"
@@ -218,6 +222,7 @@ def test_the_sun_is_small_and_bright_and_mirrored_in_the_lacquer():
     assert on_doll.max() > 4 * np.median(on_doll)
 
 
+@pytest.mark.slow
 def test_a_relative_loss_gives_the_dark_pixels_more_of_the_whole():
     shares = []
     for loss in ("L2", "RelativeL2"):
@@ -231,6 +236,7 @@ def test_a_relative_loss_gives_the_dark_pixels_more_of_the_whole():
     assert shares[1] > 1.3 * shares[0]
 
 
+@pytest.mark.slow
 def test_bin_and_cushion_fill_about_as_many_pixels():
     problem = ur.gallery.problem("plain-and-textured", reference_spp=1)
     names = seen(problem)
@@ -248,6 +254,7 @@ def test_each_planet_starts_as_the_other_and_the_glass_is_no_parameter():
     assert not any("glass" in parameter.key or "hollow" in parameter.key for parameter in problem.parameters)
 
 
+@pytest.mark.slow
 def test_only_paths_of_six_segments_reach_the_enclosed_planet_and_they_are_noisy():
     problem = ur.gallery.problem("two-planets", views=4, resolution=32, texture_resolution=16, reference_spp=256)
     assert isinstance(problem.renderer, MitsubaRenderer)
@@ -271,6 +278,7 @@ def test_a_planet_has_no_seam_and_is_of_real_paint(planet):
     assert across < 2 * np.abs(np.diff(picture, axis=1)).mean()
 
 
+@pytest.mark.slow
 def test_the_caustic_lights_the_floor_by_few_bright_samples():
     problem = ur.gallery.problem("caustic", resolution=32, reference_spp=512)
     floor = seen(problem) == "floor"

@@ -9,6 +9,7 @@ import pytest
 from test_gallery import limit, renders, scores
 
 import unrender as ur
+from tiers import quick
 from unrender.gallery import volumes
 
 SMALL = {
@@ -30,7 +31,7 @@ UNKNOWN = {
 }
 
 
-@pytest.fixture(scope="module", params=SMALL)
+@pytest.fixture(scope="module", params=quick(SMALL, "tea"))
 def small(request) -> ur.Problem:
     return ur.gallery.problem(request.param, **SMALL[request.param])
 
@@ -62,6 +63,7 @@ CARRIED = ur.PathGradient(image=ur.images.RecursiveControlVariate(space="path"),
 
 
 @pytest.mark.parametrize(("name", "factor"), [("three-bodies", 0.4), ("tea", 0.8)])
+@pytest.mark.slow
 def test_a_descent_approaches_the_truth(name, factor):
     problem = ur.gallery.problem(name, **SMALL[name])
     result = ur.optimize(problem, CARRIED, ur.optimizers.Adam(0.02), steps=40, seed=1)
@@ -71,6 +73,7 @@ def test_a_descent_approaches_the_truth(name, factor):
 
 
 @pytest.mark.parametrize("estimator", [CARRIED, ur.PathGradient(spp=8)], ids=["rcv", "plain"])
+@pytest.mark.slow
 def test_smoke_takes_shape(estimator):
     problem = ur.gallery.problem("smoke", **SMALL["smoke"])
     result = ur.optimize(problem, estimator, ur.optimizers.Adam(0.02), steps=30, seed=1)
@@ -82,6 +85,7 @@ def test_smoke_takes_shape(estimator):
     assert error[1] < 0.8 * error[0], error
 
 
+@pytest.mark.slow
 def test_a_glowing_volume_takes_the_look_of_a_toy():
     options = {"resolution": 16, "grid_resolution": 8, "views": 4, "reference_spp": 64}
     problem = ur.gallery.problem("nerf-volume", **options)
