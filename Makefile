@@ -2,6 +2,7 @@
 # make test        lint, types, and every test but the slow ones
 # make test-all    the slow ones too
 # make lint        lint and types alone
+# make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
@@ -11,7 +12,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all lint clean
+.PHONY: help demo test test-all lint docs clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
@@ -42,6 +43,10 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: .venv/docs-ready
+	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs build/site
+	@echo "the site: file://$(CURDIR)/build/site/index.html"
+
 clean:
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
 	find src tests benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -53,4 +58,8 @@ clean:
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@$(BIN)/pyright --version
+	@touch $@
+
+.venv/docs-ready: .venv/ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@
