@@ -15,7 +15,7 @@ variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))  # some public cla
 project = "unrender"
 author = "the unrender contributors"
 release = version_of("unrender")
-copyright = "unrender contributors, BSD-3-Clause"  # noqa: A001
+copyright = "unrender contributors, BSD-3-Clause"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "markdown_docstrings", "mathml"]
 exclude_patterns = ["_build", "extensions"]

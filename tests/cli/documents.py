@@ -6,13 +6,15 @@ A page's blocks run in order, in an empty folder. A comment before a block says 
     <!-- test: edit room.toml OLD NEW --> before it, OLD becomes NEW in that file
     <!-- test: skip, REASON -->         it is not executed
 
-and one comment anywhere, `<!-- test: after guide/example.md -->`, runs the blocks of another page first.
+and one comment anywhere, `<!-- test: after guide/example.md -->`, runs the blocks of another page first; with `files of` in place of
+`after`, the run folders of that page are removed.
 """
 
 from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import types
@@ -32,7 +34,8 @@ FENCE = re.compile(
     r"^(?P<fence>```+)(?P<language>[^\n`]*)\n(?P<text>.*?)^(?P=fence)[ ]*$",
     re.MULTILINE | re.DOTALL,
 )
-AFTER = re.compile(r"^<!-- test: after (\S+) -->$", re.MULTILINE)
+AFTER = re.compile(r"^<!-- test: (?:after|files of) (\S+) -->$", re.MULTILINE)
+FILES = re.compile(r"^<!-- test: files of ", re.MULTILINE)
 DIRECTIVES = {"{toctree}", "{eval-rst}", "{include}", "{container}"}
 SMALL = {"resolution": "16", "texture_resolution": "8", "reference_spp": "4"}
 
@@ -64,6 +67,8 @@ def previous_pages(page: Path) -> Iterator[Path]:
     """The pages whose blocks run first."""
     for name in AFTER.findall(page.read_text(encoding="utf-8")):
         yield ROOT / "docs" / name
+    if FILES.search(page.read_text(encoding="utf-8")):
+        shutil.rmtree("out", ignore_errors=True)
 
 
 class Runner:
@@ -99,7 +104,9 @@ class Runner:
     def python(self, block: Block) -> None:
         """Execute it."""
         self.output()
-        exec(compile("\n" * int(block.place.rpartition(":")[2]) + block.text, block.place, "exec"), self.module.__dict__)
+        exec(
+            compile("\n" * int(block.place.rpartition(":")[2]) + block.text, block.place, "exec"), self.module.__dict__
+        )
 
     def text(self, block: Block) -> None:
         """What the Python block before it printed; `...` stands for anything."""

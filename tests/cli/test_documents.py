@@ -5,24 +5,38 @@ from __future__ import annotations
 import ast
 import functools
 import importlib
+import itertools
 import pkgutil
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import documents
 import drjit as dr
 import matplotlib
 import pytest
+from documents import ROOT, Runner, blocks, previous_pages
 
 import unrender as ur
-import documents
-from documents import ROOT, Runner, blocks, previous_pages
 
 DOCS = ROOT / "docs"
 # CONTRIBUTING.md has tests of its own, that follow its text; results.md is made of benchmarks, whose commands take hours.
-PAGES = [ROOT / "README.md", *sorted(page for page in DOCS.rglob("*.md") if page.name not in ("results.md", "contributing.md"))]
-SLOW = {"README.md", "quickstart.md", "pixels.md", "poses.md", "runs.md", "watching.md", "exporting.md", "surfaces.md", "volumes.md"}
+PAGES = [
+    ROOT / "README.md",
+    *sorted(page for page in DOCS.rglob("*.md") if page.name not in ("results.md", "contributing.md")),
+]
+SLOW = {
+    "README.md",
+    "quickstart.md",
+    "pixels.md",
+    "poses.md",
+    "runs.md",
+    "watching.md",
+    "exporting.md",
+    "surfaces.md",
+    "volumes.md",
+}
 
 # What the example of a docstring takes as given.
 GIVEN = {
@@ -48,6 +62,7 @@ GIVEN = {
         def f(points, items): return (points**2).sum(axis=1)
     """,
 }
+SLOW_EXAMPLES = {"unrender.exporting.scene_folder.export", "unrender.smoothing.grey_box"}
 ILLUSTRATIONS = {"unrender.core.registry": "a class is shown without its methods"}
 
 
@@ -107,7 +122,7 @@ def test_every_block_of_a_page_is_true(
         registry = importlib.import_module("unrender.core.registry")
         monkeypatch.setattr(registry, "_components", dict(registry._components))
         monkeypatch.setattr(registry, "_state_modules", set(registry._state_modules))
-    for each in [*previous_pages(page), page]:
+    for each in itertools.chain(previous_pages(page), [page]):  # one after the other: what comes between is done, too
         runner = Runner(each.stem, capsys.readouterr)
         for block in blocks(each):
             runner.run(block)
@@ -155,7 +170,13 @@ def test_there_are_examples_in_docstrings():
     assert {"unrender", "unrender.smoothing.function"} <= {name for name, _ in _examples()}
 
 
-@pytest.mark.parametrize(("name", "code"), [pytest.param(*each, id=each[0]) for each in _examples()])
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        pytest.param(*each, id=each[0], marks=[pytest.mark.slow] if each[0] in SLOW_EXAMPLES else [])
+        for each in _examples()
+    ],
+)
 @pytest.mark.usefixtures("small_runs")
 def test_the_examples_of_docstrings_run(name: str, code: str) -> None:
     if name in ILLUSTRATIONS:
@@ -197,13 +218,16 @@ def test_the_reference_has_every_public_name():
 def test_names_in_the_pages_exist():
     """`unrender.a.b` and `ur.a.b` in backticks."""
     for page in PAGES:
-        for name in re.findall(r"`(?:unrender|ur)\.([\w.]+)(?:\(.*?\))?`", page.read_text(encoding="utf-8")):
+        for name in re.findall(r"(?<!group )`(?:unrender|ur)\.([\w.]+)(?:\(.*?\))?`", page.read_text(encoding="utf-8")):
             assert _resolve(name.rstrip(".")), f"{page.relative_to(ROOT)}: unrender.{name}"
 
 
 def _resolve(name: str) -> bool:
     if name.startswith("grey_box"):  # needs PyTorch
-        return f"def {name.rpartition('.')[2]}" in (ROOT / "src/unrender/smoothing/grey_box.py").read_text() or "." not in name
+        return (
+            f"def {name.rpartition('.')[2]}" in (ROOT / "src/unrender/smoothing/grey_box.py").read_text()
+            or "." not in name
+        )
     found: Any = ur
     parts = name.split(".")
     for index, part in enumerate(parts):
@@ -232,7 +256,12 @@ def test_the_stub_has_every_public_name():
     """What a type checker sees, the names under TYPE_CHECKING, is what `__all__` lists and the module gives."""
     tree = ast.parse((ROOT / "src/unrender/__init__.py").read_text(encoding="utf-8"))
     checked = next(node for node in tree.body if isinstance(node, ast.If))
-    seen = {alias.asname or alias.name for node in ast.walk(checked) if isinstance(node, ast.ImportFrom) for alias in node.names}
+    seen = {
+        alias.asname or alias.name
+        for node in ast.walk(checked)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
     plain = {"use", "InputError", "UnrenderError", "VariantError"}
     assert seen | plain == {*ur.__all__, "grey_box"}
     assert all(hasattr(ur, name) for name in ur.__all__)
