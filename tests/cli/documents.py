@@ -215,7 +215,8 @@ def check_options(words: list[str], place: str) -> None:
 def small(arguments: list[str]) -> list[str]:
     """The same command with the smallest budgets, by its own options."""
     verb, words = arguments[0], list(arguments)
-    budgets = {"run": ["--steps", "2"], "resume": ["--steps", "4"], "compare": ["--seconds", "0.2", "--seeds", "1"]}
+    further = "6" if "--steps" in words else "4"  # a finished run is resumed only with a larger budget
+    budgets = {"run": ["--steps", "2"], "resume": ["--steps", further], "compare": ["--seconds", "0.2", "--seeds", "1"]}
     if verb not in budgets:
         return words
     for option in ("--steps", "--seconds", "--seeds"):
