@@ -4,6 +4,7 @@
 # make test-slow   the tests that `make test` leaves out
 # make test-unit   the tests that need no Mitsuba alone, in about a minute
 # make lint        lint and types alone
+# make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
@@ -14,7 +15,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-slow test-unit lint clean
+.PHONY: help demo test test-all test-slow test-unit lint docs clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
@@ -51,6 +52,10 @@ lint: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: .venv/docs-ready
+	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs build/site
+	@echo "the site: file://$(CURDIR)/build/site/index.html"
+
 clean:
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
 	find src tests benchmarks scripts -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -62,4 +67,8 @@ clean:
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@$(BIN)/pyright --version
+	@touch $@
+
+.venv/docs-ready: .venv/ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@

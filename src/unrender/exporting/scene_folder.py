@@ -62,7 +62,7 @@ def export(
     """Write a scene with its recovered parameters as a folder that plain Mitsuba loads.
 
         ur.export("out/indirect-room-rcv", "out/room")
-        ur.export((problem, result.parameters), "out/room")
+        ur.export((problem, result.parameters), "out/room-2")
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the

@@ -1,0 +1,55 @@
+"""The documentation site: `make docs`. Builds without the network, and its pages need none; warnings are errors."""
+
+import os
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE / "extensions"))
+
+from unrender.backend import variant  # noqa: E402
+
+variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))  # some public classes are Mitsuba's own subclasses
+
+project = "unrender"
+author = "the unrender contributors"
+release = version_of("unrender")
+copyright = "unrender contributors, BSD-3-Clause"
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "markdown_docstrings", "mathml"]
+exclude_patterns = ["_build", "extensions"]
+
+# Pages: Markdown; those with {code-cell} are notebooks, executed at each build.
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+nb_execution_mode = "force"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+nb_execution_in_temp = True
+
+# Reference: the names that a module's `__all__` lists, in the order of the page.
+autodoc_member_order = "groupwise"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_class_signature = "mixed"
+autodoc_default_options = {"exclude-members": "__init__, __new__, __weakref__, __dict__, __module__"}
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+add_module_names = False
+
+html_theme = "furo"
+html_title = "unrender"
+html_static_path = ["static"]
+html_css_files = ["unrender.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "light_css_variables": {"font-stack": "system-ui, sans-serif"},
+    "dark_css_variables": {"font-stack": "system-ui, sans-serif"},
+}

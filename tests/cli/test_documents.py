@@ -1,0 +1,268 @@
+"""What the README, the pages of the site and the docstrings show is true: every code block is executed or checked (`documents`)."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import itertools
+import pkgutil
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import documents
+import drjit as dr
+import matplotlib
+import pytest
+from documents import ROOT, Runner, blocks, previous_pages
+
+import unrender as ur
+
+DOCS = ROOT / "docs"
+# CONTRIBUTING.md has tests of its own, that follow its text; results.md is made of benchmarks, whose commands take hours.
+PAGES = [
+    ROOT / "README.md",
+    *sorted(page for page in DOCS.rglob("*.md") if page.name not in ("results.md", "contributing.md")),
+]
+SLOW = {
+    "README.md",
+    "quickstart.md",
+    "pixels.md",
+    "poses.md",
+    "runs.md",
+    "watching.md",
+    "exporting.md",
+    "surfaces.md",
+    "volumes.md",
+}
+
+# What the example of a docstring takes as given.
+GIVEN = {
+    "unrender": "",
+    "unrender.exporting.scene_folder.export": """
+        import unrender as ur
+        problem = ur.gallery.problem("indirect-room", resolution=16, texture_resolution=8)
+        result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), 2, run_directory="out/indirect-room-rcv")
+    """,
+    "unrender.gallery.registry.problem": "from unrender.gallery import problem",
+    "unrender.gallery.catalogue.problem": "from unrender.gallery import problem",
+    "unrender.rendering.mitsuba.emissive": "volume = None",
+    "unrender.smoothing.function": """
+        import unrender as ur
+        def f(x): return (x**2).sum(axis=1)
+        theta = [0.5, -0.2]
+    """,
+    "unrender.smoothing.grey_box": """
+        import torch
+        import unrender as ur
+        pictures = torch.ones(3, 4)
+        network = torch.nn.Linear(4, 2)
+        def f(points, items): return (points**2).sum(axis=1)
+    """,
+}
+SLOW_EXAMPLES = {"unrender.exporting.scene_folder.export", "unrender.smoothing.grey_box"}
+ILLUSTRATIONS = {"unrender.core.registry": "a class is shown without its methods"}
+
+
+@pytest.fixture
+def small_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """An empty folder, and few steps and samples whatever a block asks for."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "400")
+    matplotlib.use("Agg")
+    optimize, resume, problem = ur.optimize, ur.resume, ur.gallery.problem
+
+    def few(steps: int | None, seconds: float | None, most: int) -> dict[str, Any]:
+        return {"steps": None if steps is None else min(steps, most), "seconds": None if seconds is None else 0.2}
+
+    def optimize_briefly(*given: Any, steps: Any = None, seconds: Any = None, **options: Any) -> ur.Result:
+        positional = list(given)
+        if len(positional) > 3:
+            steps = positional.pop()
+        return optimize(*positional, **few(steps, seconds, 2), **options)
+
+    def resume_briefly(*given: Any, steps: Any = None, seconds: Any = None, **options: Any) -> ur.Result:
+        return resume(*given, **few(steps, seconds, 4), **options)
+
+    def problem_of_noisy_references(name: str, **options: Any) -> ur.Problem:
+        if "reference_spp" in {option.name for option in ur.gallery.options(name)}:
+            options["reference_spp"] = 4
+        return problem(name, **options)
+
+    monkeypatch.setattr(ur, "optimize", optimize_briefly)
+    monkeypatch.setattr(ur, "resume", resume_briefly)
+    monkeypatch.setattr(ur.gallery, "problem", problem_of_noisy_references)
+    threads = dr.thread_count()
+    yield
+    dr.set_thread_count(threads)
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+
+
+def _parameters() -> list[Any]:
+    return [
+        pytest.param(page, id=str(page.relative_to(ROOT)), marks=[pytest.mark.slow] if page.name in SLOW else [])
+        for page in PAGES
+        if blocks(page)
+    ]
+
+
+@pytest.mark.parametrize("page", _parameters())
+@pytest.mark.usefixtures("small_runs")
+def test_every_block_of_a_page_is_true(
+    page: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = [block.text for block in blocks(page)]
+    if any("import torch" in text for text in texts):
+        pytest.importorskip("torch")
+    if any("ur.register" in text for text in texts):  # what a page registers is gone after it
+        registry = importlib.import_module("unrender.core.registry")
+        monkeypatch.setattr(registry, "_components", dict(registry._components))
+        monkeypatch.setattr(registry, "_state_modules", set(registry._state_modules))
+    for each in itertools.chain(previous_pages(page), [page]):  # one after the other: what comes between is done, too
+        runner = Runner(each.stem, capsys.readouterr)
+        for block in blocks(each):
+            runner.run(block)
+
+
+def test_few_blocks_are_skipped_and_each_says_why():
+    skipped = [block for page in PAGES for block in blocks(page) if block.marker.startswith("skip")]
+    for block in skipped:
+        assert re.fullmatch(r"skip, .{10,}", block.marker), block.place
+    assert len(skipped) <= 4
+
+
+def _docstrings() -> Iterator[tuple[str, str]]:
+    """(qualified name, docstring) of every module, class and function of the package, private ones among them."""
+    for module in pkgutil.walk_packages(ur.__path__, "unrender."):
+        yield from _of_source(module.name)
+    yield from _of_source("unrender")
+
+
+def _of_source(module: str) -> Iterator[tuple[str, str]]:
+    base = ROOT / "src" / Path(*module.split("."))
+    path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and (text := ast.get_docstring(node)):
+            yield (module if isinstance(node, ast.Module) else f"{module}.{node.name}"), text
+
+
+@functools.cache
+def _examples() -> list[tuple[str, str]]:
+    """(qualified name, code) of every indented block of a docstring that is Python."""
+    found = []
+    for name, text in _docstrings():
+        for paragraphs in re.findall(r"(?:(?<=\n\n)|\A)((?: {4}.*\n?|\n(?= {4}))+)", text):
+            code = "\n".join(line[4:] for line in paragraphs.splitlines())
+            try:
+                body = compile(code, name, "exec", ast.PyCF_ONLY_AST).body  # pyright: ignore[reportAttributeAccessIssue]
+            except SyntaxError:
+                continue  # a formula, a table
+            if body:
+                found.append((name, code))
+    return found
+
+
+def test_there_are_examples_in_docstrings():
+    assert {"unrender", "unrender.smoothing.function"} <= {name for name, _ in _examples()}
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        pytest.param(*each, id=each[0], marks=[pytest.mark.slow] if each[0] in SLOW_EXAMPLES else [])
+        for each in _examples()
+    ],
+)
+@pytest.mark.usefixtures("small_runs")
+def test_the_examples_of_docstrings_run(name: str, code: str) -> None:
+    if name in ILLUSTRATIONS:
+        pytest.skip(ILLUSTRATIONS[name])
+    assert name in GIVEN, f"{name}: say in GIVEN what its example takes as given"
+    given = "\n".join(line.removeprefix("        ") for line in GIVEN[name].splitlines())
+    if "torch" in given:
+        pytest.importorskip("torch")
+    namespace: dict[str, Any] = {}
+    exec(given, namespace)
+    exec(code, namespace)
+
+
+def test_the_fields_of_the_documented_problem_file_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = importlib.import_module("unrender.problem.toml_file").__doc__ or ""
+    shown = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    ") or not line)
+    documents.check_toml(shown, "unrender.problem.toml_file")
+
+
+PUBLIC_MODULES = {
+    "images": "unrender.images", "pixels": "unrender.pixels", "losses": "unrender.losses", "optimizers": "unrender.optimizers",
+    "schedules": "unrender.schedules", "preconditioners": "unrender.preconditioners", "smoothed": "unrender.smoothing",
+    "statistics": "unrender.statistics", "metrics": "unrender.evaluation.metrics", "report": "unrender.report",
+    "gallery": "unrender.gallery", "protocols": "unrender.protocols",
+}  # fmt: skip
+
+
+def test_the_reference_has_every_public_name():
+    """By a directive of its own, or by one for its module, which documents what `__all__` lists."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md"))
+    single = set(re.findall(r"auto(?:class|function|exception):: (\w+)$", text, re.MULTILINE))
+    whole = set(re.findall(r"automodule:: ([\w.]+)$", text, re.MULTILINE))
+    for name in ur.__all__:
+        protocol = name in getattr(ur.protocols, "__all__")  # noqa: B009
+        assert name in single or protocol or PUBLIC_MODULES.get(name) in whole, name
+
+
+def test_names_in_the_pages_exist():
+    """`unrender.a.b` and `ur.a.b` in backticks."""
+    for page in PAGES:
+        for name in re.findall(r"(?<!group )`(?:unrender|ur)\.([\w.]+)(?:\(.*?\))?`", page.read_text(encoding="utf-8")):
+            assert _resolve(name.rstrip(".")), f"{page.relative_to(ROOT)}: unrender.{name}"
+
+
+def _resolve(name: str) -> bool:
+    if name.startswith("grey_box"):  # needs PyTorch
+        return (
+            f"def {name.rpartition('.')[2]}" in (ROOT / "src/unrender/smoothing/grey_box.py").read_text()
+            or "." not in name
+        )
+    found: Any = ur
+    parts = name.split(".")
+    for index, part in enumerate(parts):
+        if not hasattr(found, part):
+            try:
+                found = importlib.import_module(".".join(["unrender", *parts[: index + 1]]))
+                continue
+            except ImportError:
+                return False
+        found = getattr(found, part)
+    return True
+
+
+def test_files_and_folders_that_the_design_notes_name_exist():
+    text = (DOCS / "design-notes.md").read_text(encoding="utf-8")
+    for name in re.findall(r"`([\w/]+(?:\.py|/))`", text):
+        assert (ROOT / "src" / "unrender" / name).exists() or (ROOT / name).exists(), name
+
+
+def test_links_of_the_readme_lead_to_files():
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8")):
+        assert (ROOT / target).exists(), target
+
+
+def test_the_stub_has_every_public_name():
+    """What a type checker sees, the names under TYPE_CHECKING, is what `__all__` lists and the module gives."""
+    tree = ast.parse((ROOT / "src/unrender/__init__.py").read_text(encoding="utf-8"))
+    checked = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.asname or alias.name
+        for node in ast.walk(checked)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    plain = {"use", "InputError", "UnrenderError", "VariantError"}
+    assert seen | plain == {*ur.__all__, "grey_box"}
+    assert all(hasattr(ur, name) for name in ur.__all__)
+    assert (ROOT / "src/unrender/py.typed").is_file()
