@@ -15,8 +15,8 @@ from kernels import on_device, recorded
 
 import unrender as ur
 from unrender.rendering.mitsuba import emissive
-from unrender.rendering.mitsuba.integrators import majorant_grid
-from unrender.rendering.mitsuba.integrators.majorant_grid import Cells, MajorantSupergrids
+from unrender.rendering.mitsuba.integrators import majorant_supergrid
+from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids, SupergridTraversal
 from unrender.rendering.renderer import SampleRequest
 
 SHAPE = (17, 33, 22)
@@ -85,7 +85,7 @@ def majorants(of: Any, where: np.ndarray) -> np.ndarray:
     """Those that a walk finds which begins there."""
     count = where.shape[1]
     ray = mi.Ray3f(mi.Point3f(where), mi.Vector3f(0, 0, 1))
-    cells = Cells(tables(of)[1], mi.MediumPtr(of), ray, mi.Float(0), mi.Float(1e-6), None, mi.Bool(True))
+    cells = SupergridTraversal(tables(of)[1], mi.MediumPtr(of), ray, mi.Float(0), mi.Float(1e-6), None, mi.Bool(True))
     return np.array(cells.start().σ̄) * np.ones(count)
 
 
@@ -107,7 +107,7 @@ def test_majorants_bound_the_extinction_everywhere(place: str, wrap: str) -> Non
 @pytest.mark.parametrize("fault", ["neighbours", "place"])
 def test_a_bound_that_forgets_something_is_seen(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """So the test above can fail: cells that look no further than their own voxels, and a grid half a cell away."""
-    monkeypatch.setattr(majorant_grid, "_MARGIN", 1.0)
+    monkeypatch.setattr(majorant_supergrid, "_MARGIN", 1.0)
     if fault == "neighbours":
 
         def narrow(found: Any, shape: tuple[int, int, int], size: int, cells: int) -> Any:
@@ -116,11 +116,11 @@ def test_a_bound_that_forgets_something_is_seen(fault: str, monkeypatch: pytest.
             padded[:, :count] = np.array(found).reshape(shape)
             return mi.Float(padded.reshape(outer, cells, size, inner).max(axis=2).ravel())
 
-        monkeypatch.setattr(majorant_grid, "_pool", narrow)
+        monkeypatch.setattr(majorant_supergrid, "_pool", narrow)
     else:
-        found = majorant_grid.to_local
+        found = majorant_supergrid.to_local
         shift = np.array([[0, 0, 0, 0.05]] * 3)
-        monkeypatch.setattr(majorant_grid, "to_local", lambda volume: found(volume) + shift)
+        monkeypatch.setattr(majorant_supergrid, "to_local", lambda volume: found(volume) + shift)
     cloud = medium()
     where = points(cloud)
     assert not (extinction(cloud, where).max(axis=0) <= majorants(cloud, where)).all()
@@ -137,11 +137,11 @@ def test_majorants_are_those_of_a_loop_over_voxels() -> None:
     grids, found = tables(medium(channels=3, scale=2.0))
     x, y, z = (int(n) for n in found["layout"].numpy().reshape(-1, 4)[-1, :3])
     data = 2.0 * values(3).max(axis=-1)
-    sizes = [majorant_grid.cell_size(n) for n in SHAPE]
+    sizes = [majorant_supergrid.cell_size(n) for n in SHAPE]
     expected = np.full((z + 2, y + 2, x + 2), data.max())
     for cell in np.ndindex(z, y, x):
         box = data[np.ix_(*[reached(c, k, n) for c, k, n in zip(cell, sizes, SHAPE, strict=True)])]
-        bound = min(majorant_grid._MARGIN * box.max(), data.max())
+        bound = min(majorant_supergrid._MARGIN * box.max(), data.max())
         expected[cell[0] + 1, cell[1] + 1, cell[2] + 1] = bound
     np.testing.assert_allclose(found["majorants"].numpy().reshape(expected.shape), expected, rtol=1e-6)
     assert grids.every
@@ -161,7 +161,7 @@ def test_a_walk_uses_up_the_optical_depth_that_it_was_given(place: str) -> None:
     length = np.linalg.norm(b - a, axis=0)
     ray = mi.Ray3f(mi.Point3f(a), mi.Vector3f((b - a) / length))
     near, far = mi.Float(0.1 * length), mi.Float(length)
-    cells = Cells(tables(cloud)[1], mi.MediumPtr(cloud), ray, near, far, None, mi.Bool(True))
+    cells = SupergridTraversal(tables(cloud)[1], mi.MediumPtr(cloud), ray, near, far, None, mi.Bool(True))
     asked = rng.exponential(3, (2, count))
     place_ = cells.start()
     reached = []

@@ -21,8 +21,10 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film, poses
-from unrender.rendering.mitsuba.integrators.path import DELTA_EQUAL, PathPair
+from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 from unrender.rendering.mitsuba.leaves import gradients, set_parameters
 from unrender.rendering.mitsuba.scene_pair import (
@@ -415,12 +417,12 @@ class MitsubaRenderer:
                     sensors = scene.sensors_dr()
                     ray, ray_weight = film.rays_of_many(sensors, films, which, sampler, seed, spp, pixels, count)
                 if what == "tangent":
-                    δ, _ = kernel.sample(dr.ADMode.Forward, scene, tables, sampler, ray, None, radiance)
+                    δ, _ = kernel.sample(dr.ADMode.Forward, scene, tables, sampler, ray, (ReplayState(None, radiance),))
                     return dr.square(δ * ray_weight)
                 if backward:
-                    δL = film.film_adjoint(weights, spp, count) * ray_weight
-                    δLₚ = film.film_adjoint(weightsₚ, spp, count) * ray_weight if pair else None
-                    kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ)
+                    states = ((weights, radiance), (weightsₚ, radianceₚ))[: 2 if pair else 1]
+                    replay = tuple(ReplayState(film.film_adjoint(w, spp, count) * ray_weight, L) for w, L in states)
+                    kernel.sample(dr.ADMode.Backward, scene, tables, sampler, ray, replay, pair)
                     return None
                 L, Lₚ = kernel.sample(dr.ADMode.Primal, scene, tables, sampler, ray, pair=pair)
                 return (L * ray_weight, Lₚ * ray_weight) if pair else L * ray_weight

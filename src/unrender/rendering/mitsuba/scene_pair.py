@@ -23,8 +23,8 @@ import numpy as np
 from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive
-from unrender.rendering.mitsuba.integrators.majorant_grid import MajorantSupergrids
-from unrender.rendering.mitsuba.integrators.path import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
+from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
+from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.renderer import ParameterInfo
 
 SceneDescription = str | Path | dict | Callable[[], Any]

@@ -1,13 +1,10 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """Coarse grids of majorants: a bound of the extinction for each cell of a medium instead of one for all of it.
 
 A medium has one where its extinction is a `gridvolume` of enough voxels (`cell_size`). A cell covers some voxels along each axis; its
 majorant is the greatest extinction of the voxels that interpolation reaches from within, in all channels and, for a pair, in both
 states. Rays walk from cell to cell (Amanatides and Woo 1987), and what they sample in each has the cell's majorant: the
 optical depth of majorants to the next tentative collision is drawn once, and used up cell by cell. So nothing is biased, however
-coarse the cells. Cells beyond the grid, where it repeats, clamps or mirrors, have the majorant of the whole grid.
+coarse the cells. SupergridTraversal beyond the grid, where it repeats, clamps or mirrors, have the majorant of the whole grid.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ import numpy as np
 from unrender.rendering.mitsuba import emissive
 
 _CELLS = 16
-"""Cells along an axis, at most."""
+"""SupergridTraversal along an axis, at most."""
 
 _LEAST = 2
 """Voxels of a cell along an axis, at least."""
@@ -40,7 +37,7 @@ _MARGIN = 1.25
 extinction, ratios of transmittance are noisy, and two states of a pair part at null collisions."""
 
 _ROUNDING = 0.25
-"""Voxels by which the place of a grid may be wrong. Cells look half a voxel further than interpolation does."""
+"""Voxels by which the place of a grid may be wrong. SupergridTraversal look half a voxel further than interpolation does."""
 
 
 class MajorantSupergrids:
@@ -59,7 +56,7 @@ class MajorantSupergrids:
     def __init__(self, media: dict[int, Any]):
         parameters = {number: mi.traverse(medium) for number, medium in media.items()}
         self._voxels = [(of, of["sigma_t.data"].shape) for of in parameters.values() if "sigma_t.data" in of]
-        found = {number: Grid.of(medium, parameters[number]) for number, medium in media.items()}
+        found = {number: MajorantSupergrid.of(medium, parameters[number]) for number, medium in media.items()}
         self._grids = {number: grid for number, grid in found.items() if grid is not None}
         self.every = len(self._grids) == len(found)
         size = max(found, default=0) + 1
@@ -89,7 +86,7 @@ class MajorantSupergrids:
         return parts[0] if len(parts) == 1 else dr.concat(parts)
 
 
-class Grid:
+class MajorantSupergrid:
     """The coarse grid of one medium.
 
     Attributes:
@@ -111,7 +108,7 @@ class Grid:
         self._known: tuple[Any, Any] | None = None
 
     @staticmethod
-    def of(medium: Any, parameters: Any) -> Grid | None:
+    def of(medium: Any, parameters: Any) -> MajorantSupergrid | None:
         """From what `mi.traverse` finds in a medium. None where it is to have one majorant: homogeneous ones, small grids, grids whose
         place is not known."""
         if medium.class_name() != "HeterogeneousMedium" and not emissive.emits(medium):
@@ -125,7 +122,7 @@ class Grid:
             return None
         place = to_local(volume)
         scale = float(parameters["scale"]) if "scale" in parameters else 1.0
-        return None if place is None else Grid(parameters, place, scale)
+        return None if place is None else MajorantSupergrid(parameters, place, scale)
 
     def majorants(self) -> Any:
         """Those of the cells, and around them a layer of the greatest: `mi.Float` of (z + 2, y + 2, x + 2)."""
@@ -217,7 +214,7 @@ def to_local(volume: Any) -> np.ndarray | None:
 
 
 @dataclass
-class Place:
+class DdaState:
     """Where a walk through a medium is. State of Dr.Jit loops, hence mutable.
 
     Attributes:
@@ -233,7 +230,7 @@ class Place:
     border: Any
 
 
-class Uniform:
+class HomogeneousMajorant:
     """One majorant for all of a segment from `near` to `far`: 0 where there is no medium.
 
     No dataclass: Dr.Jit would take it for state of its loops.
@@ -242,23 +239,23 @@ class Uniform:
     def __init__(self, σ̄: Any, near: Any, far: Any):
         self.σ̄, self.near, self.far = σ̄, near, far
 
-    def at_least(self, least: Any) -> Uniform:
+    def at_least(self, least: Any) -> HomogeneousMajorant:
         """The same with majorants of at least so much."""
-        return Uniform(dr.maximum(self.σ̄, least), self.near, self.far)
+        return HomogeneousMajorant(dr.maximum(self.σ̄, least), self.near, self.far)
 
-    def start(self) -> Place:
+    def start(self) -> DdaState:
         """At `near`."""
-        return Place(mi.Float(self.near), mi.Float(self.σ̄), mi.Int32(0), mi.Float(0))
+        return DdaState(mi.Float(self.near), mi.Float(self.σ̄), mi.Int32(0), mi.Float(0))
 
-    def advance(self, place: Place, τ: Any, active: Any) -> Place:
+    def advance(self, place: DdaState, τ: Any, active: Any) -> DdaState:
         """Move on by an optical depth `τ` of majorants: beyond `far` where the medium has not so much left."""
         del active
         place.t = place.t + dr.select(place.σ̄ > 0, τ / place.σ̄, dr.inf)
         return place
 
 
-class Cells:
-    """The cells that a segment crosses. Interface as `Uniform`.
+class SupergridTraversal:
+    """The cells that a segment crosses. Interface as `HomogeneousMajorant`.
 
     Args:
         tables: {"frames", "layout", "majorants"} of `MajorantSupergrids`.
@@ -281,7 +278,7 @@ class Cells:
         self.across = dr.select(moves, dr.select(self.d > 0, self.rate, -self.rate), dr.inf)
         self.way = mi.Vector3i(dr.select(self.d > 0, 1, -1))
 
-    def at_least(self, least: Any) -> Cells:
+    def at_least(self, least: Any) -> SupergridTraversal:
         """The same with majorants of at least so much."""
         found = copy(self)
         found.least = least
@@ -295,17 +292,17 @@ class Cells:
             found = dr.select(self.known, found, self.σ̄)
         return dr.maximum(found, self.least)
 
-    def start(self) -> Place:
+    def start(self) -> DdaState:
         """At `near`: in the cell a little beyond, lest rounding finds one that the segment does not cross."""
         t = mi.Float(self.near)
         beyond = t + 1e-4 * (self.far - t)
         cell = mi.Vector3i(dr.floor(self.o + beyond * self.d))
         edge = mi.Vector3f(cell) + dr.select(self.d > 0, 1, 0)
         border = dr.select(dr.isfinite(self.across), (edge - self.o) * self.rate, dr.inf)
-        return Place(t, self._majorant(cell, self.near < self.far), cell, border)
+        return DdaState(t, self._majorant(cell, self.near < self.far), cell, border)
 
     @dr.syntax
-    def advance(self, place: Place, τ: Any, active: Any) -> Place:
+    def advance(self, place: DdaState, τ: Any, active: Any) -> DdaState:
         """Move on by an optical depth `τ` of majorants, from cell to cell; to `far` where the medium has not so much left."""
         τ = mi.Float(τ)
         going = mi.Bool(active)
