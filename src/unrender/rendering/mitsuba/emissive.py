@@ -1,4 +1,3 @@
-
 """A medium that emits and absorbs, and scatters nothing: Mitsuba's plugin `emissive`, for fits of radiance fields.
 
     {"type": "emissive", "sigma_t": volume, "emission": volume}

@@ -23,6 +23,7 @@ import numpy as np
 from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive
+from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.renderer import ParameterInfo
@@ -43,6 +44,11 @@ def load(description: SceneDescription) -> Any:
 
     Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
     """
+    return load_resolved(description)[0]
+
+
+def load_resolved(description: SceneDescription) -> tuple[Any, Any]:
+    """As `load`, and what was loaded: the file's path, or the dictionary."""
     ensure()
     emissive.register()
     if callable(description):
@@ -66,7 +72,7 @@ def load(description: SceneDescription) -> Any:
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
     if not scene.sensors():
         raise InputError("scene: it has no sensor, and nothing can be rendered without one")
-    return scene
+    return scene, Path(description) if isinstance(description, str) else description
 
 
 def _one_line(error: Exception) -> str:
@@ -117,9 +123,10 @@ class ScenePair:
 
     def __init__(self, description: SceneDescription):
         self.description = description
-        self.current = load(description)
+        self.current, resolved = load_resolved(description)
         self.current_parameters = mi.traverse(self.current)
         self.volumetric = bool(media(self.current))
+        self._grid_transforms = extinction_transforms(resolved) if self.volumetric else {}
         self._check_media()
         self._previous: Any = None
         self._previous_parameters: Any = None
@@ -201,7 +208,9 @@ class ScenePair:
     def _grids(self, previous: bool) -> MajorantSupergrids:
         if previous not in self._majorants or not self._majorants[previous].fits():
             scene = self.previous if previous else self.current
-            self._majorants[previous] = MajorantSupergrids({_id(medium): medium for medium in media(scene)})
+            attached = {key: _id(medium) for key, medium in attached_media(scene)}
+            transforms = {attached[key]: matrix for key, matrix in self._grid_transforms.items() if key in attached}
+            self._majorants[previous] = MajorantSupergrids({_id(medium): medium for medium in media(scene)}, transforms)
         return self._majorants[previous]
 
     def _check_media(self) -> None:
@@ -276,9 +285,7 @@ class ScenePair:
 
 def media(scene: Any) -> list[Any]:
     """All participating media of a scene, once for each place they are in, in an order that two loads share."""
-    found = [medium for shape in scene.shapes() for medium in (shape.interior_medium(), shape.exterior_medium())]
-    found += [sensor.get_medium() for sensor in scene.sensors()]
-    return [medium for medium in found if medium is not None]
+    return [medium for _, medium in attached_media(scene)]
 
 
 def _id(medium: Any) -> int:

@@ -10,7 +10,7 @@ coarse the cells. SupergridTraversal beyond the grid, where it repeats, clamps o
 from __future__ import annotations
 
 import functools
-import re
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -44,7 +44,8 @@ class MajorantSupergrids:
     """The coarse grids of the media of one scene.
 
     Args:
-        media: those of the scene, with their registry ids.
+        media: those of the scene, by their registry ids.
+        transforms: (4, 4) by registry id, from [0, 1]³ to the world, of their extinction grids; a medium without one has no supergrid.
 
     Attributes:
         every: whether each medium has one.
@@ -53,10 +54,13 @@ class MajorantSupergrids:
             its majorants begin.
     """
 
-    def __init__(self, media: dict[int, Any]):
+    def __init__(self, media: Mapping[int, Any], transforms: Mapping[int, np.ndarray]):
         parameters = {number: mi.traverse(medium) for number, medium in media.items()}
         self._voxels = [(of, of["sigma_t.data"].shape) for of in parameters.values() if "sigma_t.data" in of]
-        found = {number: MajorantSupergrid.of(medium, parameters[number]) for number, medium in media.items()}
+        found = {
+            number: MajorantSupergrid.of(medium, parameters[number], transforms.get(number))
+            for number, medium in media.items()
+        }
         self._grids = {number: grid for number, grid in found.items() if grid is not None}
         self.every = len(self._grids) == len(found)
         size = max(found, default=0) + 1
@@ -108,19 +112,19 @@ class MajorantSupergrid:
         self._known: tuple[Any, Any] | None = None
 
     @staticmethod
-    def of(medium: Any, parameters: Any) -> MajorantSupergrid | None:
+    def of(medium: Any, parameters: Any, to_world: np.ndarray | None) -> MajorantSupergrid | None:
         """From what `mi.traverse` finds in a medium. None where it is to have one majorant: homogeneous ones, small grids, grids whose
         place is not known."""
         if medium.class_name() != "HeterogeneousMedium" and not emissive.emits(medium):
             return None
-        if "sigma_t.data" not in parameters:
+        if "sigma_t.data" not in parameters or to_world is None:
             return None
         volume = parameters.properties["sigma_t.data"][2]
         if not isinstance(volume, mi.Volume) or volume.class_name() != "GridVolume":
             return None
         if max(parameters["sigma_t.data"].shape[:3]) < _FINE:
             return None
-        place = to_local(volume)
+        place = to_local(volume, to_world)
         scale = float(parameters["scale"]) if "scale" in parameters else 1.0
         return None if place is None else MajorantSupergrid(parameters, place, scale)
 
@@ -185,21 +189,23 @@ def _surrounded(values: Any, cells: tuple[int, ...], outside: Any) -> Any:
     return found
 
 
-def to_local(volume: Any) -> np.ndarray | None:
+def to_local(volume: Any, to_world: np.ndarray) -> np.ndarray | None:
     """The affine map (3, 4) from the world to [0, 1]³ of a `gridvolume`; None where it cannot be told well enough.
 
-    Mitsuba says it in words only. Where its axes are the world's, its box is exact and gives the numbers; elsewhere the words are checked
-    by that box.
+    Args:
+        volume: live.
+        to_world: (4, 4), the map from [0, 1]³ to the world that its description gives.
+
+    The volume's bounding box is the check: a map that does not lead its corners there is refused. Where the grid's axes are the
+    world's, the box is exact and gives the numbers.
     """
-    said = re.search(r"to_local = Transform\[\s*matrix=\[(.+?)\],\s*inverse_transpose", str(volume), re.DOTALL)
-    numbers = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", said[1]) if said else []
-    if said is None or len(numbers) != 16:
-        return None
-    matrix = np.array(numbers, np.float64).reshape(4, 4)
     box = volume.bbox()
     low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
-    if not np.array_equal(matrix[3], [0, 0, 0, 1]) or not np.isfinite([*low, *high]).all() or not (low < high).all():
+    if not np.array_equal(to_world[3], [0, 0, 0, 1]) or not np.isfinite([*low, *high]).all() or not (low < high).all():
         return None
+    if np.linalg.det(to_world) == 0:
+        return None
+    matrix = np.linalg.inv(to_world)
     linear = matrix[:3, :3]
     linear[np.abs(linear) < 1e-6 * np.abs(linear).max()] = 0
     if ((linear != 0).sum(axis=0) == 1).all() and ((linear != 0).sum(axis=1) == 1).all():
