@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.io.volumes import read_grid
 
-MediumKey = tuple[str, str]
-"""The id of a shape or sensor, and "interior", "exterior" or "medium"."""
+MediumKey = tuple[str, str, int]
+"""The id of a shape or sensor; "interior", "exterior" or "medium"; how many of the same name came before, since shapes of an XML file may
+have no id."""
 
 
 def attached_media(scene: mi.Scene) -> list[tuple[MediumKey, Any]]:
@@ -26,7 +28,16 @@ def attached_media(scene: mi.Scene) -> list[tuple[MediumKey, Any]]:
         for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium()))
     ]
     found += [((sensor.id(), "medium"), sensor.get_medium()) for sensor in sensors]
-    return [(key, medium) for key, medium in found if medium is not None]
+    return _numbered((owner, medium) for owner, medium in found if medium is not None)
+
+
+def _numbered(slots: Iterable[tuple[tuple[str, str], Any]]) -> list[tuple[MediumKey, Any]]:
+    before: Counter[tuple[str, str]] = Counter()
+    found = []
+    for owner, held in slots:
+        found.append(((*owner, before[owner]), held))
+        before[owner] += 1
+    return found
 
 
 def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumKey, np.ndarray]:
@@ -35,7 +46,7 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
     Args:
         description: an XML file or a Mitsuba dictionary, of a scene that Mitsuba loads.
 
-    Media and volumes that are ready-made objects have none, as have those of two shapes with one id.
+    Media and volumes that are ready-made objects have none.
     """
     config = mi.parser.ParserConfig(ensure())
     config.merge_equivalent = config.merge_meshes = config.parallel = False
@@ -46,15 +57,14 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
     nodes: Any = state.nodes
-    found: dict[MediumKey, np.ndarray | None] = {}
-    for node in nodes:
-        if node.type not in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
-            continue
-        for name, child in _children(nodes, node).items():
-            if child.type == mi.ObjectType.Medium:
-                key = (node.props.id(), name if node.type == mi.ObjectType.Shape else "medium")
-                found[key] = None if key in found else _transform(nodes, child, folder)
-    return {key: matrix for key, matrix in found.items() if matrix is not None}
+    slots = []
+    for node in _children(nodes, nodes[0]).values():
+        if node.type in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
+            for name, child in _children(nodes, node).items():
+                if child.type == mi.ObjectType.Medium:
+                    owner = node.props.id(), name if node.type == mi.ObjectType.Shape else "medium"
+                    slots.append((owner, _transform(nodes, child, folder)))
+    return {key: matrix for key, matrix in _numbered(slots) if matrix is not None}
 
 
 def _children(nodes: Any, node: Any) -> dict[str, Any]:

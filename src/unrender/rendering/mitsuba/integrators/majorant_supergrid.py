@@ -206,17 +206,17 @@ def to_local(volume: Any, to_world: np.ndarray) -> np.ndarray | None:
     if np.linalg.det(to_world) == 0:
         return None
     matrix = np.linalg.inv(to_world)
+    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) @ to_world.T
+    wrong = np.maximum(np.abs(corners.min(axis=0)[:3] - low), np.abs(corners.max(axis=0)[:3] - high))
+    voxels = np.array([int(n) for n in volume.resolution()])
+    if not ((np.abs(matrix[:3, :3]) @ wrong) * voxels < _ROUNDING).all():
+        return None
     linear = matrix[:3, :3]
     linear[np.abs(linear) < 1e-6 * np.abs(linear).max()] = 0
     if ((linear != 0).sum(axis=0) == 1).all() and ((linear != 0).sum(axis=1) == 1).all():
         matrix[:3, :3] = np.sign(linear) / (high - low)
         matrix[:3, 3] = -np.where(linear > 0, matrix[:3, :3] * low, matrix[:3, :3] * high).sum(axis=1)
-    if np.linalg.det(matrix) == 0:
-        return None
-    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) @ np.linalg.inv(matrix).T
-    wrong = np.maximum(np.abs(corners.min(axis=0)[:3] - low), np.abs(corners.max(axis=0)[:3] - high))
-    voxels = np.array([int(n) for n in volume.resolution()])
-    return matrix[:3] if ((np.abs(matrix[:3, :3]) @ wrong) * voxels < _ROUNDING).all() else None
+    return matrix[:3]
 
 
 @dataclass
