@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
 
@@ -27,8 +28,8 @@ class ReplayState:
         radiance: per lane, as the primal pass returned it (`state_in` of Mitsuba's `prb`).
     """
 
-    δL: mi.Spectrum | None
-    radiance: mi.Spectrum
+    δL: Spectrum | None
+    radiance: Spectrum
 
 
 class PathKernel(Protocol):
@@ -44,7 +45,7 @@ class PathKernel(Protocol):
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
-    ) -> tuple[mi.Spectrum, mi.Spectrum | None]:
+    ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. Call under `dr.suspend_grad()`.
 
         Args:
@@ -102,16 +103,16 @@ class PathContext:
         """Derivatives where paths are replayed, none in a primal pass."""
         return dr.resume_grad(when=not self.primal)
 
-    def initial_radiance(self) -> list[mi.Spectrum]:
+    def initial_radiance(self) -> list[Spectrum]:
         """L of each state before the first vertex: none gathered yet or, to replay, all of it still ahead."""
         return [mi.Spectrum(0 if self.primal else self.replay[state].radiance) for state in range(self.state_count)]
 
-    def accumulate(self, L: Sequence[mi.Spectrum], *parts: Sequence[mi.Spectrum]) -> list[mi.Spectrum]:
+    def accumulate(self, L: Sequence[Spectrum], *parts: Sequence[Spectrum]) -> list[Spectrum]:
         """L of each state after a vertex that gave `parts`: more gathered or, in a replay, less still ahead."""
         combine = operator.add if self.primal else operator.sub
         return [functools.reduce(combine, of_state) for of_state in zip(L, *parts, strict=True)]
 
-    def adjoint_sum(self, contributions: Sequence[mi.Spectrum]) -> mi.Spectrum:
+    def adjoint_sum(self, contributions: Sequence[Spectrum]) -> Spectrum:
         """Σ δL · contribution over the states; the contribution itself in forward mode."""
         if self.forward:
             return contributions[0]
@@ -129,8 +130,8 @@ class ScatteringVertex:
     """
 
     interaction: mi.Interaction3f
-    pdf: mi.Float
-    delta: mi.Bool
+    pdf: Float
+    delta: Bool
 
 
 def total(parts: Sequence[Any]) -> Any:
@@ -138,12 +139,12 @@ def total(parts: Sequence[Any]) -> Any:
     return functools.reduce(operator.add, parts)
 
 
-def largest(spectra: Sequence[mi.Spectrum]) -> mi.Float:
+def largest(spectra: Sequence[Spectrum]) -> Float:
     """The largest channel of all states, per lane."""
     return functools.reduce(dr.maximum, [dr.max(spectrum) for spectrum in spectra])
 
 
-def relative(value: mi.Spectrum) -> mi.Spectrum:
+def relative(value: Spectrum) -> Spectrum:
     """value / detach(value), 0 where it is zero: one, with the derivative of the logarithm."""
     primal = dr.detach(value)
     return dr.select(primal != 0, value / primal, 0)

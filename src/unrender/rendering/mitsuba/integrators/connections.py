@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators import tracking
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import PathContext, largest
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 
@@ -25,9 +26,9 @@ class ConnectionSample:
     """
 
     ray: mi.Ray3f
-    t: mi.Float
+    t: Float
     medium: mi.MediumPtr
-    length: mi.Float
+    length: Float
 
     @staticmethod
     def empty() -> ConnectionSample:
@@ -43,7 +44,7 @@ class ConnectionSample:
         self.medium = dr.select(take, segment.media[0], self.medium)
         self.t = dr.select(take, segment.near + noise.next_1d() * length, self.t)
 
-    def optical_depth(self, medium: mi.MediumPtr) -> mi.Spectrum:
+    def optical_depth(self, medium: mi.MediumPtr) -> Spectrum:
         """The optical depth that this point stands for, in `medium`. Its derivative is that of -log T, unbiased."""
         mei = tracking.medium_interaction(self.ray, self.t)
         return self.length * medium.get_scattering_coefficients(mei, self.length > 0)[2]
@@ -63,9 +64,9 @@ class Connection:
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
-    T: list[mi.Spectrum]
+    T: list[Spectrum]
     sample: ConnectionSample
-    active: mi.Bool
+    active: Bool
 
 
 @dr.syntax
@@ -76,8 +77,8 @@ def connect(
     medium: mi.MediumPtr,
     sampler: Any,
     noise: Any,
-    active: mi.Bool,
-) -> tuple[list[mi.Spectrum], ConnectionSample]:
+    active: Bool,
+) -> tuple[list[Spectrum], ConnectionSample]:
     """Transmittance of each state from `vertex`, which light leaves into `medium`, to `target`.
 
     With `noise`, random numbers of its own, also a point of the connection.
@@ -94,7 +95,8 @@ def _connection_segment(
     context: PathContext, target: mi.Point3f, way: Connection, sampler: Any, noise: Any
 ) -> Connection:
     ray, medium, active = way.ray, way.medium, way.active
-    si = context.scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=False, active=active)
+    scene: Any = context.scene
+    si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=False, active=active)
     inside = active & (medium != None)  # noqa: E711 (a comparison per lane)
     near, far = tracking.clip_segment(medium, ray, dr.minimum(si.t, ray.maxt), inside)
     segment = MediumSegment(context.tables, context.states.media(medium), ray, near, far, inside)

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
 
 
-def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
     """The power heuristic with exponent 2, detached."""
     a, b = dr.square(pdf_a), dr.square(pdf_b)
     return dr.detach(dr.select(a > 0, a / (a + b), 0))
@@ -24,9 +25,9 @@ def direct_emission(
     context: PathContext,
     last: ScatteringVertex,
     surfaces: Sequence[mi.SurfaceInteraction3f],
-    β: Sequence[mi.Spectrum],
-    active: mi.Bool,
-) -> list[mi.Spectrum]:
+    β: Sequence[Spectrum],
+    active: Bool,
+) -> list[Spectrum]:
     """Le of each state: what the emitter at a surface (or the environment) adds to a path that was sampled without looking for it.
 
     Args:
@@ -54,14 +55,12 @@ class EmitterConnection:
         active: lanes that found one; narrowed by the caller where the emitter is occluded.
     """
 
-    def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool):
+    def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
         self._context, self._vertex = context, vertex
         self.ds, _ = context.scene.sample_emitter_direction(vertex, sample, False, active)
         self.active = active & (self.ds.pdf != 0)
 
-    def contributions(
-        self, β: Sequence[mi.Spectrum], values: Sequence[mi.Spectrum], pdf: mi.Float
-    ) -> list[mi.Spectrum]:
+    def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
         """Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached where the caller resumes gradients.
 
         Args:

@@ -55,7 +55,7 @@ class MajorantSupergrids:
     """
 
     def __init__(self, media: Mapping[int, Any], transforms: Mapping[int, np.ndarray]):
-        parameters = {number: mi.traverse(medium) for number, medium in media.items()}
+        parameters: dict[int, Any] = {number: mi.traverse(medium) for number, medium in media.items()}
         self._voxels = [(of, of["sigma_t.data"].shape) for of in parameters.values() if "sigma_t.data" in of]
         found = {
             number: MajorantSupergrid.of(medium, parameters[number], transforms.get(number))
@@ -104,7 +104,8 @@ class MajorantSupergrid:
         self._parameters = parameters
         self._scale = scale
         *shape, self._channels = parameters["sigma_t.data"].shape
-        self.voxels: tuple[int, int, int] = tuple(int(n) for n in shape[::-1])
+        z, y, x = shape
+        self.voxels = int(x), int(y), int(z)
         self._cell = tuple(cell_size(n) for n in self.voxels)
         self.cells = tuple(-(-n // k) for n, k in zip(self.voxels, self._cell, strict=True))
         self.size = int(np.prod([n + 2 for n in self.cells]))

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators import emitters, specular
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import (
     PathContext,
     ReplayState,
@@ -43,13 +44,13 @@ class PathState:
     """
 
     ray: mi.Ray3f
-    depth: mi.UInt32
-    L: list[mi.Spectrum]
-    δL: mi.Spectrum
-    β: list[mi.Spectrum]
-    η: mi.Float
+    depth: UInt32
+    L: list[Spectrum]
+    δL: Spectrum
+    β: list[Spectrum]
+    η: Float
     last: ScatteringVertex
-    active: mi.Bool
+    active: Bool
 
 
 class BsdfDirection:
@@ -66,10 +67,10 @@ class BsdfDirection:
     def __init__(
         self,
         bs: mi.BSDFSample3f,
-        pdf: mi.Float,
-        delta: mi.Bool,
-        values: list[mi.Spectrum],
-        weights: list[mi.Spectrum],
+        pdf: Float,
+        delta: Bool,
+        values: list[Spectrum],
+        weights: list[Spectrum],
     ):
         self.bs, self.pdf, self.delta, self.values, self.weights = bs, pdf, delta, values, weights
 
@@ -103,7 +104,7 @@ class PathPair:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
-    ) -> tuple[mi.Spectrum, mi.Spectrum | None]:
+    ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
         path = PathState(
@@ -131,7 +132,7 @@ class PathPair:
         si = context.geometry.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
         )
-        surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))
+        surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))  # pyright: ignore[reportArgumentType]
 
         # ---------------------- Direct emission ----------------------
         Le = emitters.direct_emission(context, path.last, surfaces, path.β, path.active)
@@ -168,12 +169,12 @@ class PathPair:
     def _sample_emitter(
         self,
         context: PathContext,
-        β: Sequence[mi.Spectrum],
+        β: Sequence[Spectrum],
         surfaces: Sequence[mi.SurfaceInteraction3f],
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
-        active: mi.Bool,
-    ) -> list[mi.Spectrum]:
+        active: Bool,
+    ) -> list[Spectrum]:
         """Ld of each state, by next-event estimation."""
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -195,7 +196,7 @@ class PathPair:
         surfaces: Sequence[mi.SurfaceInteraction3f],
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
-        active: mi.Bool,
+        active: Bool,
     ) -> BsdfDirection:
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         samples = sampler.next_1d(), sampler.next_2d()
@@ -218,9 +219,9 @@ class PathPair:
         self,
         context: PathContext,
         path: PathState,
-        Le: Sequence[mi.Spectrum],
-        Ld: Sequence[mi.Spectrum],
-        values: Sequence[mi.Spectrum],
+        Le: Sequence[Spectrum],
+        Ld: Sequence[Spectrum],
+        values: Sequence[Spectrum],
     ) -> None:
         """Back-propagate the derivative of this vertex, or carry tangents forward through it.
 

@@ -8,17 +8,19 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-Pointer = TypeVar("Pointer", mi.BSDFPtr, mi.EmitterPtr, mi.ShapePtr, mi.MediumPtr)
+from unrender.rendering.mitsuba.integrators.array_types import UInt32
+
+Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
 
 
-def registry_id(pointer: Any) -> mi.UInt32:
+def registry_id(pointer: Any) -> UInt32:
     """The registry id of each lane's object, 0 for none."""
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
-def remap(table: mi.UInt32, pointer: Pointer) -> Pointer:
+def remap(table: UInt32, pointer: Pointer) -> Pointer:
     """The previous scene's object for the current scene's `pointer`; `table` is one of `ScenePair.tables()`."""
-    return dr.reinterpret_array(type(pointer), dr.gather(mi.UInt32, table, registry_id(pointer)))
+    return dr.reinterpret_array(type(pointer), dr.gather(mi.UInt32, table, registry_id(pointer)))  # pyright: ignore[reportReturnType]
 
 
 class StatePointers:

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.array_types import Spectrum
 from unrender.rendering.mitsuba.integrators.base import ReplayState
 
 
@@ -28,7 +29,7 @@ class PrbKernel:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
-    ) -> tuple[mi.Spectrum, None]:
+    ) -> tuple[Spectrum, None]:
         """See `PathKernel.sample`. Raises `ValueError` for pairs and for other geometry, which `prb` does not know."""
         del tables
         if pair or geometry is not None:

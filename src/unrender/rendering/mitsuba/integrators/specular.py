@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import PathContext
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
@@ -33,14 +34,14 @@ class DeltaLobes:
         tables: Mapping[str, Any],
         bsdf: mi.BSDFPtr,
         bs: mi.BSDFSample3f,
-        samples: tuple[mi.Float, mi.Point2f],
-        active: mi.Bool,
-        delta: mi.Bool,
+        samples: tuple[Float, mi.Point2f],
+        active: Bool,
+        delta: Bool,
     ):
         self._kind = dr.gather(mi.UInt32, tables["delta"], registry_id(bsdf), active)
         self._bs, self._samples, self._delta = bs, samples, delta
 
-    def _value(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
+    def _value(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Spectrum:
         """The value of the sampled lobe in one state; 1 for BSDFs whose specular lobes do not change.
 
         A conductor's, dielectric's or plastic's is had by sampling that lobe alone, with probability one; a mask's null lobe from
@@ -62,8 +63,8 @@ class DeltaLobes:
         context: PathContext,
         bsdfs: Sequence[mi.BSDFPtr],
         surfaces: Sequence[mi.SurfaceInteraction3f],
-        values: list[mi.Spectrum],
-        weights: list[mi.Spectrum],
+        values: list[Spectrum],
+        weights: list[Spectrum],
     ) -> None:
         """Put the lobes' values in the place of what BSDF evaluations gave for them, and those of the previous state into its weight."""
         bs = self._bs
@@ -78,12 +79,12 @@ class DeltaLobes:
 
 
 def sampling_weights(
-    values: Sequence[mi.Spectrum],
-    pdf: mi.Float,
-    weight: mi.Spectrum,
-    smooth: mi.Bool,
-    delta: mi.Bool,
-) -> list[mi.Spectrum]:
+    values: Sequence[Spectrum],
+    pdf: Float,
+    weight: Spectrum,
+    smooth: Bool,
+    delta: Bool,
+) -> list[Spectrum]:
     """Sampling weight of each state for a direction that the current state sampled: the BSDF's whole value over its whole density,
     which both states share; the sampled lobe's own weight where it is perfectly specular.
 

@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import largest, total
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import (
     DdaState,
@@ -27,7 +28,7 @@ _POINTS = 4.0
 """Tentative points on a segment, in the mean at least, where a derivative is looked for: an empty medium has none of its own."""
 
 
-def medium_interaction(ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
+def medium_interaction(ray: mi.Ray3f, t: Float) -> mi.MediumInteraction3f:
     """The point of a medium at distance `t` along a ray."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
@@ -39,7 +40,7 @@ def medium_interaction(ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
     return mei
 
 
-def clip_segment(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+def clip_segment(medium: mi.MediumPtr, ray: mi.Ray3f, reach: Float, active: Bool) -> tuple[Float, Float]:
     """From where to where a ray that ends at `reach` is inside the bounding box of a medium; (0, 0) where it is not."""
     hit, near, far = medium.intersect_aabb(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, reach)
@@ -66,14 +67,14 @@ class MediumSegment:
         tables: Mapping[str, Any],
         media: Sequence[mi.MediumPtr],
         ray: mi.Ray3f,
-        near: mi.Float,
-        far: mi.Float,
-        active: mi.Bool,
+        near: Float,
+        far: Float,
+        active: Bool,
     ):
         self.media, self.ray, self.near, self.far = media, ray, near, far
         self.majorant = self._majorant(tables, active)
 
-    def _majorant(self, tables: Mapping[str, Any], active: mi.Bool) -> HomogeneousMajorant | SupergridTraversal:
+    def _majorant(self, tables: Mapping[str, Any], active: Bool) -> HomogeneousMajorant | SupergridTraversal:
         supergrids = "majorants" in tables
         σ̄ = None
         if not (supergrids and tables["every"]):
@@ -84,16 +85,16 @@ class MediumSegment:
             return SupergridTraversal(tables, self.media[0], self.ray, self.near, self.far, σ̄, active)
         return HomogeneousMajorant(σ̄, self.near, self.far)
 
-    def at(self, t: mi.Float) -> mi.MediumInteraction3f:
+    def at(self, t: Float) -> mi.MediumInteraction3f:
         """The point at distance `t` along the ray."""
         return medium_interaction(self.ray, t)
 
-    def extinctions(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Spectrum]:
+    def extinctions(self, mei: mi.MediumInteraction3f, active: Bool) -> list[Spectrum]:
         """σₜ of each state."""
         return [medium.get_scattering_coefficients(mei, active)[2] for medium in self.media]
 
 
-def sample_optical_depth(u: mi.Float) -> mi.Float:
+def sample_optical_depth(u: Float) -> Float:
     """The optical depth of majorants to the next tentative collision, from a uniform number."""
     return -dr.log(1 - u)
 
@@ -113,15 +114,15 @@ class FreeFlight:
     """
 
     dda: DdaState
-    β: list[mi.Spectrum]
-    collides: mi.Bool
-    active: mi.Bool
+    β: list[Spectrum]
+    collides: Bool
+    active: Bool
 
 
 @dr.syntax
 def sample_free_flight(
-    segment: MediumSegment, β: Sequence[mi.Spectrum], sampler: Any, active: mi.Bool
-) -> tuple[mi.Float, mi.Bool, list[mi.Spectrum]]:
+    segment: MediumSegment, β: Sequence[Spectrum], sampler: Any, active: Bool
+) -> tuple[Float, Bool, list[Spectrum]]:
     """Delta tracking through a segment.
 
     A tentative collision is real with a probability that weighs all channels of all states by their throughput: the
@@ -137,7 +138,7 @@ def sample_free_flight(
     return flight.dda.t, flight.collides, _scattered(segment, flight)
 
 
-def _scattered(segment: MediumSegment, flight: FreeFlight) -> list[mi.Spectrum]:
+def _scattered(segment: MediumSegment, flight: FreeFlight) -> list[Spectrum]:
     """Throughput of each state behind the collision. Only here, since an albedo is dear to look up and null collisions need none."""
     mei, collides = segment.at(flight.dda.t), flight.collides
     σₛ = [medium.get_scattering_coefficients(mei, collides)[0] for medium in segment.media]
@@ -176,12 +177,12 @@ class RatioTracking:
     """
 
     dda: DdaState
-    T: list[mi.Spectrum]
-    active: mi.Bool
+    T: list[Spectrum]
+    active: Bool
 
 
 @dr.syntax
-def estimate_transmittance(segment: MediumSegment, sampler: Any, active: mi.Bool) -> list[mi.Spectrum]:
+def estimate_transmittance(segment: MediumSegment, sampler: Any, active: Bool) -> list[Spectrum]:
     """Transmittance of a segment in each state: in closed form where the medium is homogeneous, else by ratio tracking."""
     length = segment.far - segment.near
     active = active & (segment.near < segment.far)
@@ -207,7 +208,7 @@ def _ratio_tracking_step(segment: MediumSegment, walk: RatioTracking, sampler: A
     return walk
 
 
-def _roulette(faint: mi.Bool, sampler: Any) -> mi.Float:
+def _roulette(faint: Bool, sampler: Any) -> Float:
     """The weight of a walk: 1; where it is `faint`, 2 or 0."""
     return dr.select(faint, dr.select(sampler.next_1d() < 0.5, 2.0, 0.0), 1.0)
 
@@ -230,12 +231,12 @@ class Reservoir:
     """
 
     ray: mi.Ray3f
-    t: mi.Float
+    t: Float
     medium: mi.MediumPtr
-    depth: mi.UInt32
-    β: list[mi.Spectrum]
-    weight: mi.Float
-    total: mi.Float
+    depth: UInt32
+    β: list[Spectrum]
+    weight: Float
+    total: Float
 
     @staticmethod
     def empty(state_count: int) -> Reservoir:
@@ -245,7 +246,7 @@ class Reservoir:
         return Reservoir(ray, mi.Float(0), medium, mi.UInt32(0), β, mi.Float(0), mi.Float(0))
 
     @property
-    def inverse_probability(self) -> mi.Float:
+    def inverse_probability(self) -> Float:
         """1 / probability that the kept point was kept; 0 where there is none."""
         return dr.select(self.weight > 0, self.total / self.weight, 0)
 
@@ -262,19 +263,19 @@ class DifferentialRatioTracking:
     """
 
     dda: DdaState
-    β: list[mi.Spectrum]
+    β: list[Spectrum]
     reservoir: Reservoir
-    active: mi.Bool
+    active: Bool
 
 
 @dr.syntax
 def update_reservoir(
     reservoir: Reservoir,
     segment: MediumSegment,
-    depth: mi.UInt32,
-    β: Sequence[mi.Spectrum],
+    depth: UInt32,
+    β: Sequence[Spectrum],
     sampler: Any,
-    active: mi.Bool,
+    active: Bool,
 ) -> Reservoir:
     """Differential ratio tracking (Nimier-David et al. 2022): points of a segment in proportion to transmittance alone.
 
@@ -296,8 +297,8 @@ def update_reservoir(
 def _offer_point(
     segment: MediumSegment,
     majorant: HomogeneousMajorant | SupergridTraversal,
-    c: mi.Float,
-    depth: mi.UInt32,
+    c: Float,
+    depth: UInt32,
     walk: DifferentialRatioTracking,
     sampler: Any,
 ) -> DifferentialRatioTracking:
@@ -328,9 +329,7 @@ def _offer_point(
     return walk
 
 
-def relative_derivatives(
-    segment: MediumSegment, t: mi.Float, collides: mi.Bool, noise: Any, inside: mi.Bool
-) -> list[mi.Spectrum]:
+def relative_derivatives(segment: MediumSegment, t: Float, collides: Bool, noise: Any, inside: Bool) -> list[Spectrum]:
     """Of each state, the derivative of a path's contribution by the medium of a segment, as a share of the contribution (attached; only
     its derivative matters).
 
@@ -352,12 +351,12 @@ def relative_derivatives(
     return found
 
 
-def mis_constant(near: mi.Float, far: mi.Float) -> mi.Float:
+def mis_constant(near: Float, far: Float) -> Float:
     """The constant c of the two estimators of in-scattering's derivative: a collision is weighted by σₛ/(σₛ + c), a point of
     differential ratio tracking by the rest. Any c is unbiased; the density of the latter is about 1/(far - near)."""
     return dr.select(near < far, dr.rcp(far - near), 0)
 
 
-def mis_complement(σₛ: mi.Spectrum, c: mi.Float) -> mi.Spectrum:
+def mis_complement(σₛ: Spectrum, c: Float) -> Spectrum:
     """c/(σₛ + c), 0 where both are."""
     return dr.select(c > 0, c / (σₛ + c), 0)

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import RepeatingSampler
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import (
     PathContext,
     ReplayState,
@@ -41,9 +42,7 @@ class PathStart:
         t: None, or where to scatter.
     """
 
-    def __init__(
-        self, ray: mi.Ray3f, medium: mi.MediumPtr, depth: mi.UInt32, active: mi.Bool, t: mi.Float | None = None
-    ):
+    def __init__(self, ray: mi.Ray3f, medium: mi.MediumPtr, depth: UInt32, active: Bool, t: Float | None = None):
         self.ray, self.medium, self.depth, self.active, self.t = ray, medium, depth, active, t
 
 
@@ -67,15 +66,15 @@ class VolumePathState:
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
-    depth: mi.UInt32
-    L: list[mi.Spectrum]
-    δL: mi.Spectrum
-    β: list[mi.Spectrum]
-    η: mi.Float
+    depth: UInt32
+    L: list[Spectrum]
+    δL: Spectrum
+    β: list[Spectrum]
+    η: Float
     last: ScatteringVertex
     reservoir: Reservoir
-    forced: mi.Bool
-    active: mi.Bool
+    forced: Bool
+    active: Bool
 
 
 class VolumeContext(PathContext):
@@ -101,11 +100,11 @@ class Flight:
     def __init__(
         self,
         segment: MediumSegment,
-        t: mi.Float,
-        collides: mi.Bool,
-        emits: mi.Bool,
-        may_scatter: mi.Bool,
-        derivatives: Sequence[mi.Spectrum],
+        t: Float,
+        collides: Bool,
+        emits: Bool,
+        may_scatter: Bool,
+        derivatives: Sequence[Spectrum],
     ):
         self.segment, self.t, self.collides, self.emits = segment, t, collides, emits
         self.may_scatter, self.derivatives = may_scatter, derivatives
@@ -128,8 +127,8 @@ class Vertex:
         flight: Flight,
         surfaces: list[mi.SurfaceInteraction3f],
         bsdfs: list[mi.BSDFPtr],
-        scatters: mi.Bool,
-        escaped: mi.Bool,
+        scatters: Bool,
+        escaped: Bool,
     ):
         self.si, self.mei = surfaces[0], flight.segment.at(flight.t)
         self.media, self.surfaces, self.bsdfs = flight.segment.media, surfaces, bsdfs
@@ -140,8 +139,8 @@ class Vertex:
         self.interaction = dr.select(scatters, mi.Interaction3f(self.mei), mi.Interaction3f(self.si))
 
     def evaluate(
-        self, context: PathContext, wo: mi.Vector3f, d: mi.Vector3f, at_surface: mi.Bool, at_medium: mi.Bool
-    ) -> tuple[list[mi.Spectrum], mi.Float]:
+        self, context: PathContext, wo: mi.Vector3f, d: mi.Vector3f, at_surface: Bool, at_medium: Bool
+    ) -> tuple[list[Spectrum], Float]:
         """Values of each state, and the current state's density: of the BSDF towards `wo` (local), of the phase function towards `d`."""
         f, pdf = self.bsdfs[0].eval_pdf(context.bsdf_ctx, self.si, wo, at_surface)
         fₘ, pdfₘ = self.media[0].phase_function().eval_pdf(context.phase_ctx, self.mei, d, at_medium)
@@ -170,10 +169,10 @@ class SampledDirection:
         self,
         bs: mi.BSDFSample3f,
         d: mi.Vector3f,
-        pdf: mi.Float,
-        delta: mi.Bool,
-        values: list[mi.Spectrum],
-        weights: list[mi.Spectrum],
+        pdf: Float,
+        delta: Bool,
+        values: list[Spectrum],
+        weights: list[Spectrum],
     ):
         self.bs, self.d, self.pdf, self.delta, self.values, self.weights = bs, d, pdf, delta, values, weights
         self.null = delta & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -228,14 +227,14 @@ class VolumePair:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
-    ) -> tuple[mi.Spectrum, mi.Spectrum | None]:
+    ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. See `PathKernel.sample`; `tables` has also the entries of `ScenePair.media()` and `.majorants()`.
 
         Raises `ValueError` for other geometry than the scene's: posed shapes and media do not meet.
         """
         if geometry is not None:
             raise ValueError("media: expected the scene's own geometry")
-        camera_medium = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
+        camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
         start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
         context = VolumeContext(start, mode, scene, tables, replay, pair)
         noise = None if context.primal else independent(sampler, dr.width(ray))
@@ -287,7 +286,7 @@ class VolumePair:
             scatters = scatters & ~flight.emits
 
         # ---------------------- Direct emission ----------------------
-        surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))
+        surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))  # pyright: ignore[reportArgumentType]
         Le = emitters.direct_emission(context, path.last, surfaces, path.β, escaped)
 
         # ---------------------- Emitter sampling ----------------------
@@ -346,7 +345,7 @@ class VolumePair:
 
     def _sample_emitter(
         self, context: VolumeContext, path: VolumePathState, vertex: Vertex, sampler: Any, noise: Any
-    ) -> tuple[list[mi.Spectrum], ConnectionSample]:
+    ) -> tuple[list[Spectrum], ConnectionSample]:
         """Ld of each state, by next-event estimation, and a point of the connection."""
         si = vertex.si
         smooth = mi.has_flag(vertex.bsdfs[0].flags(), mi.BSDFFlags.Smooth)
@@ -387,7 +386,7 @@ class VolumePair:
         path: VolumePathState,
         flight: Flight,
         connection: ConnectionSample,
-        contributions: tuple[Sequence[mi.Spectrum], ...],
+        contributions: tuple[Sequence[Spectrum], ...],
     ) -> None:
         """Back-propagate the derivative of this segment and vertex, or carry tangents forward through them.
 
@@ -406,7 +405,7 @@ class VolumePair:
             else:
                 dr.backward_from(context.adjoint_sum(Lo), flags=_KEEP)
 
-    def _go_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> mi.Bool:
+    def _go_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> Bool:
         """Leave the vertex in the sampled direction. Tells which lanes scattered, or met a boundary that turned them."""
         si, bs, scatters, meets = vertex.si, direction.bs, vertex.scatters, vertex.meets
         connects = path.medium.use_emitter_sampling()
@@ -424,7 +423,7 @@ class VolumePair:
         )
         return moved
 
-    def _in_scattering(self, context: VolumeContext, kept: Reservoir, noise: Any) -> mi.Spectrum:
+    def _in_scattering(self, context: VolumeContext, kept: Reservoir, noise: Any) -> Spectrum:
         """Back-propagate the derivative of the scattering at the kept point, whose light is found by a path of its own; with `Forward`
         the derivative along the tangents is returned, else 0."""
         active = kept.total > 0
@@ -446,7 +445,9 @@ class VolumePair:
 
 def independent(sampler: Any, lanes: int) -> RepeatingSampler:
     """Random numbers apart from those of the path, which is replayed and must meet its own again."""
-    copy = sampler.clone()
-    bits = dr.reinterpret_array(mi.UInt32, copy.next_1d())
-    state, sequence = mi.sample_tea_32(bits, dr.arange(mi.UInt32, lanes))
-    return RepeatingSampler(lanes, mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence)))
+    copy: Any = sampler.clone()
+    bits: Any = dr.reinterpret_array(mi.UInt32, copy.next_1d())
+    lane: Any = dr.arange(mi.UInt32, lanes)
+    state, sequence = mi.sample_tea_32(bits, lane)
+    rng: Any = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
+    return RepeatingSampler(lanes, rng)
