@@ -61,8 +61,10 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
     for node in _children(nodes, nodes[0]).values():
         if node.type in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
             for name, child in _children(nodes, node).items():
-                if child.type == mi.ObjectType.Medium:
-                    owner = node.props.id(), name if node.type == mi.ObjectType.Shape else "medium"
+                side = name if node.type == mi.ObjectType.Shape else "medium"
+                # The parser does not know the type of media that are plugins in Python.
+                if child.type == mi.ObjectType.Medium or side in ("interior", "exterior") or "sigma_t" in child.props:
+                    owner = node.props.id(), side
                     slots.append((owner, _transform(nodes, child, folder)))
     return {key: matrix for key, matrix in _numbered(slots) if matrix is not None}
 
