@@ -12,6 +12,7 @@ import pytest
 import unrender as ur
 from unrender.exporting import scene_folder as exporting
 from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.described import load_described
 from unrender.rendering.mitsuba.poses import Pose
 
 MADE_BEFORE: list[Any] = []
@@ -35,7 +36,7 @@ def start(asked: ur.Problem) -> dict[str, np.ndarray]:
 
 
 def test_a_material_that_tells_no_description_is_one_line(tmp_path: Path) -> None:
-    MADE_BEFORE.append(mi.load_dict({"type": "diffuse"}))
+    MADE_BEFORE.append(mi.load_dict({"type": "roughconductor"}))
     for description in (scene(MADE_BEFORE[0]), lambda: scene(MADE_BEFORE[0])):
         asked = problem(description)
         with pytest.raises(ur.InputError, match=r"^ball\.bsdf: a ready-made .*, which tells no description of itself"):
@@ -44,7 +45,19 @@ def test_a_material_that_tells_no_description_is_one_line(tmp_path: Path) -> Non
     MADE_BEFORE.clear()
 
 
-def test_materials_made_by_mitsuba_in_the_function_are_heard(tmp_path: Path) -> None:
+def test_materials_made_by_load_described_are_exported(tmp_path: Path) -> None:
+    """Also those whose settings are not all parameters."""
+
+    def description() -> dict[str, Any]:
+        return scene(load_described({"type": "roughconductor", "distribution": "ggx", "alpha": 0.25}))
+
+    asked = problem(description, "ball.bsdf.alpha.value")
+    done = ur.export((asked, {"ball.bsdf.alpha.value": np.array(0.5)}), tmp_path / "out")
+    assert done.scene is not None
+    assert 'value="ggx"' in done.scene.read_text()
+
+
+def test_diffuse_materials_made_by_mitsuba_are_read_off_the_object(tmp_path: Path) -> None:
     """One object in two shapes stays one material."""
 
     def description() -> dict[str, Any]:

@@ -15,7 +15,7 @@ from test_volume_gradients import limit, own, scores
 from test_volume_pair import changed, runs, volpath
 from zscores import agree
 
-from unrender.rendering.mitsuba.integrators import majorant_grid
+from unrender.rendering.mitsuba.integrators import majorant_supergrid
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -55,7 +55,7 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
         runs(renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected
     )
     assert verdict, figures
-    monkeypatch.setattr(majorant_grid, "_MARGIN", 0.5)
+    monkeypatch.setattr(majorant_supergrid, "_MARGIN", 0.5)
     wrong = MitsubaRenderer(several(), DEPTH)
     verdict, figures = agree(runs(wrong.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
     assert not verdict, f"majorants of half the extinction went unseen: {figures}"
@@ -94,7 +94,7 @@ def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
 @pytest.mark.slow
 def test_gradients_of_voxels_agree_with_finite_differences_cell_by_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     """Empty, thin, dense ones, and those at the majorant of their cell."""
-    monkeypatch.setattr(majorant_grid, "_FINE", 2)
+    monkeypatch.setattr(majorant_supergrid, "_FINE", 2)
     renderer = MitsubaRenderer(scene(voxels(), lights="sky"), 2)
     found = scores(renderer, own(renderer), 32)
     assert renderer.pair.majorants(previous=False, both=True)
@@ -107,7 +107,7 @@ def test_gradients_are_those_of_one_majorant(monkeypatch: pytest.MonkeyPatch) ->
     weight = np.random.default_rng(2).uniform(0.2, 1.8, (1, SIZE, SIZE, 3))
 
     def sums(fine: int) -> np.ndarray:
-        monkeypatch.setattr(majorant_grid, "_FINE", fine)
+        monkeypatch.setattr(majorant_supergrid, "_FINE", fine)
         renderer = MitsubaRenderer(scene(sparse(), lights="sky"), 3)
         assert bool(renderer.pair.majorants(previous=False, both=False)) == (fine < VOXELS)
         keys = [key for key in media_keys(renderer) if key.endswith("sigma_t.data")]

@@ -136,7 +136,7 @@ def test_gradients_of_voxels_agree_with_finite_differences() -> None:
 @pytest.mark.slow
 def test_without_differential_ratio_tracking_black_and_empty_voxels_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """So the test above can fail: collisions alone find no derivative where nothing collides or scatters."""
-    monkeypatch.setattr(tracking, "balance", lambda near, far: near * 0)
+    monkeypatch.setattr(tracking, "mis_constant", lambda near, far: near * 0)
     renderer = MitsubaRenderer(scene(voxels(), lights="sky"), 2)
     found = scores(renderer, own(renderer), 16)
     wrong = {name for name, z in found.items() if abs(z) > limit(len(found))}

@@ -1,7 +1,7 @@
 """Scene dictionaries that hold ready-made Mitsuba objects, turned into ones that name files.
 
-A mesh, a bitmap or a grid goes to a file as it is. A material cannot be read back off its object; but whoever made it called
-`mitsuba.load_dict`, so descriptions are listened for while a function makes its dictionary.
+A mesh, a bitmap or a grid goes to a file as it is. Of a material the description is known if it was made by `load_described`; plain
+diffuse ones are read off the object.
 """
 
 from __future__ import annotations
@@ -16,26 +16,16 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
+from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """The folders of a scene's files."""
 
 
-def listen(make: Callable[[], Any]) -> tuple[Any, list[tuple[Any, dict[str, Any]]]]:
-    """What `make()` returns, and every object that it made by `mitsuba.load_dict` with its description."""
-    heard: list[tuple[Any, dict[str, Any]]] = []
-    load = mi.load_dict
-
-    def listening(description: dict[str, Any], *arguments: Any, **options: Any) -> Any:
-        made = load(description, *arguments, **options)
-        heard.append((made, description))
-        return made
-
-    mi.load_dict = listening
-    try:
-        return make(), heard
-    finally:
-        mi.load_dict = load
+def make(description: Callable[[], Any]) -> tuple[Any, Recorded]:
+    """What `description()` returns, and the objects that it made by `load_described`, with their descriptions."""
+    with recorded_descriptions() as recorded:
+        return description(), recorded
 
 
 class FilesOnly:
@@ -43,12 +33,12 @@ class FilesOnly:
 
     Args:
         folder: where the files go, in sub-folders.
-        heard: of `listen`.
+        recorded: of `make`.
     """
 
-    def __init__(self, folder: Path, heard: list[tuple[Any, dict[str, Any]]]):
+    def __init__(self, folder: Path, recorded: Recorded):
         self._folder = folder
-        self._heard = heard
+        self._recorded = recorded
         self._placed: list[tuple[Any, str]] = []
 
     def dictionary(self, given: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -75,11 +65,13 @@ class FilesOnly:
         self._placed.append((value, ".".join(place)))
         if isinstance(value, mi.Mesh):
             return self._mesh(value, place)
-        description = next((told for made, told in self._heard if made is value), None)
+        description = next((known for made, known in self._recorded if made is value), None)
+        if description is None and isinstance(value, mi.BSDF):
+            description = diffuse_description(value)
         if description is None:
             raise InputError(
-                f"{'.'.join(place)}: a ready-made {value.class_name()}, which tells no description of itself; make it by "
-                "mitsuba.load_dict inside the function that returns the scene, or give its dictionary"
+                f"{'.'.join(place)}: a ready-made {value.class_name()}, which tells no description of itself; give its dictionary, or "
+                "make it by unrender.rendering.mitsuba.described.load_described inside the function that returns the scene"
             )
         return self.dictionary(description, place)
 
@@ -111,6 +103,35 @@ class FilesOnly:
         path = self._folder / kind / (file_name(".".join(place)) + ending)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+
+def diffuse_description(bsdf: Any) -> dict[str, Any] | None:
+    """The description of a diffuse material of one colour, two-sided or not; None of others, whose settings (distributions, filters) are
+    not all among their parameters."""
+    found = mi.traverse(bsdf)
+    if bsdf.class_name() == "TwoSidedBRDF":
+        sides = {}
+        for side in ("brdf_0", "brdf_1"):
+            key = f"{side}.reflectance.value"
+            owner = found.hierarchy[found.properties[key][2]][0] if key in found else None
+            if owner is not None and (inner := _diffuse(owner, found, key)):
+                sides[side] = inner
+        count = len({key.split(".")[0] for key in found.keys()})  # noqa: SIM118
+        return {"type": "twosided", **sides} if sides and len(sides) == count else None
+    return _diffuse(bsdf, found, "reflectance.value")
+
+
+def _diffuse(bsdf: Any, parameters: Any, key: str) -> dict[str, Any] | None:
+    if bsdf.class_name() != "SmoothDiffuse" or key not in parameters:
+        return None
+    value: Any = parameters[key]
+    flat = [float(x) for x in np.array(value).ravel()]
+    kind = parameters.properties[key][2].class_name()
+    if kind == "UniformSpectrum" and len(flat) == 1:
+        return {"type": "diffuse", "reflectance": flat[0]}
+    if kind == "SRGBReflectanceSpectrum" and len(flat) == 3:
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": flat}}
+    return None
 
 
 def as_bitmap(values: np.ndarray) -> Any:

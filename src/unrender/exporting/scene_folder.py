@@ -91,21 +91,21 @@ def export(
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
-    pair_request = out.with_name(f".{out.name}.{os.getpid()}.part")
+    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         try:
-            pair_request.mkdir(parents=True)
-            notices = maps.write(values, pair_request)
+            partial.mkdir(parents=True)
+            notices = maps.write(values, partial)
             plain = not problem.renderer.pair.emissive
             if plain:
-                notices = _fill(pair_request, problem.renderer, values, problem.max_depth, spp) + notices
+                notices = _fill(partial, problem.renderer, values, problem.max_depth, spp) + notices
             else:
                 notices.append(
                     f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
                 )
-            _swap(pair_request, out)
+            _swap(partial, out)
         finally:
-            shutil.rmtree(pair_request, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
     return Exported(out, out / SCENE if plain else None, tuple(notices))
@@ -126,14 +126,14 @@ def _check_place(out: Path, overwrite: bool) -> None:
         raise InputError(f"export to {out}: holds an earlier export; give --overwrite (overwrite=True) to replace it")
 
 
-def _swap(pair_request: Path, out: Path) -> None:
+def _swap(partial: Path, out: Path) -> None:
     if out.is_dir():
         old = out.with_name(f".{out.name}.{os.getpid()}.old")
         out.rename(old)
-        pair_request.rename(out)
+        partial.rename(out)
         shutil.rmtree(old, ignore_errors=True)
     else:
-        pair_request.rename(out)
+        partial.rename(out)
 
 
 def _fill(
@@ -166,8 +166,8 @@ def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
     """An XML file, or a dictionary without ready-made objects."""
     if isinstance(description, (str, Path)):
         return Path(description)
-    given, heard = ready_made.listen(description) if callable(description) else (description, [])
-    return ready_made.FilesOnly(folder, heard).dictionary(given)
+    given, recorded = ready_made.make(description) if callable(description) else (description, [])
+    return ready_made.FilesOnly(folder, recorded).dictionary(given)
 
 
 def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:

@@ -9,6 +9,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba.described import load_described
+
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
     """A smooth mesh through a grid of points.
@@ -88,7 +90,7 @@ def _mesh(
     name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
 ) -> Any:
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    properties["bsdf"] = load_described(bsdf)
     textured = coordinates is not None
     mesh = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=textured)
     parameters = mi.traverse(mesh)

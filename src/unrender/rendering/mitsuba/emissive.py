@@ -1,6 +1,3 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """A medium that emits and absorbs, and scatters nothing: Mitsuba's plugin `emissive`, for fits of radiance fields.
 
     {"type": "emissive", "sigma_t": volume, "emission": volume}

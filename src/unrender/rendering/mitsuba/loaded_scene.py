@@ -17,7 +17,7 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
-from unrender.rendering.mitsuba.scene_loading import SceneDescription, load
+from unrender.rendering.mitsuba.scene_loading import SceneDescription, load_resolved
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
 __all__ = ["LoadedScene", "loaded_scenes"]
@@ -55,12 +55,13 @@ class LoadedScene:
 
     Attributes:
         scene: as Mitsuba has it.
+        source: what was loaded: the file's path, or the dictionary.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
 
     def __init__(self, description: SceneDescription):
-        self.scene: mi.Scene = load(description)
+        self.scene, self.source = load_resolved(description)
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}

@@ -7,7 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.path import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
+from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
 __all__ = ["ParameterTraits", "normals_key", "parameter_traits", "physical_range"]
 

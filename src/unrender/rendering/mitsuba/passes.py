@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.integrators.base import ReplayState
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
@@ -243,7 +244,5 @@ def _camera_rays(
 
 def _sample(kernel, mode, scene, tables, sampler, ray, replay=(), pair=False, geometry=None) -> tuple[Any, Any]:
     """Call the kernel; `replay`: (loss derivative, radiance of the primal pass) per lane, of the current and of the previous state."""
-    (δL, radiance), (δLₚ, radianceₚ) = (*replay, (None, None), (None, None))[:2]
-    if geometry is None:
-        return kernel.sample(mode, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ)
-    return kernel.sample(mode, scene, tables, sampler, ray, δL, radiance, pair, δLₚ, radianceₚ, geometry)
+    states = tuple(ReplayState(*of_state) for of_state in replay)
+    return kernel.sample(mode, scene, tables or {}, sampler, ray, states, pair, geometry)

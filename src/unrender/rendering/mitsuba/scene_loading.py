@@ -12,8 +12,9 @@ import mitsuba as mi
 from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive
+from unrender.rendering.mitsuba.grid_transforms import attached_media
 
-__all__ = ["SceneDescription", "load", "media"]
+__all__ = ["SceneDescription", "load", "load_resolved", "media"]
 
 SceneDescription = str | Path | dict | Callable[[], Any]
 """An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
@@ -25,6 +26,11 @@ def load(description: SceneDescription) -> mi.Scene:
 
     Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
     """
+    return load_resolved(description)[0]
+
+
+def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]:
+    """As `load`, and what was loaded: the file's path, or the dictionary."""
     ensure()
     emissive.register()
     if callable(description):
@@ -48,7 +54,7 @@ def load(description: SceneDescription) -> mi.Scene:
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
     if not scene.sensors():
         raise InputError("scene: it has no sensor, and nothing can be rendered without one")
-    return scene
+    return scene, Path(description) if isinstance(description, str) else description
 
 
 def _one_line(error: Exception) -> str:
@@ -60,6 +66,4 @@ def _one_line(error: Exception) -> str:
 
 def media(scene: mi.Scene) -> list[mi.Medium]:
     """All participating media of a scene, once for each place they are in, in an order that two loads share."""
-    found = [medium for shape in scene.shapes() for medium in (shape.interior_medium(), shape.exterior_medium())]
-    found += [sensor.get_medium() for sensor in scene.sensors()]
-    return [medium for medium in found if medium is not None]
+    return [medium for _, medium in attached_media(scene)]

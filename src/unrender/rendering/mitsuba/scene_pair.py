@@ -17,8 +17,9 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film
-from unrender.rendering.mitsuba.integrators.majorant_grid import MajorantSupergrids
-from unrender.rendering.mitsuba.integrators.path import DELTA_MASK
+from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
+from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
+from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, parameter_traits, physical_range
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, media
@@ -44,6 +45,7 @@ class ScenePair:
         self._current = LoadedScene(description)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
+        self._grid_transforms = extinction_transforms(self._current.source) if self.volumetric else {}
         self._check_media()
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
@@ -168,7 +170,9 @@ class ScenePair:
     def _grids(self, previous: bool) -> MajorantSupergrids:
         if previous not in self._majorants or not self._majorants[previous].fits():
             scene = self.previous if previous else self.current
-            self._majorants[previous] = MajorantSupergrids({_id(medium): medium for medium in media(scene)})
+            attached = {key: _id(medium) for key, medium in attached_media(scene)}
+            transforms = {attached[key]: matrix for key, matrix in self._grid_transforms.items() if key in attached}
+            self._majorants[previous] = MajorantSupergrids({_id(medium): medium for medium in media(scene)}, transforms)
         return self._majorants[previous]
 
     def _check_media(self) -> None:

@@ -1,22 +1,78 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """The surface path tracer: next-event estimation, multiple importance sampling, roulette, for one state or two, and its adjoint.
 
-Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. A subscript ₚ
-marks the previous state, which rides on the current state's paths (Nicolet et al. 2023, section 5 and appendix B).
+Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. β, L and whatever else
+differs between the states are lists, the current state first; the previous state is traced on the current state's paths.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators import emitters, specular
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
+from unrender.rendering.mitsuba.integrators.base import (
+    PathContext,
+    ReplayState,
+    ScatteringVertex,
+    largest,
+    relative,
+)
+
 ROULETTE_FLOOR = 0.25
 """Roulette looks at the current throughput alone, so that the adjoint can replay it without the previous state. This floor
 keeps paths alive that only the previous state still uses: both images stay unbiased whatever the ratio of throughputs."""
+
+
+@dataclass
+class PathState:
+    """A path's loop state.
+
+    Attributes:
+        ray: of the next segment.
+        depth: segments traced.
+        L: radiance of each state: gathered so far or, in a replay, still to be gathered.
+        δL: derivative of the radiance along the tangents (forward mode).
+        β: throughput of each state.
+        η: relative index of refraction.
+        last: the vertex that `ray` leaves.
+        active: lanes whose path goes on.
+    """
+
+    ray: mi.Ray3f
+    depth: UInt32
+    L: list[Spectrum]
+    δL: Spectrum
+    β: list[Spectrum]
+    η: Float
+    last: ScatteringVertex
+    active: Bool
+
+
+class BsdfDirection:
+    """A direction sampled off a BSDF.
+
+    Attributes:
+        bs: `mi.BSDFSample3f`.
+        pdf: solid angle density, all smooth lobes together.
+        delta: lanes that sampled a perfectly specular lobe.
+        values: of each state, BSDF times cosine, or of the specular lobe where that follows its parameters; attached.
+        weights: of each state, sampling weights; detached.
+    """
+
+    def __init__(
+        self,
+        bs: mi.BSDFSample3f,
+        pdf: Float,
+        delta: Bool,
+        values: list[Spectrum],
+        weights: list[Spectrum],
+    ):
+        self.bs, self.pdf, self.delta, self.values, self.weights = bs, pdf, delta, values, weights
 
 
 class PathPair:
@@ -38,201 +94,142 @@ class PathPair:
         self.rr_depth = rr_depth
         self.changing_delta = changing_delta
 
-    @dr.syntax
     def sample(
         self,
         mode: dr.ADMode,
-        scene: Any,
-        tables: Any,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
         sampler: Any,
-        ray: Any,
-        δL: Any = None,
-        state_in: Any = None,
+        ray: mi.RayDifferential3f,
+        replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
-        δLₚ: Any = None,
-        stateₚ_in: Any = None,
         geometry: Any = None,
-    ) -> tuple[Any, Any]:
-        """Trace one path per lane.
+    ) -> tuple[Spectrum, Spectrum | None]:
+        """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
+        context = PathContext(mode, scene, tables, replay, pair, geometry)
+        path = PathState(
+            ray=mi.Ray3f(dr.detach(ray)),
+            depth=mi.UInt32(0),
+            L=context.initial_radiance(),
+            δL=mi.Spectrum(0),
+            β=[mi.Spectrum(1) for _ in range(context.state_count)],
+            η=mi.Float(1),
+            last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
+            active=mi.Bool(True),
+        )
+        path = self._trace(context, path, sampler)
+        return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
-        Args:
-            mode: `Primal`, or `Backward` to replay the paths of a primal pass and back-propagate `δL` into the parameters
-                of `scene`, with `pair` also `δLₚ` into those of the previous scene (path replay, Vicini et al. 2021), or `Forward` to
-                replay them and carry the tangents of the parameters of `scene` forward. Call under `dr.suspend_grad()`.
-            scene: the current scene.
-            tables: of `ScenePair.tables()`, used with `pair`; its "delta" entry, used with `changing_delta`.
-            sampler: seeded; the same seed replays the same paths.
-            ray: camera rays.
-            δL: adjoint radiance per lane, with `Backward`.
-            state_in: radiance per lane that the primal pass returned, with `Backward` and `Forward`.
-            pair: whether the previous state rides along.
-            δLₚ, stateₚ_in: likewise for the previous state, with `Backward` and `pair`.
-            geometry: what rays meet in place of `scene` (`poses.Assembly`), or None.
+    @dr.syntax
+    def _trace(self, context: PathContext, path: PathState, sampler: Any) -> PathState:
+        label = f"path pair ({context.mode.name})"
+        while dr.hint(path.active, max_iterations=self.max_depth, label=label):
+            path = self._bounce(context, path, sampler)
+        return path
 
-        Returns:
-            radiance of the current and of the previous state per lane, both unbiased; with `Forward` the derivative of the radiance
-            along the tangents, and zero.
+    def _bounce(self, context: PathContext, path: PathState, sampler: Any) -> PathState:
+        """One segment and the vertex at its end."""
+        si = context.geometry.ray_intersect(
+            path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
+        )
+        surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))  # pyright: ignore[reportArgumentType]
+
+        # ---------------------- Direct emission ----------------------
+        Le = emitters.direct_emission(context, path.last, surfaces, path.β, path.active)
+
+        # ---------------------- Emitter sampling ----------------------
+        active_next = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
+        Ld = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next)
+
+        # ------------------ Detached BSDF sampling -------------------
+        direction = self._sample_bsdf(context, surfaces, bsdfs, sampler, active_next)
+        bs = direction.bs
+
+        # ---- Update loop variables based on current interaction -----
+        path.L = context.accumulate(path.L, Le, Ld)
+        if not context.primal:
+            self._differentiate(context, path, Le, Ld, direction.values)
+        path.ray = si.spawn_ray(si.to_world(bs.wo))
+        path.η *= bs.eta
+        path.β = [β * weight for β, weight in zip(path.β, direction.weights, strict=True)]
+        pdf = dr.select(direction.delta, 1, direction.pdf)  # no emitter sample competes with a delta lobe
+        path.last = ScatteringVertex(dr.detach(si, True), pdf, direction.delta)
+
+        # -------------------- Stopping criterion ---------------------
+        active_next &= largest(path.β) > 0
+        q = dr.clip(dr.max(path.β[0]) * dr.square(path.η), ROULETTE_FLOOR, 0.95)
+        roulette = path.depth >= self.rr_depth
+        rr_weight = dr.select(roulette, dr.rcp(q), 1)
+        path.β = [β * rr_weight for β in path.β]
+        active_next &= ~roulette | (sampler.next_1d() < q)
+        path.depth[si.is_valid()] += 1
+        path.active = active_next
+        return path
+
+    def _sample_emitter(
+        self,
+        context: PathContext,
+        β: Sequence[Spectrum],
+        surfaces: Sequence[mi.SurfaceInteraction3f],
+        bsdfs: Sequence[mi.BSDFPtr],
+        sampler: Any,
+        active: Bool,
+    ) -> list[Spectrum]:
+        """Ld of each state, by next-event estimation."""
+        si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
+        active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
+        ds = connection.ds
+        connection.active &= ~context.geometry.ray_test(si.spawn_ray_to(ds.p), connection.active)
+        wo = si.to_local(ds.d)
+        with context.resume_grad():
+            f, pdf = bsdf.eval_pdf(bsdf_ctx, si, wo, connection.active)
+            previous = [
+                bsdfₚ.eval(bsdf_ctx, siₚ, wo, connection.active)
+                for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
+            ]
+            return connection.contributions(β, [f, *previous], pdf)
+
+    def _sample_bsdf(
+        self,
+        context: PathContext,
+        surfaces: Sequence[mi.SurfaceInteraction3f],
+        bsdfs: Sequence[mi.BSDFPtr],
+        sampler: Any,
+        active: Bool,
+    ) -> BsdfDirection:
+        si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
+        samples = sampler.next_1d(), sampler.next_2d()
+        bs, weight = bsdf.sample(bsdf_ctx, si, *samples, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        smooth = active & ~delta
+        with context.resume_grad():
+            f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
+            previous = [
+                bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth) for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
+            ]
+        values = [f, *previous]
+        weights = specular.sampling_weights(values, pdf, weight, smooth, delta)
+        if self.changing_delta and (context.pair or not context.primal):
+            lobes = specular.DeltaLobes(context.tables, bsdf, bs, samples, active, active & delta)
+            lobes.follow(context, bsdfs, surfaces, values, weights)
+        return BsdfDirection(bs, pdf, delta, values, weights)
+
+    def _differentiate(
+        self,
+        context: PathContext,
+        path: PathState,
+        Le: Sequence[Spectrum],
+        Ld: Sequence[Spectrum],
+        values: Sequence[Spectrum],
+    ) -> None:
+        """Back-propagate the derivative of this vertex, or carry tangents forward through it.
+
+        `path.L` holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
         """
-        primal, forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
-        geometry = scene if geometry is None else geometry
-        follow_delta = self.changing_delta and (pair or not primal)
-        bsdf_ctx = mi.BSDFContext()
-
-        # --------------------- Configure loop state ----------------------
-        ray = mi.Ray3f(dr.detach(ray))
-        depth = mi.UInt32(0)
-        L = mi.Spectrum(0 if primal else state_in)
-        Lₚ = mi.Spectrum(stateₚ_in if stateₚ_in is not None else 0)
-        δL = mi.Spectrum(δL if δL is not None else 0)
-        δLₚ = mi.Spectrum(δLₚ if δLₚ is not None else 0)
-        β = mi.Spectrum(1)
-        βₚ = mi.Spectrum(1)
-        η = mi.Float(1)
-        active = mi.Bool(True)
-
-        si_last = dr.zeros(mi.SurfaceInteraction3f)
-        pdf_last = mi.Float(1)
-        delta_last = mi.Bool(True)
-
-        while dr.hint(active, max_iterations=self.max_depth, label=f"path pair ({mode.name})"):
-            si = geometry.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
-            bsdf = si.bsdf(ray)
-
-            # ---------------------- Direct emission ----------------------
-            ds = mi.DirectionSample3f(scene, si=si, ref=si_last)
-            mis = mis_weight(pdf_last, scene.pdf_emitter_direction(si_last, ds, ~delta_last))
-            with dr.resume_grad(when=not primal):
-                Le = β * mis * ds.emitter.eval(si, active)
-            Leₚ = Ldₚ = mi.Spectrum(0)
-            if dr.hint(pair, mode="scalar"):
-                siₚ = mi.SurfaceInteraction3f(si)
-                siₚ.shape = remap(mi.ShapePtr, tables["shape"], si.shape)
-                emitterₚ = remap(mi.EmitterPtr, tables["emitter"], ds.emitter)
-                with dr.resume_grad(when=not primal):
-                    Leₚ = βₚ * mis * emitterₚ.eval(siₚ, active)
-
-            # ---------------------- Emitter sampling ----------------------
-            active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
-            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, _ = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
-            active_em &= ds.pdf != 0
-            active_em &= ~geometry.ray_test(si.spawn_ray_to(ds.p), active_em)
-            inv_pdf = dr.select(active_em, dr.rcp(ds.pdf), 0)
-            wo = si.to_local(ds.d)
-            with dr.resume_grad(when=not primal):
-                f, pdf = bsdf.eval_pdf(bsdf_ctx, si, wo, active_em)
-                mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-                em = scene.eval_emitter_direction(si, ds, active_em) * inv_pdf
-                Ld = dr.select(active_em, β * mis_em * f * em, 0)
-            if dr.hint(pair, mode="scalar"):
-                bsdfₚ = remap(mi.BSDFPtr, tables["bsdf"], bsdf)
-                emitterₚ = remap(mi.EmitterPtr, tables["emitter"], ds.emitter)
-                with dr.resume_grad(when=not primal):
-                    fₚ = bsdfₚ.eval(bsdf_ctx, siₚ, wo, active_em)
-                    emₚ = emitterₚ.eval_direction(siₚ, ds, active_em) * inv_pdf
-                    Ldₚ = dr.select(active_em, βₚ * mis_em * fₚ * emₚ, 0)
-
-            # ------------------ Detached BSDF sampling -------------------
-            sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-            bs, weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            smooth = active_next & ~delta
-            if dr.hint(follow_delta, mode="scalar"):
-                kind = dr.gather(mi.UInt32, tables["delta"], dr.reinterpret_array(mi.UInt32, bsdf), active_next)
-            with dr.resume_grad(when=not primal):
-                f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
-            inv_pdf = dr.select(smooth & (pdf > 0), dr.rcp(pdf), 0)
-            weight = dr.select(delta, weight, dr.detach(f) * inv_pdf)
-            if dr.hint(pair, mode="scalar"):
-                with dr.resume_grad(when=not primal):
-                    valueₚ = bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth)
-                weightₚ = dr.select(delta, weight, dr.detach(valueₚ) * inv_pdf)
-                if dr.hint(follow_delta, mode="scalar"):
-                    with dr.resume_grad(when=not primal):
-                        lobeₚ = self._delta_value(kind, bsdfₚ, siₚ, bs, sample_1, sample_2, active_next & delta)
-                        valueₚ = dr.select(delta, lobeₚ, valueₚ)
-                    changed = delta & (kind != DELTA_EQUAL)
-                    weightₚ = dr.select(changed, dr.detach(lobeₚ) * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0), weightₚ)
-
-            # ---- Update loop variables based on current interaction -----
-            L = (L + Le + Ld) if primal else (L - Le - Ld)
-            if dr.hint(pair, mode="scalar"):
-                Lₚ = (Lₚ + Leₚ + Ldₚ) if primal else (Lₚ - Leₚ - Ldₚ)
-            if dr.hint(not primal, mode="scalar"):
-                with dr.resume_grad():
-                    # L now holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
-                    value = f
-                    if dr.hint(follow_delta, mode="scalar"):
-                        lobe = self._delta_value(kind, bsdf, si, bs, sample_1, sample_2, active_next & delta)
-                        value = dr.select(delta, lobe, f)
-                    Lo = Le + Ld + L * relative(value)
-                    if dr.hint(forward, mode="scalar"):
-                        δL += dr.forward_to(Lo)
-                    else:
-                        Lo = δL * Lo
-                        if dr.hint(pair, mode="scalar"):
-                            Lo += δLₚ * (Leₚ + Ldₚ + Lₚ * relative(valueₚ))
-                        dr.backward_from(Lo)
-            ray = si.spawn_ray(si.to_world(bs.wo))
-            η *= bs.eta
-            β *= weight
-            if dr.hint(pair, mode="scalar"):
-                βₚ *= weightₚ
-            si_last = dr.detach(si, True)
-            pdf_last = dr.select(delta, 1, pdf)  # no emitter sample competes with a delta lobe
-            delta_last = delta
-
-            # -------------------- Stopping criterion ---------------------
-            β_max = dr.max(β)
-            if dr.hint(pair, mode="scalar"):
-                active_next &= (β_max > 0) | (dr.max(βₚ) > 0)
+        with dr.resume_grad():
+            Lo = [e + d + L * relative(value) for e, d, L, value in zip(Le, Ld, path.L, values, strict=True)]
+            if context.forward:
+                path.δL += dr.forward_to(Lo[0])
             else:
-                active_next &= β_max > 0
-            q = dr.clip(β_max * dr.square(η), ROULETTE_FLOOR, 0.95)
-            roulette = depth >= self.rr_depth
-            rr_weight = dr.select(roulette, dr.rcp(q), 1)
-            β *= rr_weight
-            βₚ *= rr_weight
-            active_next &= ~roulette | (sampler.next_1d() < q)
-            depth[si.is_valid()] += 1
-            active = active_next
-
-        return δL if forward else L, Lₚ
-
-    def _delta_value(self, kind, bsdf, si, bs, sample_1, sample_2, active):
-        """The value of the perfectly specular lobe that was sampled, which no BSDF evaluation returns.
-
-        A conductor's, dielectric's or plastic's is had by sampling that lobe alone, with probability one; a mask's null lobe from
-        its null transmission. 1 for BSDFs whose specular lobes do not change. Its derivative is that of the lobe, not of the
-        probability of choosing it, which the weight of an attached sample would add.
-        """
-        value = mi.Spectrum(1)
-        for lobe in mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null:
-            chosen = active & (kind == DELTA_SIMPLE) & mi.has_flag(bs.sampled_type, lobe)
-            ctx = mi.BSDFContext()
-            ctx.type_mask = +lobe
-            again, weight = bsdf.sample(ctx, si, sample_1, sample_2, chosen)
-            value = dr.select(chosen, weight * dr.detach(again.pdf), value)
-        chosen = active & (kind == DELTA_MASK) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        return dr.select(chosen, bsdf.eval_null_transmission(si, chosen), value)
-
-
-DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
-"""Entries of `tables["delta"]`: how a BSDF's perfectly specular lobes follow a change of its parameters."""
-
-
-def remap(pointer: type, table: Any, source: Any) -> Any:
-    """The previous state's object for the current state's `source`, of type `pointer` (`mi.BSDFPtr`, ...)."""
-    return dr.reinterpret_array(pointer, dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, source)))
-
-
-def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
-    """The power heuristic with exponent 2, detached."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.detach(dr.select(a > 0, a / (a + b), 0))
-
-
-def relative(value: Any) -> Any:
-    """value / detach(value), 0 where it is zero: one, with the derivative of the logarithm."""
-    primal = dr.detach(value)
-    return dr.select(primal != 0, value / primal, 0)
+                dr.backward_from(context.adjoint_sum(Lo))

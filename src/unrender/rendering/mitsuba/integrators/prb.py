@@ -1,27 +1,38 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """Mitsuba's own path replay, for parameters that move geometry."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.array_types import Spectrum
+from unrender.rendering.mitsuba.integrators.base import ReplayState
 
 
 class PrbKernel:
-    """Mitsuba's `prb` behind the interface of `PathPair`, for parameters that move geometry: its adjoint carries the
-    continuous part of their derivative. Visibility is left out, so those gradients are biased."""
+    """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.
+    Visibility is left out, so those gradients are biased."""
 
     def __init__(self, max_depth: int):
-        self._integrator = mi.load_dict({"type": "prb", "max_depth": max_depth})
+        self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth})
 
     def sample(
-        self, mode, scene, tables, sampler, ray, δL=None, state_in=None, pair=False, δLₚ=None, stateₚ_in=None
-    ) -> tuple[Any, Any]:
-        """See `PathPair.sample`; never a pair."""
-        del tables, pair, δLₚ, stateₚ_in
-        active = mi.Bool(True)
-        L = self._integrator.sample(mode, scene, sampler, ray, δL, state_in, active)[0]
-        return L, None
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        replay: tuple[ReplayState, ...] = (),
+        pair: bool = False,
+        geometry: Any = None,
+    ) -> tuple[Spectrum, None]:
+        """See `PathKernel.sample`. Raises `ValueError` for pairs and for other geometry, which `prb` does not know."""
+        del tables
+        if pair or geometry is not None:
+            raise ValueError("prb: expected one state and the scene's own geometry")
+        δL, state_in = (replay[0].δL, replay[0].radiance) if replay else (None, None)
+        return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(True))[0], None

@@ -1,19 +1,16 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """Coarse grids of majorants: a bound of the extinction for each cell of a medium instead of one for all of it.
 
 A medium has one where its extinction is a `gridvolume` of enough voxels (`cell_size`). A cell covers some voxels along each axis; its
 majorant is the greatest extinction of the voxels that interpolation reaches from within, in all channels and, for a pair, in both
 states. Rays walk from cell to cell (Amanatides and Woo 1987), and what they sample in each has the cell's majorant: the
 optical depth of majorants to the next tentative collision is drawn once, and used up cell by cell. So nothing is biased, however
-coarse the cells. Cells beyond the grid, where it repeats, clamps or mirrors, have the majorant of the whole grid.
+coarse the cells. SupergridTraversal beyond the grid, where it repeats, clamps or mirrors, have the majorant of the whole grid.
 """
 
 from __future__ import annotations
 
 import functools
-import re
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -25,7 +22,7 @@ import numpy as np
 from unrender.rendering.mitsuba import emissive
 
 _CELLS = 16
-"""Cells along an axis, at most."""
+"""SupergridTraversal along an axis, at most."""
 
 _LEAST = 2
 """Voxels of a cell along an axis, at least."""
@@ -40,14 +37,15 @@ _MARGIN = 1.25
 extinction, ratios of transmittance are noisy, and two states of a pair part at null collisions."""
 
 _ROUNDING = 0.25
-"""Voxels by which the place of a grid may be wrong. Cells look half a voxel further than interpolation does."""
+"""Voxels by which the place of a grid may be wrong. SupergridTraversal look half a voxel further than interpolation does."""
 
 
 class MajorantSupergrids:
     """The coarse grids of the media of one scene.
 
     Args:
-        media: those of the scene, with their registry ids.
+        media: those of the scene, by their registry ids.
+        transforms: (4, 4) by registry id, from [0, 1]³ to the world, of their extinction grids; a medium without one has no supergrid.
 
     Attributes:
         every: whether each medium has one.
@@ -56,10 +54,13 @@ class MajorantSupergrids:
             its majorants begin.
     """
 
-    def __init__(self, media: dict[int, Any]):
-        parameters = {number: mi.traverse(medium) for number, medium in media.items()}
+    def __init__(self, media: Mapping[int, Any], transforms: Mapping[int, np.ndarray]):
+        parameters: dict[int, Any] = {number: mi.traverse(medium) for number, medium in media.items()}
         self._voxels = [(of, of["sigma_t.data"].shape) for of in parameters.values() if "sigma_t.data" in of]
-        found = {number: Grid.of(medium, parameters[number]) for number, medium in media.items()}
+        found = {
+            number: MajorantSupergrid.of(medium, parameters[number], transforms.get(number))
+            for number, medium in media.items()
+        }
         self._grids = {number: grid for number, grid in found.items() if grid is not None}
         self.every = len(self._grids) == len(found)
         size = max(found, default=0) + 1
@@ -89,7 +90,7 @@ class MajorantSupergrids:
         return parts[0] if len(parts) == 1 else dr.concat(parts)
 
 
-class Grid:
+class MajorantSupergrid:
     """The coarse grid of one medium.
 
     Attributes:
@@ -103,7 +104,8 @@ class Grid:
         self._parameters = parameters
         self._scale = scale
         *shape, self._channels = parameters["sigma_t.data"].shape
-        self.voxels: tuple[int, int, int] = tuple(int(n) for n in shape[::-1])
+        z, y, x = shape
+        self.voxels = int(x), int(y), int(z)
         self._cell = tuple(cell_size(n) for n in self.voxels)
         self.cells = tuple(-(-n // k) for n, k in zip(self.voxels, self._cell, strict=True))
         self.size = int(np.prod([n + 2 for n in self.cells]))
@@ -111,21 +113,21 @@ class Grid:
         self._known: tuple[Any, Any] | None = None
 
     @staticmethod
-    def of(medium: Any, parameters: Any) -> Grid | None:
+    def of(medium: Any, parameters: Any, to_world: np.ndarray | None) -> MajorantSupergrid | None:
         """From what `mi.traverse` finds in a medium. None where it is to have one majorant: homogeneous ones, small grids, grids whose
         place is not known."""
         if medium.class_name() != "HeterogeneousMedium" and not emissive.emits(medium):
             return None
-        if "sigma_t.data" not in parameters:
+        if "sigma_t.data" not in parameters or to_world is None:
             return None
         volume = parameters.properties["sigma_t.data"][2]
         if not isinstance(volume, mi.Volume) or volume.class_name() != "GridVolume":
             return None
         if max(parameters["sigma_t.data"].shape[:3]) < _FINE:
             return None
-        place = to_local(volume)
+        place = to_local(volume, to_world)
         scale = float(parameters["scale"]) if "scale" in parameters else 1.0
-        return None if place is None else Grid(parameters, place, scale)
+        return None if place is None else MajorantSupergrid(parameters, place, scale)
 
     def majorants(self) -> Any:
         """Those of the cells, and around them a layer of the greatest: `mi.Float` of (z + 2, y + 2, x + 2)."""
@@ -188,36 +190,38 @@ def _surrounded(values: Any, cells: tuple[int, ...], outside: Any) -> Any:
     return found
 
 
-def to_local(volume: Any) -> np.ndarray | None:
+def to_local(volume: Any, to_world: np.ndarray) -> np.ndarray | None:
     """The affine map (3, 4) from the world to [0, 1]³ of a `gridvolume`; None where it cannot be told well enough.
 
-    Mitsuba says it in words only. Where its axes are the world's, its box is exact and gives the numbers; elsewhere the words are checked
-    by that box.
+    Args:
+        volume: live.
+        to_world: (4, 4), the map from [0, 1]³ to the world that its description gives.
+
+    The volume's bounding box is the check: a map that does not lead its corners there is refused. Where the grid's axes are the
+    world's, the box is exact and gives the numbers.
     """
-    said = re.search(r"to_local = Transform\[\s*matrix=\[(.+?)\],\s*inverse_transpose", str(volume), re.DOTALL)
-    numbers = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", said[1]) if said else []
-    if said is None or len(numbers) != 16:
-        return None
-    matrix = np.array(numbers, np.float64).reshape(4, 4)
     box = volume.bbox()
     low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
-    if not np.array_equal(matrix[3], [0, 0, 0, 1]) or not np.isfinite([*low, *high]).all() or not (low < high).all():
+    if not np.array_equal(to_world[3], [0, 0, 0, 1]) or not np.isfinite([*low, *high]).all() or not (low < high).all():
+        return None
+    if np.linalg.det(to_world) == 0:
+        return None
+    matrix = np.linalg.inv(to_world)
+    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) @ to_world.T
+    wrong = np.maximum(np.abs(corners.min(axis=0)[:3] - low), np.abs(corners.max(axis=0)[:3] - high))
+    voxels = np.array([int(n) for n in volume.resolution()])
+    if not ((np.abs(matrix[:3, :3]) @ wrong) * voxels < _ROUNDING).all():
         return None
     linear = matrix[:3, :3]
     linear[np.abs(linear) < 1e-6 * np.abs(linear).max()] = 0
     if ((linear != 0).sum(axis=0) == 1).all() and ((linear != 0).sum(axis=1) == 1).all():
         matrix[:3, :3] = np.sign(linear) / (high - low)
         matrix[:3, 3] = -np.where(linear > 0, matrix[:3, :3] * low, matrix[:3, :3] * high).sum(axis=1)
-    if np.linalg.det(matrix) == 0:
-        return None
-    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) @ np.linalg.inv(matrix).T
-    wrong = np.maximum(np.abs(corners.min(axis=0)[:3] - low), np.abs(corners.max(axis=0)[:3] - high))
-    voxels = np.array([int(n) for n in volume.resolution()])
-    return matrix[:3] if ((np.abs(matrix[:3, :3]) @ wrong) * voxels < _ROUNDING).all() else None
+    return matrix[:3]
 
 
 @dataclass
-class Place:
+class DdaState:
     """Where a walk through a medium is. State of Dr.Jit loops, hence mutable.
 
     Attributes:
@@ -233,7 +237,7 @@ class Place:
     border: Any
 
 
-class Uniform:
+class HomogeneousMajorant:
     """One majorant for all of a segment from `near` to `far`: 0 where there is no medium.
 
     No dataclass: Dr.Jit would take it for state of its loops.
@@ -242,23 +246,23 @@ class Uniform:
     def __init__(self, σ̄: Any, near: Any, far: Any):
         self.σ̄, self.near, self.far = σ̄, near, far
 
-    def at_least(self, least: Any) -> Uniform:
+    def at_least(self, least: Any) -> HomogeneousMajorant:
         """The same with majorants of at least so much."""
-        return Uniform(dr.maximum(self.σ̄, least), self.near, self.far)
+        return HomogeneousMajorant(dr.maximum(self.σ̄, least), self.near, self.far)
 
-    def start(self) -> Place:
+    def start(self) -> DdaState:
         """At `near`."""
-        return Place(mi.Float(self.near), mi.Float(self.σ̄), mi.Int32(0), mi.Float(0))
+        return DdaState(mi.Float(self.near), mi.Float(self.σ̄), mi.Int32(0), mi.Float(0))
 
-    def advance(self, place: Place, τ: Any, active: Any) -> Place:
+    def advance(self, place: DdaState, τ: Any, active: Any) -> DdaState:
         """Move on by an optical depth `τ` of majorants: beyond `far` where the medium has not so much left."""
         del active
         place.t = place.t + dr.select(place.σ̄ > 0, τ / place.σ̄, dr.inf)
         return place
 
 
-class Cells:
-    """The cells that a segment crosses. Interface as `Uniform`.
+class SupergridTraversal:
+    """The cells that a segment crosses. Interface as `HomogeneousMajorant`.
 
     Args:
         tables: {"frames", "layout", "majorants"} of `MajorantSupergrids`.
@@ -281,7 +285,7 @@ class Cells:
         self.across = dr.select(moves, dr.select(self.d > 0, self.rate, -self.rate), dr.inf)
         self.way = mi.Vector3i(dr.select(self.d > 0, 1, -1))
 
-    def at_least(self, least: Any) -> Cells:
+    def at_least(self, least: Any) -> SupergridTraversal:
         """The same with majorants of at least so much."""
         found = copy(self)
         found.least = least
@@ -295,17 +299,17 @@ class Cells:
             found = dr.select(self.known, found, self.σ̄)
         return dr.maximum(found, self.least)
 
-    def start(self) -> Place:
+    def start(self) -> DdaState:
         """At `near`: in the cell a little beyond, lest rounding finds one that the segment does not cross."""
         t = mi.Float(self.near)
         beyond = t + 1e-4 * (self.far - t)
         cell = mi.Vector3i(dr.floor(self.o + beyond * self.d))
         edge = mi.Vector3f(cell) + dr.select(self.d > 0, 1, 0)
         border = dr.select(dr.isfinite(self.across), (edge - self.o) * self.rate, dr.inf)
-        return Place(t, self._majorant(cell, self.near < self.far), cell, border)
+        return DdaState(t, self._majorant(cell, self.near < self.far), cell, border)
 
     @dr.syntax
-    def advance(self, place: Place, τ: Any, active: Any) -> Place:
+    def advance(self, place: DdaState, τ: Any, active: Any) -> DdaState:
         """Move on by an optical depth `τ` of majorants, from cell to cell; to `far` where the medium has not so much left."""
         τ = mi.Float(τ)
         going = mi.Bool(active)

@@ -1,0 +1,78 @@
+"""Emitters along a path: radiance that its segments meet and radiance that next-event estimation connects to, weighted by MIS.
+
+The visibility (or transmittance) of an emitter is tested apart from its radiance, so that an emitter that is black in one state
+still counts in the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
+from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
+
+
+def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
+    """The power heuristic with exponent 2, detached."""
+    a, b = dr.square(pdf_a), dr.square(pdf_b)
+    return dr.detach(dr.select(a > 0, a / (a + b), 0))
+
+
+def direct_emission(
+    context: PathContext,
+    last: ScatteringVertex,
+    surfaces: Sequence[mi.SurfaceInteraction3f],
+    β: Sequence[Spectrum],
+    active: Bool,
+) -> list[Spectrum]:
+    """Le of each state: what the emitter at a surface (or the environment) adds to a path that was sampled without looking for it.
+
+    Args:
+        last: where the path came from.
+        surfaces: the interaction on the shape of each state.
+        β: throughput of each state.
+        active: lanes that meet a surface or leave the scene.
+    """
+    scene, si = context.scene, surfaces[0]
+    ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
+    mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, active & ~last.delta))
+    emitters = context.states.emitters(ds.emitter)
+    with context.resume_grad():
+        return [
+            throughput * mis * emitter.eval(surface, active)
+            for throughput, emitter, surface in zip(β, emitters, surfaces, strict=True)
+        ]
+
+
+class EmitterConnection:
+    """A point sampled on an emitter, to be connected with a vertex.
+
+    Attributes:
+        ds: `mi.DirectionSample3f`.
+        active: lanes that found one; narrowed by the caller where the emitter is occluded.
+    """
+
+    def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
+        self._context, self._vertex = context, vertex
+        self.ds, _ = context.scene.sample_emitter_direction(vertex, sample, False, active)
+        self.active = active & (self.ds.pdf != 0)
+
+    def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
+        """Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached where the caller resumes gradients.
+
+        Args:
+            β: throughput of each state, transmittance included.
+            values: of the BSDF (times cosine) or phase function, of each state, towards the emitter.
+            pdf: solid angle density with which the current state's BSDF or phase function samples that direction.
+        """
+        ds = self.ds
+        inv_pdf = dr.select(self.active, dr.rcp(ds.pdf), 0)
+        mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+        found = []
+        for throughput, value, emitter in zip(β, values, self._context.states.emitters(ds.emitter), strict=True):
+            radiance = emitter.eval_direction(self._vertex, ds, self.active) * inv_pdf
+            found.append(dr.select(self.active, throughput * mis * value * radiance, 0))
+        return found

@@ -1,0 +1,59 @@
+"""From objects of the current scene to those of the previous one, by gathers from registry id to registry id."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.array_types import UInt32
+
+Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
+
+
+def registry_id(pointer: Any) -> UInt32:
+    """The registry id of each lane's object, 0 for none."""
+    return dr.reinterpret_array(mi.UInt32, pointer)
+
+
+def remap(table: UInt32, pointer: Pointer) -> Pointer:
+    """The previous scene's object for the current scene's `pointer`; `table` is one of `ScenePair.tables()`."""
+    return dr.reinterpret_array(type(pointer), dr.gather(mi.UInt32, table, registry_id(pointer)))  # pyright: ignore[reportReturnType]
+
+
+class StatePointers:
+    """Objects of each traced state: of the current scene alone or, for a pair, of the current and of the previous one.
+
+    Args:
+        tables: of `ScenePair.tables()`; read for a pair only.
+        pair: whether the previous state is traced too.
+    """
+
+    def __init__(self, tables: Mapping[str, Any], pair: bool):
+        self._tables = tables
+        self.pair = pair
+
+    def _of(self, kind: str, pointer: Pointer) -> list[Pointer]:
+        return [pointer, remap(self._tables[kind], pointer)] if self.pair else [pointer]
+
+    def bsdfs(self, bsdf: mi.BSDFPtr) -> list[mi.BSDFPtr]:
+        """Of each state."""
+        return self._of("bsdf", bsdf)
+
+    def emitters(self, emitter: mi.EmitterPtr) -> list[mi.EmitterPtr]:
+        """Of each state."""
+        return self._of("emitter", emitter)
+
+    def media(self, medium: mi.MediumPtr) -> list[mi.MediumPtr]:
+        """Of each state."""
+        return self._of("medium", medium)
+
+    def interactions(self, si: mi.SurfaceInteraction3f) -> list[mi.SurfaceInteraction3f]:
+        """`si` on the shape of each state."""
+        if not self.pair:
+            return [si]
+        siₚ = mi.SurfaceInteraction3f(si)
+        siₚ.shape = remap(self._tables["shape"], si.shape)
+        return [si, siₚ]
