@@ -1,7 +1,7 @@
 # Dr.Jit's stubs know less than its functions return.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
 
-"""Coarse grids of majorants bias nothing: images against `volpath`, pairs against separate renders, gradients against one majorant."""
+"""Majorant supergrids bias nothing: images against `volpath`, pairs against separate renders, gradients against one majorant."""
 
 from __future__ import annotations
 

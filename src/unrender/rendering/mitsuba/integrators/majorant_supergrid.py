@@ -1,4 +1,4 @@
-"""Coarse grids of majorants: a bound of the extinction for each cell of a medium instead of one for all of it.
+"""Majorant supergrids: a bound of the extinction for each cell of a medium instead of one for all of it.
 
 A medium has one where its extinction is a `gridvolume` of enough voxels (`cell_size`). A cell covers some voxels along each axis; its
 majorant is the greatest extinction of the voxels that interpolation reaches from within, in all channels and, for a pair, in both
@@ -28,7 +28,7 @@ _LEAST = 2
 """Voxels of a cell along an axis, at least."""
 
 _FINE = 16
-"""Voxels along some axis from which on there is a coarse grid: the fewest that were measured. On two CPU cores, against one majorant, a
+"""Voxels along some axis from which on there is a supergrid: the fewest that were measured. On two CPU cores, against one majorant, a
 pair of `smoke` took 0.6 of the time at 16³ voxels and 0.66 at 32³, the primal 0.7 and 0.9, at 4 to 13 % more variance of images. A
 sparse grid of 64³ took 0.14 and 0.23, at 29 to 35 % more."""
 
@@ -41,7 +41,7 @@ _ROUNDING = 0.25
 
 
 class MajorantSupergrids:
-    """The coarse grids of the media of one scene.
+    """The majorant supergrids of the media of one scene.
 
     Args:
         media: those of the scene, by their registry ids.
@@ -91,7 +91,7 @@ class MajorantSupergrids:
 
 
 class MajorantSupergrid:
-    """The coarse grid of one medium.
+    """The majorant supergrid of one medium.
 
     Attributes:
         voxels: of the extinction along x, y and z.
