@@ -1,0 +1,36 @@
+"""Figure."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from benchmarks.meta.fig2_exponential.run import HORIZONS, METHODS
+from benchmarks.runner.records import Record
+from matplotlib.figure import Figure
+
+
+def plot(record: Record) -> Figure:
+    """Left: the rate over the steps, with the spread of 20 runs; middle: RMSE; right: one run's gradient and its predicted deviation."""
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    horizon = str(HORIZONS[0])
+    for method, (_, _, _, colour) in METHODS.items():
+        entry = record["methods"][method][horizon]
+        runs = np.array(entry["runs"])
+        axes[0].plot(runs.mean(0), color=colour, label=f"{method}, rate {entry['rate']:g}")
+        axes[0].fill_between(np.arange(runs.shape[1]), runs.min(0), runs.max(0), color=colour, alpha=0.15, lw=0)
+        axes[1].plot(entry["curve"], color=colour, label=f"{method}, rate {entry['rate']:g}")
+    axes[0].axhline(0.5, color="k", ls=":", lw=1)
+    axes[0].set(xlabel="step", ylabel="rate", ylim=(0.4, 0.75), title="mean and range of 20 runs")
+    axes[1].set(xlabel="step", ylabel="RMSE of the rate", yscale="log", title=f"tuned for {horizon} steps")
+    axes[0].legend(fontsize=8)
+    for method in ("meta 24 + 8", "coupled"):
+        entry, colour = record["methods"][method][horizon], METHODS[method][3]
+        g, s = np.array(entry["gradients"])[:200], np.array(entry["deviations"])[:200]
+        axes[2].plot(g, color=colour, label=method)
+        axes[2].fill_between(np.arange(len(g)), g - s, g + s, color=colour, alpha=0.2, lw=0)
+    axes[2].plot(
+        record["methods"]["adam"][horizon]["gradients"][:200], ".", ms=2, color="#d1782a", label="plain samples"
+    )
+    axes[2].set(xlabel="step", ylabel="gradient", ylim=(-6, 4), title="one run: estimate and predicted deviation")
+    axes[2].legend(fontsize=8)
+    return figure
