@@ -13,10 +13,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import unrender as ur
 from benchmarks.internals import method_parts, time_run_folder
 from benchmarks.runner.records import scratch
-
-import unrender as ur
 
 CASES: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {
     "indirect-room, plain": ("indirect-room", {}, "plain", {}),

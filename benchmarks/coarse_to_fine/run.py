@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import method_parts
 
 import unrender as ur
+from benchmarks.internals import method_parts
 
 STATES: Any = ("finest", "reset", "carry", "estimator")
 AFTER = 5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 

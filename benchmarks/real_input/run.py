@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from skimage.transform import resize
+
 from benchmarks.internals import mi
 from benchmarks.runner.catalogue import ROOT
 from benchmarks.runner.records import scratch
-from skimage.transform import resize
 
 TEXTURE = 128
 METHODS = {"plain": ["spp=8", "learning_rate=0.01"], "rcv": ["spp=2", "learning_rate=0.01"]}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
@@ -13,7 +14,7 @@ def plot(record: Record) -> Figure:
     primal = {k: record["primal_ms"][k][0] for k in ("mitsuba_prb", "plain", "pair")}
     steps = {
         "stock loop": record["step_ms"]["stock"],
-        "crossed halves": record["step_ms"]["crossed"][0],
+        "leave-one-out groups": record["step_ms"]["leave-one-out"][0],
         "control variate": record["step_ms"]["rcv"][0],
     }
     for axis, bars, title in zip(axes, (primal, steps), ("primal render", "whole step"), strict=True):

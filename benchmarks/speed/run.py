@@ -13,13 +13,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Key, SampleRequest, dr, mi, prepare, project, stock_scene
 from benchmarks.kernel_history import kernels
 from benchmarks.paths import truth
 from benchmarks.runner.timing import percentiles, turns
 from benchmarks.stock_loop import stock_loop
-
-import unrender as ur
 
 PROBLEMS = ("indirect-room", "glossy-room", "sunlit-vase", "lamp")
 QUICK = {"problem": ("indirect-room",), "resolution": 16, "spp": 2, "default_resolution": 16}

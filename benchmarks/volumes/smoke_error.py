@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Tree, arrays
-from benchmarks.paths import truth as true_parameters
 
 import unrender as ur
+from benchmarks.internals import Tree, arrays
+from benchmarks.paths import truth as true_parameters
 
 EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 

@@ -12,10 +12,10 @@ import resource
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Key, dr, scene_description
-from benchmarks.runner.timing import in_new_process, medians, turns
 
 import unrender as ur
+from benchmarks.internals import Key, dr, scene_description
+from benchmarks.runner.timing import in_new_process, medians, turns
 
 UPDATE = 20
 PROBLEMS = ("mirror-trio", "sun-glossy", "plain-and-textured", "two-planets")

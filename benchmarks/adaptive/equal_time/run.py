@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from benchmarks.pixel_schemes import pixels
-from benchmarks.races import Entrant, Runs, over, race, tenths
 
 import unrender as ur
+from benchmarks.pixel_schemes import pixels
+from benchmarks.races import Entrant, Runs, over, race, tenths
 
 FINE = {"resolution": 192, "texture_resolution": 192}
 TASKS: dict[str, tuple[str, dict[str, Any], int]] = {

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
-    """The picture, where the schemes look, and what it brings."""
+    """The image, two maps of pixel probabilities, and the variances."""
     maps = record["maps"]
     figure, axes = plt.subplots(1, 4, figsize=(16, 4), layout="constrained", width_ratios=(1, 1.15, 1.15, 1.3))
     axes[0].imshow(np.clip(maps["reference"], 0, 1) ** (1 / 2.2))

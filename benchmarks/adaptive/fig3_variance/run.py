@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks.gradient_variance import gradients, spread
-from benchmarks.pixel_schemes import SCHEMES, pixels
 
 import unrender as ur
+from benchmarks.gradient_variance import gradients, spread
+from benchmarks.pixel_schemes import SCHEMES, pixels
 
 FIVE_LEVELS = "adaptive, five levels"
 GROUPS = {1: "", 2: ", leave-one-out"}

@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks.gradient_variance import gradients, spread
-from benchmarks.internals import Key, PixelSampler, pixel_probability
 
 import unrender as ur
+from benchmarks.gradient_variance import gradients, spread
+from benchmarks.internals import Key, PixelSampler, pixel_probability
 
 PROBLEMS = ("caustic", "plain-and-textured", "mirror-trio")
 FEW, COUNT = 4, 512

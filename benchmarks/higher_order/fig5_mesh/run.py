@@ -13,9 +13,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Key, black_box, dr, prepare, vectors
 
 import unrender as ur
+from benchmarks.internals import Key, black_box, dr, prepare, vectors
 
 SIGMA = 0.05
 SAMPLES = 64

@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from benchmarks.higher_order.networks.cnn import RESOLUTION, PoseNetwork, parameter_count, torch
-from benchmarks.internals import SampleRequest, dr, prepare
 
 import unrender as ur
+from benchmarks.higher_order.networks.cnn import RESOLUTION, PoseNetwork, parameter_count, torch
+from benchmarks.internals import SampleRequest, dr, prepare
 
 GOALS = (0.1, 0.01)
 COLOUR = "mug.bsdf.brdf_0.reflectance.value"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:

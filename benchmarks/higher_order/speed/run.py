@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Key, black_box, dr, mi, prepare, stock_scene
 from benchmarks.kernel_history import kernels
 from benchmarks.runner.timing import medians, turns
-
-import unrender as ur
 
 BATCHES = (1, 2, 4, 8, 16, 32, 64)
 QUICK = {"resolution": 8, "spp": 1, "detail": (1,), "batches": (1, 2)}

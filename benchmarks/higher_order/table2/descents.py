@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Key, black_box, prepare, vectors
 
 import unrender as ur
+from benchmarks.internals import Key, black_box, prepare, vectors
 
 GOALS = (0.1, 0.01, 0.001)
 """Errors relative to the start: reductions of 90, 99 and 99.9 %."""

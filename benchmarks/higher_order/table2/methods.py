@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.higher_order.table2.tasks import Task
-
 import unrender as ur
+from benchmarks.higher_order.table2.tasks import Task
 
 FLOOR = 0.05
 """σ, learning rates and Newton's steps shrink to this share of their start, and no further."""

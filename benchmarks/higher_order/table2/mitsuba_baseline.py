@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from benchmarks.higher_order.table2.descents import GOALS, WINDOW, Descent, measured, truth_of
-from benchmarks.internals import dr, mi, stock_scene, vectors
 
 import unrender as ur
+from benchmarks.higher_order.table2.descents import GOALS, WINDOW, Descent, measured, truth_of
+from benchmarks.internals import dr, mi, stock_scene, vectors
 
 MITSUBA = ("BUNNY", "TEXTURE")
 _SPP = {"BUNNY": 4, "TEXTURE": 8}

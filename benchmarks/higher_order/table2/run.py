@@ -17,14 +17,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.higher_order.table2.descents import Descent, descend, numbers
 from benchmarks.higher_order.table2.methods import LEFT_OUT, METHODS, Config, configurations
 from benchmarks.higher_order.table2.mitsuba_baseline import MITSUBA, mitsuba
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
 from benchmarks.internals import dr
 from benchmarks.runner.records import command
-
-import unrender as ur
 
 TUNING = 2
 """Starts that a method is tuned on, numbered from 1000; TEXTURE, whose runs are all alike, takes one."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Tree
 
 import unrender as ur
+from benchmarks.internals import Tree
 
 
 @dataclass(frozen=True)

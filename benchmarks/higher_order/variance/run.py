@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Key, black_box, prepare, vectors
 
 import unrender as ur
+from benchmarks.internals import Key, black_box, prepare, vectors
 
 SIGMA = {"quad": 0.3, "box10": 0.3, "mug": 0.5}
 PLAIN = {"aggregate": False, "antithetic": False, "baseline": False, "low_discrepancy": False}

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
     """Variance of the difference over that of the gradient against the step, both spaces."""
     figure, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
     for colour, (name, found) in zip(
-        ("#1f6fb4", "#d1782a", "#1a8f4c", "#8a3fa8"), record["variance"].items(), strict=True
+        ("#1f6fb4", "#d1782a", "#1a8f4c", "#8a3fa8"), record["variance"]["problems"].items(), strict=True
     ):
         for space, style in (("path", "o-"), ("primary", "s:")):
             ratio = np.array(found[space]["difference"]) / found[space]["gradient"]

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import (
     Key,
     SampleRequest,
@@ -23,8 +25,6 @@ from benchmarks.internals import (
 )
 from benchmarks.paths import truth
 from benchmarks.runner.timing import medians, turns
-
-import unrender as ur
 
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
 STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)

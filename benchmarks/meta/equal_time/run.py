@@ -13,9 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.races import Entrant, race, reached
-
 import unrender as ur
+from benchmarks.races import Entrant, race, reached
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "spiral": {"resolution": 32},

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.meta.fig2_exponential.run import HORIZONS, METHODS
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
+
+COLOURS = {
+    "adam": "#d1782a",
+    "meta 24 + 8, naive": "#7fb2dd",
+    "meta 16 + 16": "#0b3c66",
+    "meta 24 + 8": "#1f6fb4",
+    "coupled": "#1a8f4c",
+}
 
 
 def plot(record: Record) -> Figure:
     """Left: the rate over the steps, with the spread of 20 runs; middle: RMSE; right: one run's gradient and its predicted deviation."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
-    horizon = str(HORIZONS[0])
-    for method, (_, _, _, colour) in METHODS.items():
+    horizon = str(record["settings"]["steps"][0])
+    for method, colour in COLOURS.items():
         entry = record["methods"][method][horizon]
         runs = np.array(entry["runs"])
         axes[0].plot(runs.mean(0), color=colour, label=f"{method}, rate {entry['rate']:g}")
@@ -24,7 +32,7 @@ def plot(record: Record) -> Figure:
     axes[1].set(xlabel="step", ylabel="RMSE of the rate", yscale="log", title=f"tuned for {horizon} steps")
     axes[0].legend(fontsize=8)
     for method in ("meta 24 + 8", "coupled"):
-        entry, colour = record["methods"][method][horizon], METHODS[method][3]
+        entry, colour = record["methods"][method][horizon], COLOURS[method]
         g, s = np.array(entry["gradients"])[:200], np.array(entry["deviations"])[:200]
         axes[2].plot(g, color=colour, label=method)
         axes[2].fill_between(np.arange(len(g)), g - s, g + s, color=colour, alpha=0.2, lw=0)

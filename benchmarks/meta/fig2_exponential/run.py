@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import RATE
 
 import unrender as ur
+from benchmarks.internals import RATE
 
 RENDERS = False
 HORIZONS = (200, 400)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.meta.fig3_4_estimates.run import METHODS
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
+
+COLOURS = {"plain": "#bbbbbb", "adam": "#d1782a", "meta": "#1f6fb4", "coupled": "#1a8f4c"}
 
 
 def plot(record: Record) -> Figure:
@@ -17,7 +19,7 @@ def plot(record: Record) -> Figure:
         steps = np.arange(len(truth))
         for column, axis in enumerate(row[:3]):
             for method in ("adam", "meta", "coupled"):
-                entry, colour = found["methods"][method], METHODS[method][1]
+                entry, colour = found["methods"][method], COLOURS[method]
                 one, known = (np.array(entry[k])[:, column] for k in ("run", "run_predicted"))
                 axis.plot(steps, one, color=colour, lw=1.2, label=method)
                 axis.fill_between(steps, one - known, one + known, color=colour, alpha=0.15, lw=0)
@@ -34,12 +36,12 @@ def plot(record: Record) -> Figure:
             low, high = np.quantile(found["methods"]["plain"]["run"], [0.01, 0.99], axis=0)[:, column]
             axis.set_ylim(low, high)
         row[0].legend(fontsize=7)
-        for method, (_, colour) in METHODS.items():
+        for method, colour in COLOURS.items():
             entry = found["methods"][method]
             row[3].semilogy(entry["error"], color=colour, label=method)
             if method != "plain":
                 q = entry["predicted_over_actual"]
-                place = list(METHODS).index(method)
+                place = list(COLOURS).index(method)
                 row[4].plot([place, place], [q[0], q[4]], color=colour)
                 row[4].plot([place, place], [q[1], q[3]], color=colour, lw=6, label=method)
                 row[4].plot(place, q[2], "k_", ms=12)

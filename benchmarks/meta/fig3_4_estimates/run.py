@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import Key, Tree, arrays
-from benchmarks.paths import geometric, straight
 
 import unrender as ur
+from benchmarks.internals import Key, Tree, arrays
+from benchmarks.paths import geometric, straight
 
 BETA_1, BETA_2 = 0.9, 0.999
 METHODS = {

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.races import Entrant, race
-
 import unrender as ur
+from benchmarks.races import Entrant, race
 
 RATES = (0.0003, 0.001)
 ABLATIONS: dict[str, dict[str, Any]] = {

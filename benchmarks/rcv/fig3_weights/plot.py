@@ -6,9 +6,16 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.rcv.fig3_weights.run import RULES
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
+
+RULES = {
+    "analytic": ("analytic n/(n+1)", "#222222"),
+    "online": ("Eq. 8, running statistics of F_CV", "#d1782a"),
+    "absolute": ("Eq. 8 + recurrence, absolute", "#8a55a8"),
+    "relative": ("Eq. 8 + recurrence, relative (unrender)", "#1f6fb4"),
+}
 
 
 def plot(record: Record) -> Figure:
@@ -34,7 +41,7 @@ def plot(record: Record) -> Figure:
         axes["variance"].fill_between(steps + 1, mean - error, mean + error, color=colour, alpha=0.2, lw=0)
     axes["variance"].plot(steps + 1, 1 / (steps + 1), color="#999999", lw=4, alpha=0.5, zorder=0, label="1/(n+1)")
     axes["variance"].plot(
-        steps[3:] + 1, 1 / (steps[3:] - 1), color="#999999", ls=":", label="1/(n-1): learns from step 1 on"
+        steps[3:] + 1, 1 / (steps[3:] - 1), color="#999999", ls=":", label="1/(n-1): statistics from step 1 on"
     )
     axes["weight"].set(
         xlabel="step n", ylabel="control weight (mean; 10th to 90th percentile)", title="Weights", ylim=(0, 1.02)
@@ -44,7 +51,7 @@ def plot(record: Record) -> Figure:
     axes["variance"].set(xlabel="renders so far, n + 1", ylabel="variance / variance of one render", title=title)
     axes["variance"].set(xscale="log", yscale="log")
     axes["variance"].legend(loc="lower left", fontsize=8)
-    drawn = None
+    drawn: Any = None
     for rule in ("online", "absolute", "relative"):
         drawn = axes[rule].imshow(maps[rule], vmin=0, vmax=1, cmap="viridis")
         mean = record["rules"][rule]["weight"][-1]
@@ -52,7 +59,6 @@ def plot(record: Record) -> Figure:
         words = f"{RULES[rule][0]}\nlast weights of one run (mean {mean:.3f}; n/(n+1) = {best:.3f})"
         axes[rule].set_title(words, fontsize=8)
         axes[rule].axis("off")
-    assert drawn is not None
     figure.colorbar(drawn, ax=[axes[r] for r in ("online", "absolute", "relative")], label="control weight", shrink=0.9)
     figure.suptitle(
         f"indirect-room, unchanging, {record['settings']['resolution']}², {record['settings']['spp']} spp a step"

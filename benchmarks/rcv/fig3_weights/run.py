@@ -19,11 +19,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Key, SampleRequest, advance, arrays, prepare
 from benchmarks.moments import Moments, summed_variances
 from benchmarks.paths import images_along
-
-import unrender as ur
 from unrender import statistics
 from unrender.statistics import welford
 

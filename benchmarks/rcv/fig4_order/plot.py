@@ -6,11 +6,17 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.rcv.fig4_order.run import METHODS
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
 
+from benchmarks.runner.records import Record
+
 PATHS = {"still": "unchanging parameters", "drift": "drifting parameters"}
+
+METHODS = {
+    "plain": ("plain render", "#888888"),
+    "before": ("updated before use", "#c0392b"),
+    "after": ("updated after use", "#1f6fb4"),
+}
 
 
 def plot(record: Record) -> Figure:
@@ -38,14 +44,13 @@ def plot(record: Record) -> Figure:
         )
         line[1].set_title(f"converged, step {record['settings']['steps'] - 1}", fontsize=9)
         top = 100 * float(np.quantile(maps[f"{path}/before"], 0.98))
-        drawn = None
+        drawn: Any = None
         for axis, name in zip(line[2:], ("before", "after"), strict=True):
             drawn = axis.imshow(100 * maps[f"{path}/{name}"], vmin=0, vmax=top, cmap="magma")
             entry = result["methods"][name]
             last = entry["paired"][-1]
             words = f"bias {last['signed']:+.2%} ± {last['signed_error']:.2%}, rms {last['rms']:.2%}"
             axis.set_title(f"{METHODS[name][0]}\n{words}\nequivalent to {entry['equivalent_spp']:.0f} spp", fontsize=9)
-        assert drawn is not None
         figure.colorbar(drawn, ax=line[3], label="|mean over runs less fixed weights|,\n% of the image's mean")
         for axis in line[1:]:
             axis.axis("off")

@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Key, SampleRequest, Tree, advance, arrays, prepare
 from benchmarks.moments import Moments, bias, paired_bias
 from benchmarks.paths import converged, follow, geometric
-
-import unrender as ur
 
 METHODS = ("plain", "before", "after")
 ORDERS = {

@@ -6,8 +6,11 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.landscape_plot import plot_landscape
+from benchmarks.loss_landscape import LOSSES
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
@@ -16,18 +19,15 @@ def plot(record: Record) -> Figure:
     halves: Any = whole.subfigures(2, 1, height_ratios=[1.3, 1])
     above, below = halves
     plot_landscape(above.subplots(2, 2), record["fig6"], "the wall's albedo")
-    above.suptitle(
-        f"Fig. 6: indirect-room, {record['settings']['resolution']}², mean of {record['settings']['runs']} renders (± standard error)"
-    )
+    s = record["settings"]
+    above.suptitle(f"Fig. 6: indirect-room, {s['resolution']}², mean of {s['runs']} renders (± standard error)")
     plot_derivatives(below.subplots(2, 5), below, record)
     words = "bias and variance relative to the mean of |derivative| and its square"
-    below.suptitle(
-        f"Fig. 7: derivative of the loss at step {record['settings']['step']} of a descent, {record['settings']['runs']} runs; {words}"
-    )
+    below.suptitle(f"Fig. 7: derivative of the loss at step {s['step']} of a descent, {s['runs']} runs; {words}")
     return whole
 
 
-def plot_derivatives(axes: Any, figure: Any, record: dict[str, Any]) -> None:
+def plot_derivatives(axes: Any, figure: Any, record: Record) -> None:
     """Two rows (losses) of derivative images."""
     maps = record["maps"]
     for row, name in zip(axes, LOSSES, strict=True):
@@ -40,11 +40,10 @@ def plot_derivatives(axes: Any, figure: Any, record: dict[str, Any]) -> None:
             "plain/bias": f"plain: bias {entry['plain']['signed']:+.1%}, rms {entry['plain']['rms']:.1%}",
             "rcv/bias": f"control v.: bias {entry['rcv']['signed']:+.1%}, rms {entry['rcv']['rms']:.1%}",
         }
-        drawn = None
+        drawn: Any = None
         for axis, (what, title) in zip(row, titles.items(), strict=True):
             drawn = axis.imshow(maps[f"{name}/{what}"], vmin=-top, vmax=top, cmap="RdBu_r")
             variance = f"\nvariance {entry[what]['variance']:.3g}" if what in entry else "\nmean of runs less converged"
             axis.set_title(title + (variance if what != "reference" else ""), fontsize=8)
             axis.axis("off")
-        assert drawn is not None
         figure.colorbar(drawn, ax=list(row), label=f"∂{name}/∂pixel (per pixel)", shrink=0.9)

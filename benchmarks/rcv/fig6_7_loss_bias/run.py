@@ -17,12 +17,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Tree, arrays
 from benchmarks.loss_landscape import LOSSES, check, places, sample, statistics
 from benchmarks.moments import Moments, paired_bias
 from benchmarks.paths import converged, descent, follow
-
-import unrender as ur
 
 KEY = "back.bsdf.reflectance.data"
 TRUE_SCALE = 0.7

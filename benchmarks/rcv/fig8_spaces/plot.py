@@ -6,9 +6,15 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.rcv.fig8_spaces.run import METHODS
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
+
+METHODS = {
+    "plain": ("plain", "#888888"),
+    "primary": ("primary space", "#d1782a"),
+    "path": ("path space", "#1f6fb4"),
+}
 
 
 def plot(record: Record) -> Figure:
@@ -22,7 +28,7 @@ def plot(record: Record) -> Figure:
     for row, (scene, entry) in zip(axes, entries.items(), strict=True):
         steps, checked = np.arange(len(entry["methods"]["plain"]["weight"])), np.array(entry["checked"])
         plain = entry["methods"]["plain"]
-        for name, (label, colour, _) in METHODS.items():
+        for name, (label, colour) in METHODS.items():
             found = entry["methods"][name]
             if name != "plain":
                 row[0].plot(steps, found["weight"], color=colour, label=label, **styles[name])
@@ -45,11 +51,10 @@ def plot(record: Record) -> Figure:
         reference = maps[f"{scene}/reference"]
         row[2].imshow(np.clip(reference / np.quantile(reference, 0.98), 0, 1) ** (1 / 2.2))
         row[2].set_title("converged, last step", fontsize=9)
-        drawn = None
+        drawn: Any = None
         for axis, name in zip(row[3:5], ("primary", "path"), strict=True):
             drawn = axis.imshow(maps[f"{scene}/{name}"], vmin=0, vmax=1, cmap="viridis")
             axis.set_title(f"weights, {METHODS[name][0]}", fontsize=9)
-        assert drawn is not None
         figure.colorbar(drawn, ax=list(row[3:5]), label="control weight (mean over runs)", shrink=0.8)
         for axis in row[2:5]:
             axis.axis("off")

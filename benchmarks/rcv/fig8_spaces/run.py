@@ -12,12 +12,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import ImageEstimator, Key, Tree, arrays, dr, image_step, prepare
 from benchmarks.moments import Moments
 from benchmarks.paths import converged, descent, follow, weight_of
 from benchmarks.runner.timing import medians, turns
-
-import unrender as ur
 
 RATE = 0.02
 METHODS: dict[str, ImageEstimator] = {

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
@@ -14,7 +15,7 @@ def plot(record: Record) -> Figure:
     rows = -(-len(entries) // 2)
     figure, axes = plt.subplots(rows, 2, figsize=(10, 3.2 * rows), squeeze=False, layout="constrained")
     colours = {"stock": "#888888", "plain": "#d1782a", "rcv": "#1f6fb4"}
-    for axis, entry in zip(axes.flat, entries, strict=False):
+    for axis, entry in zip(axes.flat, entries.values(), strict=False):
         for method, found in entry["methods"].items():
             grid = np.linspace(0, entry["seconds"], 100)
             curves = np.stack([np.interp(grid, *np.array([(0.0, 1.0), *run]).T) for run in found["runs"]])

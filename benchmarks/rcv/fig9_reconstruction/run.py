@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from benchmarks.races import TUNING_SEED, median_and_range, total_error
-from benchmarks.stock_loop import stock_loop
 
 import unrender as ur
+from benchmarks.races import TUNING_SEED, median_and_range, total_error
+from benchmarks.stock_loop import stock_loop
 
 Grid = dict[str, list[tuple[int, float]]]
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.pixel_schemes import COLOURS
+from benchmarks.race_plots import draw
+from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import unrender as ur
 from benchmarks.measured_races import compete, scaled
 from benchmarks.pixel_schemes import SCHEMES, pixels
 from benchmarks.races import Entrant, over
 from benchmarks.volumes.smoke_error import measure
-
-import unrender as ur
 
 RATES = (0.003, 0.01)
 QUICK = {"seconds": 0.5, "seeds": 2, "count": 32, "resolution": 8, "grid": 8}

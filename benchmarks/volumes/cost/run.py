@@ -9,10 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import SampleRequest, dr, mi, prepare, scene_description
-from benchmarks.runner.timing import medians, ratio, turns
 
 import unrender as ur
+from benchmarks.internals import SampleRequest, dr, mi, prepare, scene_description
+from benchmarks.runner.timing import medians, ratio, turns
 from unrender.gallery import volumes
 
 RATIOS = {

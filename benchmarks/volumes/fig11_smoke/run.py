@@ -15,11 +15,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.measured_races import compete, scaled
 from benchmarks.races import Entrant
 from benchmarks.volumes.smoke_error import measure
-
-import unrender as ur
 
 PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
 RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
+
+from benchmarks.runner.records import Record
 
 COLOURS = {"rcv": "#1f6fb4", "plain": "#d1782a"}
 

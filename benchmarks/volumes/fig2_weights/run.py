@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from benchmarks.moments import summed_variances
-from benchmarks.paths import descent, images_along
 
 import unrender as ur
+from benchmarks.moments import summed_variances
+from benchmarks.paths import descent, images_along
 
 METHODS = {"rcv": ur.images.RecursiveControlVariate(), "plain": ur.images.Plain()}
 QUANTILES = [10, 50, 90]

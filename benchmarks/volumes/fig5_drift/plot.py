@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks.runner.records import Record
 from matplotlib.figure import Figure
 
-METHODS: dict[str, ur.PathGradient] = {
-    **{f"plain, {spp} spp": ur.PathGradient(spp=spp) for spp in (2, 4, 16)},
-    **{f"rcv, {spp} spp": ur.PathGradient(ur.images.RecursiveControlVariate(), spp=spp) for spp in (2, 4)},
-}
-LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
+from benchmarks.runner.records import Record
+from benchmarks.volumes.fig5_drift.run import LOSSES, METHODS
 
 
 def plot(record: Record) -> Figure:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
 from benchmarks.landscape_plot import plot_landscape
 from benchmarks.runner.records import Record
-from matplotlib.figure import Figure
 
 
 def plot(record: Record) -> Figure:

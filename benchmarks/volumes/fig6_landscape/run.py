@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Tree
 from benchmarks.loss_landscape import LOSSES, SPP, Values, check, places, sample, statistics
 from benchmarks.paths import converged
-
-import unrender as ur
 
 KEY = "fog.interior_medium.sigma_t.value.value"
 CHECK_FACTOR, CHECK_SPP = 1.2, 4

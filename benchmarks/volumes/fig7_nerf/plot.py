@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import matplotlib.pyplot as plt
-from benchmarks.volumes.fig7_nerf.run import SPP, entrants
+from matplotlib.figure import Figure
 
-SCHEDULES = ("constant", "falling")
+from benchmarks.race_plots import colours, draw
+from benchmarks.runner.records import Record
+from benchmarks.volumes.fig7_nerf.run import SCHEDULES, SPP, entrants
+from unrender.schedules import Constant
+
 GREENS = ("#8fd3aa", "#1a8f4c", "#7fb2dd", "#5b7f3a", "#1f6fb4")
 
 
-def plot(folder: Path, record: dict[str, Any]) -> None:
+def plot(record: Record) -> Figure:
     """Errors over time: a row per schedule; seen and unseen views."""
     kinds = [kind for kind in SCHEDULES if kind in record["schedules"]]
     figure, axes = plt.subplots(
@@ -20,7 +22,7 @@ def plot(folder: Path, record: dict[str, Any]) -> None:
     names = [entrant.name for entrant in entrants(SCHEDULES[0], Constant())]
     shades = dict(zip(names, [*colours(len(SPP)), *GREENS], strict=True))
     for row, kind in zip(axes, kinds, strict=True):
-        found = record["schedules"][kind]
+        found = record["schedules"][kind]["methods"]
         for axis, views in zip(row, ("seen", "unseen"), strict=True):
             for name in (name for name in names if name in found):
                 curves = {"runs": found[name]["runs"][views]}
@@ -28,7 +30,7 @@ def plot(folder: Path, record: dict[str, Any]) -> None:
             axis.set(
                 title=f"{kind} rates, views {views}",
                 xlabel="seconds",
-                ylabel="error of pictures / initial",
+                ylabel="error of images / initial",
                 yscale="log",
             )
             axis.legend(fontsize=8)

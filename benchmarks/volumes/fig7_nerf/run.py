@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+import unrender as ur
 from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, prepare
 from benchmarks.measured_races import compete, follow, scaled
 from benchmarks.races import TUNING_SEED, Entrant
-
-import unrender as ur
 from unrender.schedules import Constant, Cosine, Schedule
 
 SPP = (2, 4, 8)

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from benchmarks.internals import SampleRequest, dr, mi, mitsuba_session
 
+from benchmarks.internals import SampleRequest, dr, mi, mitsuba_session
 from unrender.gallery import parts, volumes
 
 SIZE, SPP, VOXELS, DEPTH = 16, 64, 6, 5

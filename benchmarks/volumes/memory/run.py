@@ -10,10 +10,9 @@ from __future__ import annotations
 import resource
 from typing import Any
 
+import unrender as ur
 from benchmarks.internals import method_parts
 from benchmarks.runner.timing import in_new_process
-
-import unrender as ur
 
 METHODS = ("plain", "rcv", "meta", "coupled")
 SMALL = 16
