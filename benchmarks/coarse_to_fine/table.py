@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks import markdown

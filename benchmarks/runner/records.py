@@ -80,6 +80,8 @@ def merge(old: Mapping[str, Any], new: Mapping[str, Any], path: Sequence[str], t
     conditions = {key for key in new if key != head} if not top else set()
     if head not in old or any(old.get(key) != plain(new[key]) for key in conditions):
         return dict(new)
+    if head not in new:
+        return {**new, head: old[head]}
     return {**new, head: merge(old[head], new[head], rest, False)}
 
 

@@ -10,7 +10,11 @@ from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 HEAD = """# Results
 
 Written by `python -m benchmarks results` from each benchmark's `notes.md`, `results.json` and `table.py`; losses as plainly as wins.
-Ratios are of one run on one machine; times are not comparable between sections."""
+Ratios are of one run on one machine; times are not comparable between sections.
+
+RCV: Nicolet et al. 2023, *Recursive Control Variates for Inverse Rendering*. Meta: Balint et al. 2023, *Joint Sampling and Optimisation for
+Inverse Rendering*. HO: Wang et al. 2025, *Stochastic Gradient Estimation for Higher-order Differentiable Rendering*. Adaptive: *Image-space
+Adaptive Sampling for Fast Inverse Rendering*."""
 
 
 def write_page(file: Path = ROOT / "docs" / "results.md") -> Path:

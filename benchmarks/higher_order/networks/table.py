@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 import math
 
 from benchmarks import markdown

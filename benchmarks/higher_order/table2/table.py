@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
@@ -43,10 +41,7 @@ def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:
         if rival not in task["methods"]:
             continue
         mine = [entry for method, entry in task["methods"].items() if method.startswith("Our")]
-        ours, longest = (
-            [entry["summary"] for entry in mine],
-            max(entry["seconds"] for entry in mine),
-        )
+        ours, longest = ([entry["summary"] for entry in mine], max(entry["seconds"] for entry in mine))
         theirs, known, cells = task["methods"][rival], [], []
         for which, goal in itertools.product(("image", "parameter"), range(3)):
             times = [told[which][goal] for told in ours if told[which][goal] is not None]

@@ -14,15 +14,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import (
-    Key,
-    SampleRequest,
-    arrays,
-    coupled_gradients,
-    loss_derivative,
-    prepare,
-    trees,
-)
+from benchmarks.internals import Key, SampleRequest, arrays, coupled_gradients, loss_derivative, prepare, trees
 from benchmarks.paths import truth
 from benchmarks.runner.timing import medians, turns
 

@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
@@ -16,7 +14,8 @@ def table(record: Record) -> str:
             ratios = [f"{v / f['gradient']:.1e}" for v in f["difference"]]
             rows.append([name, space, f"{f['slope']:.2f}", *ratios])
     steps = next(iter(variance["problems"].values()))["steps"]
-    sizes = f"{variance['resolution']}², {variance['spp']} spp, {variance['runs']} runs. Var ΔF / Var F by step, a share of the way to the truth:"
+    sizes = f"{variance['resolution']}², {variance['spp']} spp, {variance['runs']} runs."
+    sizes += " Var ΔF / Var F by step, a share of the way to the truth:"
     first = markdown.table(["problem", "space", "slope, log-log", *(f"{s:g}" for s in steps)], rows)
     blocks = [sizes, first]
     for size, cost in record["cost"].items():

@@ -1,7 +1,5 @@
 """Figure."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -22,12 +20,7 @@ def plot(record: Record) -> Figure:
     """Weights and variance over steps; the last weights of one run as maps."""
     maps = record["maps"]
     mosaic: Any = [["weight"] * 3 + ["variance"] * 3, ["online"] * 2 + ["absolute"] * 2 + ["relative"] * 2]
-    figure, axes = plt.subplot_mosaic(
-        mosaic,
-        figsize=(11, 7.4),
-        layout="constrained",
-        height_ratios=[1.25, 1],
-    )
+    figure, axes = plt.subplot_mosaic(mosaic, figsize=(11, 7.4), layout="constrained", height_ratios=[1.25, 1])
     steps = np.arange(record["settings"]["steps"])
     for rule, (label, colour) in RULES.items():
         found = record["rules"][rule]

@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
@@ -24,5 +22,6 @@ def table(record: Record) -> str:
             )
     head = ["loss", "image", "bias of the derivative", "RMS over pixels", "variance"]
     ratio = f"The image's variance is {record['fig7']['image_variance_ratio']:.1f} × lower with the control variate."
-    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['runs']} runs, step {settings['step']}; relative to the derivative's mean."
+    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['runs']} runs, step {settings['step']}"
+    sizes += "; relative to the derivative's mean."
     return f"{sizes}\n\n{markdown.table(head, rows)}\n\n{ratio}"

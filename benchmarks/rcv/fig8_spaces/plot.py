@@ -1,7 +1,5 @@
 """Figure."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,11 +8,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.runner.records import Record
 
-METHODS = {
-    "plain": ("plain", "#888888"),
-    "primary": ("primary space", "#d1782a"),
-    "path": ("path space", "#1f6fb4"),
-}
+METHODS = {"plain": ("plain", "#888888"), "primary": ("primary space", "#d1782a"), "path": ("path space", "#1f6fb4")}
 
 
 def plot(record: Record) -> Figure:

@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
@@ -23,5 +21,6 @@ def table(record: Record) -> str:
         "cost of an image",
         "cost of a step",
     ]
-    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['steps']} steps, {settings['runs']} runs; relative to a plain render."
+    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['steps']} steps, {settings['runs']} runs"
+    sizes += "; relative to a plain render."
     return f"{sizes}\n\n{markdown.table(head, rows)}"

@@ -1,7 +1,5 @@
 """Figure."""
 
-from __future__ import annotations
-
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 

@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from benchmarks import markdown

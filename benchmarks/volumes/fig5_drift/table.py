@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 

@@ -1,7 +1,5 @@
 """Figure."""
 
-from __future__ import annotations
-
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
@@ -28,10 +26,7 @@ def plot(record: Record) -> Figure:
                 curves = {"runs": found[name]["runs"][views]}
                 draw(axis, curves, 0, shades[name], f"{name}: {found[name]['final'][views][0]:.3f}")
             axis.set(
-                title=f"{kind} rates, views {views}",
-                xlabel="seconds",
-                ylabel="error of images / initial",
-                yscale="log",
+                title=f"{kind} rates, views {views}", xlabel="seconds", ylabel="error of images / initial", yscale="log"
             )
             axis.legend(fontsize=8)
     return figure

@@ -1,7 +1,5 @@
 """Table."""
 
-from __future__ import annotations
-
 from benchmarks.runner.records import Record
 from benchmarks.volumes.cost.table import ratios
 
