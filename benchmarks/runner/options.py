@@ -18,11 +18,11 @@ def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -
     Types: int, float, str, bool, Path, any of these or None, and tuples of one of them. A tuple's default that is not empty lists its
     choices. A parameter without a default is an argument by position.
     """
-    hints, told = typing.get_type_hints(function), _arguments(inspect.getdoc(function) or "")
+    hints, helps = typing.get_type_hints(function), _arguments(inspect.getdoc(function) or "")
     names = list(inspect.signature(function).parameters)
     for name, parameter in inspect.signature(function).parameters.items():
         kind, many = _kind(hints[name])
-        default, text = parameter.default, told.get(name, "").replace("%", "%%")
+        default, text = parameter.default, helps.get(name, "").replace("%", "%%")
         if default is inspect.Parameter.empty:
             parser.add_argument(name, type=kind, help=text)
             continue

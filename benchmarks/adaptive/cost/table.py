@@ -19,8 +19,11 @@ def table(record: Record) -> str:
     return "\n\n".join(
         [
             f"{settings['count']} pixels a step, milliseconds of a step:",
-            markdown.table(["problem", "uniform", "adaptive, kept", "refreshed every 20", "share of refreshing"], rows),
-            "By the size of the image, refreshes included, `plain-and-textured`:",
+            markdown.table(
+                ["problem", "uniform", "adaptive, same probabilities", "updated every 20 steps", "share of updates"],
+                rows,
+            ),
+            "By the size of the image, importance-map updates included, `plain-and-textured`:",
             markdown.table(["image", "ms a step", "over the smallest"], by_size),
             f"16 views of 4 megapixels: at most {memory['peak_gb']:.2f} GB resident, references in {where}.",
         ]

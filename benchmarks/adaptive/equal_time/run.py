@@ -40,14 +40,14 @@ def entrants(task: str, count: int) -> list[Entrant]:
     """Who races."""
     adam = ur.optimizers.Adam
 
-    def drawn(label: str, scheme: str, **options: Any) -> Entrant:
+    def entrant(label: str, scheme: str, **options: Any) -> Entrant:
         return Entrant(label, label, ur.PathGradient(pixels=pixels(scheme, count, **options), spp=2), adam, RATES)
 
-    found = [drawn("uniform", "uniform"), drawn("loss", "loss"), drawn("adaptive", "adaptive")]
+    found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        found.append(drawn("adaptive, as the paper", "adaptive", relative=False, levels=4))
+        found.append(entrant("adaptive, as the paper", "adaptive", relative=False, levels=4))
     if task == "plain-and-textured":
-        found.append(drawn("adaptive, five levels", "adaptive", levels=4))
+        found.append(entrant("adaptive, five levels", "adaptive", levels=4))
     if task == "two-planets, memories":
         adaptive = pixels("adaptive", count)
         meta = ur.optimizers.MetaAdam

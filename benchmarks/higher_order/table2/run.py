@@ -92,7 +92,7 @@ def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def medians(runs: list[dict[str, Any]]) -> dict[str, list[list[float]]]:
-    """Seconds and the median error there, in the picture and in the parameters; the runs give up their own curves for it."""
+    """Seconds and the median error there, of the image and of the parameters; the runs' own curves are removed."""
     found = {}
     for which in ("image", "parameter"):
         curves = [run.pop(f"{which}_curve") for run in runs]

@@ -17,9 +17,9 @@ def table(record: Record) -> str:
     rows = []
     for name, task in record["tasks"].items():
         for method, entry in task["methods"].items():
-            told = entry["summary"]
-            there = " / ".join(map(str, told["parameter_count"])) + f" of {len(entry['runs'])}"
-            rows.append([name, method, *seconds(told["image"]), *seconds(told["parameter"]), there])
+            summary = entry["summary"]
+            there = " / ".join(map(str, summary["parameter_count"])) + f" of {len(entry['runs'])}"
+            rows.append([name, method, *seconds(summary["image"]), *seconds(summary["parameter"]), there])
     goals = ["image 90 %", "99 %", "99.9 %", "parameters 90 %", "99 %", "99.9 %"]
     count = f"Random starts, {settings['resolution']}²; median seconds of the processor, — where half the runs or more never got there."
     entries = [entry for task in record["tasks"].values() for entry in task["methods"].values()]
@@ -44,7 +44,7 @@ def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:
         ours, longest = ([entry["summary"] for entry in mine], max(entry["seconds"] for entry in mine))
         theirs, known, cells = task["methods"][rival], [], []
         for which, goal in itertools.product(("image", "parameter"), range(3)):
-            times = [told[which][goal] for told in ours if told[which][goal] is not None]
+            times = [summary[which][goal] for summary in ours if summary[which][goal] is not None]
             time = theirs["summary"][which][goal]
             if not times and time is None:
                 cells.append("—")

@@ -28,7 +28,7 @@ QUICK = {"budget": ("steps",), "steps": 2, "seeds": 2, "resolution": 8, "grid": 
 
 
 def entrants(budget: str) -> list[Entrant]:
-    """Who races: the picture's samples differ, the derivative's do not."""
+    """Who races: the image's samples differ, the derivative's do not."""
     adam, cv = scaled(ur.optimizers.Adam), ur.images.RecursiveControlVariate
     plain = [
         Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES[budget])

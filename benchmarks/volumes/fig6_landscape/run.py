@@ -24,18 +24,18 @@ QUICK = {"resolution": 8, "runs": 3, "factors": 3, "reference_spp": 512}
 
 
 def errors(factors: list[float], values: Values) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Standard errors of `places`, from runs drawn with replacement; None where half of the draws have no such place."""
+    """Standard errors of `places`, from runs sampled with replacement; None where half of the samples have no such place."""
     rng = np.random.default_rng(0)
-    drawn: list[Any] = []
+    samples: list[Any] = []
     for _ in range(DRAWS):
         runs = values["L1"]["1"].shape[1]
         some = rng.integers(runs, size=runs)  # of all factors, whose random numbers are the same
         resampled = {name: {spp: x[:, some] for spp, x in entry.items()} for name, entry in values.items()}
-        drawn.append(places(factors, resampled))
+        samples.append(places(factors, resampled))
 
     def error(*path: str) -> float | None:
         name, spp, what = path
-        found = [one[name][spp][what] for one in drawn if one[name][spp][what] is not None]
+        found = [one[name][spp][what] for one in samples if one[name][spp][what] is not None]
         return float(np.std(found, ddof=1)) if 2 * len(found) > DRAWS else None
 
     return {
