@@ -96,7 +96,7 @@ def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
     return pair.previous, pair.previous_parameters
 
 
-def scene_description(problem: ur.Problem) -> dict[str, Any]:
+def scene_description(problem: ur.Problem) -> Any:
     """The dictionary that a gallery problem's scene is loaded from."""
     description = _mitsuba(problem).pair.description
     if not callable(description):

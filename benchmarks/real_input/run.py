@@ -30,7 +30,7 @@ QUICK = {"scene": ("cbox",), "seconds": 0.5, "resolution": 16, "reference_spp": 
 def photograph(path: Path) -> np.ndarray:
     """A photograph as linear float32 (TEXTURE, TEXTURE, 3)."""
     bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    small = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
+    small: Any = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
     return np.clip(small, 0.02, 0.95).astype(np.float32)
 
 
@@ -91,9 +91,8 @@ def prepare(make: Any, assets: Path, folder: Path, resolution: int, spp: int) ->
     ]
     lines += ['truth = "truth.exr"']
     for view in range(views):
-        image = (
-            sum(np.array(mi.render(scene, sensor=view, integrator=path, spp=spp // 8, seed=n)) for n in range(8)) / 8
-        )
+        parts = [mi.render(scene, sensor=view, integrator=path, spp=spp // 8, seed=n) for n in range(8)]
+        image = np.mean([np.array(part) for part in parts], axis=0)
         mi.Bitmap(image.astype(np.float32)).write(str(folder / f"view{view}.exr"))
         lines += ["", "[[views]]", f'reference = "view{view}.exr"', f"sensor = {view}"]
     (folder / "problem.toml").write_text("\n".join(lines) + "\n")

@@ -111,7 +111,7 @@ def train(
 
     joint = method.startswith("OurJoint")
 
-    def loss() -> torch.Tensor:
+    def loss() -> Any:
         answers = network(data.images)
         options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "together": joint}
         return ur.grey_box.loss(data.losses, answers, sigma, samples, **options).mean()

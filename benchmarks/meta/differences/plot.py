@@ -10,9 +10,8 @@ from benchmarks.runner.records import Record
 def plot(record: Record) -> Figure:
     """Variance of the difference over that of the gradient against the step, both spaces."""
     figure, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    for colour, (name, found) in zip(
-        ("#1f6fb4", "#d1782a", "#1a8f4c", "#8a3fa8"), record["variance"]["problems"].items(), strict=True
-    ):
+    colours = ("#1f6fb4", "#d1782a", "#1a8f4c", "#8a3fa8")
+    for colour, (name, found) in zip(colours, record["variance"]["problems"].items(), strict=False):
         for space, style in (("path", "o-"), ("primary", "s:")):
             ratio = np.array(found[space]["difference"]) / found[space]["gradient"]
             label = f"{name}, {space}: slope {found[space]['slope']:.2f}"
