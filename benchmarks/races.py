@@ -7,13 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-from common import total_error
 
 import unrender as ur
-from unrender.estimators.base import Estimator
-from unrender.optimizers.base import Optimizer
+from benchmarks.internals import Estimator, Optimizer
 
 TUNING_SEED = 1000
 
@@ -91,21 +88,33 @@ def tune(
 def race(
     problem: ur.Problem, entrants: list[Entrant], seeds: int, tuning_seeds: int = 1, **budget: Any
 ) -> dict[str, Any]:
-    """Every entrant, tuned, over seeds 0, 1, ...: {name: {"group", "rate", "tried", "runs", "final"}}."""
-    found: dict[str, Any] = {}
-    for entrant in entrants:
-        rate, tried = tune(problem, entrant, tuning_seeds, **budget)
-        runs = [descend(problem, entrant, rate, seed, **budget) for seed in range(seeds)]
-        final = [run[-1][2] for run in runs]
-        found[entrant.name] = {
+    """Every entrant, tuned, over seeds 0, 1, ..., in turns: {name: {"group", "rate", "tried", "runs", "final"}}."""
+    tuned = {entrant.name: tune(problem, entrant, tuning_seeds, **budget) for entrant in entrants}
+    runs: Runs = {entrant.name: [] for entrant in entrants}
+    for seed in range(seeds):
+        for entrant in entrants:
+            runs[entrant.name].append(descend(problem, entrant, tuned[entrant.name][0], seed, **budget))
+            print(f"{problem.name} {entrant.name} seed {seed}: final {runs[entrant.name][-1][-1][2]:.4f}", flush=True)
+    return {
+        entrant.name: {
             "group": entrant.group,
-            "rate": rate,
-            "tried": tried,
-            "runs": runs,
-            "final": [float(np.median(final)), min(final), max(final)],
+            "rate": tuned[entrant.name][0],
+            "tried": tuned[entrant.name][1],
+            "runs": runs[entrant.name],
+            "final": median_and_range([run[-1][2] for run in runs[entrant.name]]),
         }
-        print(f"{problem.name} {entrant.name} rate {rate:g}: final {[round(f, 4) for f in final]}", flush=True)
-    return found
+        for entrant in entrants
+    }
+
+
+def median_and_range(values: list[float]) -> list[float]:
+    """Median, least and greatest."""
+    return [float(np.median(values)), min(values), max(values)]
+
+
+def total_error(errors: dict[str, float], start: dict[str, float]) -> float:
+    """One number for several parameters: the mean of each one's error relative to where it began."""
+    return float(np.mean([errors[key] / start[key] for key in errors]))
 
 
 Runs = dict[str, list[list[tuple[float, float, float]]]]
@@ -138,18 +147,3 @@ def reached(runs: list[list[tuple[float, float, float]]], error: float, column: 
     firsts = [next((point[column] for point in run if point[2] <= error), math.inf) for run in runs]
     middle = float(np.median(firsts))
     return middle if math.isfinite(middle) else None
-
-
-def draw(axis: Any, entry: dict[str, Any], column: int, colour: Any, label: str, style: str = "-") -> None:
-    """Median and range over seeds of the error, against seconds (column 0) or samples (1)."""
-    end = min(run[-1][column] for run in entry["runs"])
-    first = max(run[0][column] for run in entry["runs"])
-    grid = np.linspace(first, end, 200)
-    curves = np.stack([np.interp(grid, np.array(run)[:, column], np.array(run)[:, 2]) for run in entry["runs"]])
-    axis.plot(grid, np.median(curves, 0), color=colour, label=label, ls=style)
-    axis.fill_between(grid, curves.min(0), curves.max(0), color=colour, alpha=0.15, lw=0)
-
-
-def colours(count: int) -> Any:
-    """So many greys to oranges for a family of baselines."""
-    return plt.get_cmap("YlOrBr")(np.linspace(0.3, 0.95, count))

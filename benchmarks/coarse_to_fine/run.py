@@ -1,30 +1,22 @@
 """Coarse to fine: whether it pays, and what should become of states at a change of resolution, at equal steps.
 
-    python benchmarks/coarse_to_fine/run.py [--problem smoke] [--method rcv] [--seeds 3]
-
-Per problem and method: the finest resolution from the start, and three resolutions with all states begun anew ("reset"), all carried
-("carry"), or those of the estimator carried and the optimizer's begun anew ("estimator", the default). The parameters' root mean square
-errors at the end, and by how much the loss jumps: five steps after a change over one step before, the mean of both changes.
+Per problem and method: the finest resolution from the start, and three resolutions with all states restarted ("reset"),
+all kept ("carry"), or those of the estimator kept and the optimizer's restarted ("estimator", the default). The
+parameters' root mean square errors at the end, and by how much the loss jumps: five steps after a change over one step
+before, the mean of both changes.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common import write
-
 import unrender as ur
-from unrender.methods import method
+from benchmarks.internals import method_parts
 
-HERE = Path(__file__).resolve().parent
-STATES = ("finest", "reset", "carry", "estimator")
+STATES: Any = ("finest", "reset", "carry", "estimator")
 AFTER = 5
 PROBLEMS: dict[str, tuple[dict[str, Any], tuple[int, int], int, tuple[str, ...]]] = {
     "indirect-room": (
@@ -40,6 +32,7 @@ PROBLEMS: dict[str, tuple[dict[str, Any], tuple[int, int], int, tuple[str, ...]]
         ("plain", "rcv"),
     ),
 }
+QUICK = {"problem": ("indirect-room",), "method": ("rcv",), "seeds": 1, "tenth": True}
 
 
 def measure(problem: ur.Problem, by: str, changes: tuple[int, int], steps: int, seeds: int) -> dict[str, Any]:
@@ -47,7 +40,7 @@ def measure(problem: ur.Problem, by: str, changes: tuple[int, int], steps: int, 
     errors: dict[str, list[float]] = {}
     jumps = []
     for seed in range(seeds):
-        found = ur.optimize(problem, *method(by).start({}), steps, seed=seed)
+        found = ur.optimize(problem, *method_parts(by), steps=steps, seed=seed)
         for key, error in problem.parameter_error(found.parameters).items():
             errors.setdefault(key, []).append(error)
         losses = [record["loss"] for record in found.history]
@@ -55,30 +48,30 @@ def measure(problem: ur.Problem, by: str, changes: tuple[int, int], steps: int, 
     return {"errors": errors, "jump": float(np.mean(jumps))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problem", action="append", choices=list(PROBLEMS))
-    parser.add_argument("--method", action="append")
-    parser.add_argument("--seeds", type=int, default=3)
-    asked = parser.parse_args()
-    ur.use()
+def run(
+    problem: tuple[str, ...] = tuple(PROBLEMS), method: tuple[str, ...] = (), seeds: int = 3, tenth: bool = False
+) -> dict[str, Any]:
+    """Every problem, method and treatment of states.
+
+    Args:
+        method: those to run (each problem's own)
+        tenth: a tenth of the steps, for a trial
+    """
     found: dict[str, Any] = {}
-    for name in asked.problem or PROBLEMS:
+    for name in problem:
         options, changes, steps, methods = PROBLEMS[name]
+        if tenth:
+            changes, steps = (changes[0] // 10, changes[1] // 10), changes[1] // 10 + AFTER + 1
         base = ur.gallery.problem(name, **options)
         found[name] = {"options": options, "changes": changes, "steps": steps, "methods": {}}
-        for by in asked.method or methods:
+        for by in method or methods:
             rows = found[name]["methods"][by] = {}
             for states in STATES:
-                way = None if states == "finest" else ur.CoarseToFine(changes, states=states)
-                parameters = [replace(p, coarse_to_fine=way) for p in base.parameters]
-                problem = ur.Problem(
+                levels = None if states == "finest" else ur.CoarseToFine(changes, states=states)
+                parameters = [replace(p, coarse_to_fine=levels) for p in base.parameters]
+                made = ur.Problem(
                     base.renderer, parameters, base.given_views, base.loss, base.max_depth, truth=base.truth, name=name
                 )
-                rows[states] = measure(problem, by, changes, steps, asked.seeds)
+                rows[states] = measure(made, by, changes, steps, seeds)
                 print(name, by, states, rows[states], flush=True)
-    write(HERE, {"seeds": asked.seeds, "problems": found})
-
-
-if __name__ == "__main__":
-    main()
+    return {"problems": found}

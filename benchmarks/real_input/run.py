@@ -1,19 +1,13 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+"""Reconstruction of scenes made by others, through the command line as a user types it.
 
-"""The main job on scenes that the project did not make, through the command line as a user types it.
-
-    python benchmarks/real_input/run.py ASSETS [--seconds 60] [--resolution 128]
-
-ASSETS holds `tutorials/` (mitsuba-tutorials' scenes) and `spot/`, `textures/` (Keenan Crane's model, mitsuba-data's pictures).
-`cbox`: the tutorials' cbox.xml with its mirror and glass spheres, its back wall papered with the flower photograph. `spot`: Spot with
-her own texture under museum.exr, seen from four sides. The references are rendered by Mitsuba's `path`; the textures start grey.
-Writes, per scene, scene.xml, references, problem.toml and run folders under benchmarks/real_input/out/.
+ASSETS holds `tutorials/` (mitsuba-tutorials' scenes) and `spot/`, `textures/` (Keenan Crane's model, mitsuba-data's
+images). `cbox`: the tutorials' cbox.xml with its mirror and glass spheres, a photograph on its back wall. `spot`: Spot
+with its own texture under museum.exr, seen from four sides. The references are rendered by Mitsuba's `path`; the
+textures start grey. Scenes, references, problem files and run folders are written below out/benchmarks/real_input/.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import subprocess
@@ -21,30 +15,28 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
-import mitsuba as mi
 import numpy as np
 from skimage.transform import resize
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common import write
+from benchmarks.internals import mi
+from benchmarks.runner.catalogue import ROOT
+from benchmarks.runner.records import scratch
 
-import unrender as ur
-
-HERE = Path(__file__).resolve().parent
 TEXTURE = 128
+METHODS = {"plain": ["spp=8", "learning_rate=0.01"], "rcv": ["spp=2", "learning_rate=0.01"]}
+QUICK = {"scene": ("cbox",), "seconds": 0.5, "resolution": 16, "reference_spp": 8}
 
 
-def picture(path: Path) -> np.ndarray:
+def photograph(path: Path) -> np.ndarray:
     """A photograph as linear float32 (TEXTURE, TEXTURE, 3)."""
     bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    small = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
+    small: Any = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
     return np.clip(small, 0.02, 0.95).astype(np.float32)
 
 
 def cbox(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
     """The Cornell box, its back wall with texture coordinates and a photograph."""
-    mi.Bitmap(picture(assets / "tutorials/textures/flower_photo.jpeg")).write(str(folder / "truth.exr"))
+    mi.Bitmap(photograph(assets / "tutorials/textures/flower_photo.jpeg")).write(str(folder / "truth.exr"))
     text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
     wall = (assets / "tutorials/meshes/cbox_back.obj").read_text()
     wall = wall.replace("f 1 2 3 4", "vt 1 0\nvt 1 1\nvt 0 1\nvt 0 0\nf 1/1 2/2 3/3 4/4")
@@ -61,8 +53,8 @@ def cbox(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
 
 
 def spot(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
-    """Spot under an environment map, four cameras around her."""
-    mi.Bitmap(picture(assets / "spot/spot_texture.png")).write(str(folder / "truth.exr"))
+    """Spot under an environment map, four cameras around it."""
+    mi.Bitmap(photograph(assets / "spot/spot_texture.png")).write(str(folder / "truth.exr"))
     cameras = "".join(
         f'<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
         f'<lookat origin="{3 * np.sin(a):.4f}, 0.7, {3 * np.cos(a):.4f}" target="0, 0.1, 0" up="0, 1, 0"/></transform>'
@@ -79,7 +71,10 @@ def spot(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
     return "spot.bsdf.reflectance.data", 4
 
 
-def prepare(make: Any, assets: Path, folder: Path, resolution: int) -> None:
+SCENES = {"cbox": cbox, "spot": spot}
+
+
+def prepare(make: Any, assets: Path, folder: Path, resolution: int, spp: int) -> None:
     """Write the scene, its references and the problem file."""
     folder.mkdir(parents=True, exist_ok=True)
     key, views = make(assets, folder, resolution)
@@ -96,7 +91,8 @@ def prepare(make: Any, assets: Path, folder: Path, resolution: int) -> None:
     ]
     lines += ['truth = "truth.exr"']
     for view in range(views):
-        image = sum(np.array(mi.render(scene, sensor=view, integrator=path, spp=256, seed=n)) for n in range(8)) / 8
+        parts = [mi.render(scene, sensor=view, integrator=path, spp=spp // 8, seed=n) for n in range(8)]
+        image = np.mean([np.array(part) for part in parts], axis=0)
         mi.Bitmap(image.astype(np.float32)).write(str(folder / f"view{view}.exr"))
         lines += ["", "[[views]]", f'reference = "view{view}.exr"', f"sensor = {view}"]
     (folder / "problem.toml").write_text("\n".join(lines) + "\n")
@@ -126,7 +122,7 @@ def recover(folder: Path, method: str, seconds: float, settings: list[str]) -> d
         seen = np.abs(found[key] - start[key]).max(axis=-1) > 1e-3  # texels that any view tells of
         rmse = [float(np.sqrt(np.mean((x[key] - truth[key])[seen] ** 2))) for x in (start, found)]
     return {
-        "command": " ".join(["unrender", *command[1:]]).replace(str(HERE), "benchmarks/real_input"),
+        "command": " ".join(["unrender", *command[1:]]).replace(f"{ROOT}/", ""),
         "steps": run["steps"],
         "seconds": run["seconds"],
         "texture_rmse": [errors[0], errors[-1]],
@@ -136,49 +132,35 @@ def recover(folder: Path, method: str, seconds: float, settings: list[str]) -> d
     }
 
 
-def plot() -> None:
-    """Per scene: reference, start and result of its first view, true and recovered texture."""
-    figure, axes = plt.subplots(2, 5, figsize=(13, 5.4), layout="constrained")
-    for row, name in zip(axes, ("cbox", "spot"), strict=True):
-        out = HERE / "out" / name / "rcv"
-        with np.load(out / "pictures.npz") as p, np.load(out / "parameters.npz") as q, np.load(out / "truth.npz") as t:
-            shown = [
-                p["view0/reference"],
-                p["view0/initial"],
-                p["view0/result"],
-                next(iter(t.values())),
-                next(iter(q.values())),
-            ]
-        scale = np.percentile(shown[0], 97)
-        titles = ("reference", "start", "recovered (rcv)", "true texture", "recovered texture")
-        for number, (axis, image, title) in enumerate(zip(row, shown, titles, strict=True)):
-            axis.imshow(np.clip(image / (scale if number < 3 else 1), 0, 1) ** (1 / 2.2))
-            axis.set(title=f"{name}: {title}", xticks=[], yticks=[])
-    figure.savefig(HERE / "figure.png", dpi=80)
-    print(f"wrote {HERE / 'figure.png'}")
+def images(folder: Path) -> dict[str, np.ndarray]:
+    """Of a finished run, for the figure: the first view's reference, start and result; the true and the found texture."""
+    with (
+        np.load(folder / "pictures.npz") as views,
+        np.load(folder / "parameters.npz") as found,
+        np.load(folder / "truth.npz") as truth,
+    ):
+        shown = {name: views[f"view0/{name}"] for name in ("reference", "initial", "result")}
+        return shown | {"true texture": next(iter(truth.values())), "texture": next(iter(found.values()))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("assets", type=Path)
-    parser.add_argument("--seconds", type=float, default=60)
-    parser.add_argument("--resolution", type=int, default=128)
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    if not asked.plot_only:
-        ur.use()
-        figures: dict[str, Any] = {"resolution": asked.resolution, "scenes": {}}
-        for name, make in (("cbox", cbox), ("spot", spot)):
-            folder = HERE / "out" / name
-            prepare(make, asked.assets.resolve(), folder, asked.resolution)
-            figures["scenes"][name] = {
-                "plain": recover(folder, "plain", asked.seconds, ["spp=8", "learning_rate=0.01"]),
-                "rcv": recover(folder, "rcv", asked.seconds, ["spp=2", "learning_rate=0.01"]),
-            }
-            print(figures["scenes"][name])
-        write(HERE, figures)
-    plot()
+def run(
+    assets: Path,
+    scene: tuple[str, ...] = tuple(SCENES),
+    seconds: float = 60.0,
+    resolution: int = 128,
+    reference_spp: int = 2048,
+) -> dict[str, Any]:
+    """Every scene by both methods.
 
-
-if __name__ == "__main__":
-    main()
+    Args:
+        assets: folder of the scenes
+        seconds: budget of a run
+    """
+    scenes: dict[str, Any] = {}
+    maps: dict[str, np.ndarray] = {}
+    for name in scene:
+        folder = scratch(f"real_input/{name}")
+        prepare(SCENES[name], assets.resolve(), folder, resolution, reference_spp)
+        scenes[name] = {by: recover(folder, by, seconds, settings) for by, settings in METHODS.items()}
+        maps |= {f"{name}/{what}": image for what, image in images(folder / "rcv").items()}
+    return {"scenes": scenes, "maps": maps}

@@ -1,4 +1,4 @@
-"""What of smoke's grids a picture can tell: the albedo of empty voxels shows in none."""
+"""Errors of smoke's grids as far as an image determines them: the albedo of empty voxels shows in none."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender.core import arrays
-from unrender.core.trees import Tree
+from benchmarks.internals import Tree, arrays
+from benchmarks.paths import truth as true_parameters
 
 EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
 
@@ -21,7 +21,7 @@ def measure(problem: ur.Problem) -> Callable[[Tree], dict[str, float]]:
         extinction, albedo = (np.asarray(arrays.numpy(parameters[key]), np.float64) for key in (EXTINCTION, ALBEDO))
         return {"extinction": extinction, "scattering": extinction * albedo, "albedo": albedo}
 
-    truth = fields({key: problem.renderer.array(value) for key, value in problem.truth.items()})
+    truth = fields(true_parameters(problem))
 
     def errors(parameters: Tree) -> dict[str, float]:
         return {name: float(np.sqrt(np.mean((x - truth[name]) ** 2))) for name, x in fields(parameters).items()}

@@ -1,18 +1,15 @@
-"""What it costs a run to be looked at: nobody, the files alone, and the live page open in a browser.
+"""The cost of watching a run: alone, with the live files, and with the live page open in a browser.
 
-    python benchmarks/watch/run.py [--resolution 128] [--spp 8] [--rounds 12] [--block 6]
-
-One run of `indirect-room` by recursive control variates. Its time is cut into blocks; in each block the run is as it is (`alone`),
-writes what a live page shows (`files`), or does so while `unrender watch` serves the page to a Chromium that shows it (`page`), in
-random order within each round, so that a machine that slows down slows all three. What is compared is wall clock per step, writing and
-serving included; the time it takes to open and close the page is left out. Beside it stands the processor time that server and
-browser take while the page is open: on a machine that does nothing else, their share of all cores is what the run can lose. Needs
-Playwright, a Chromium, and Linux.
+One run of `indirect-room` by recursive control variates. Its time is cut into blocks; in each block the run is as it is
+(`alone`), writes what a live page shows (`files`), or does so while `unrender watch` serves the page to a Chromium that
+shows it (`page`), in random order within each round, so that a machine that slows down slows all three. What is compared
+is wall clock per step, writing and serving included; the time it takes to open and close the page is left out. Beside it
+stands the processor time that server and browser take while the page is open: on a machine that does nothing else, their
+share of all cores is what the run can lose. Needs Playwright, a Chromium, and Linux.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -23,17 +20,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common import read, write
 
 import unrender as ur
 
-HERE = Path(__file__).resolve().parent
 MODES = ("alone", "files", "page")
 SETTLE = 1.5
+QUICK = {"resolution": 16, "spp": 2, "rounds": 2, "block": 0.5}
 
 
 def processor_seconds(root: int) -> float:
@@ -57,7 +50,7 @@ def processor_seconds(root: int) -> float:
 
 
 class Blocks(ur.Callback):
-    """Switches from block to block, and keeps each one's wall clock per step."""
+    """Switches from block to block, and measures each one's wall clock per step."""
 
     def __init__(self, live: ur.Live, page: Any, address: str, rounds: int, block: float, server: int):
         self._server = server
@@ -119,8 +112,8 @@ def measure(resolution: int, spp: int, rounds: int, block: float) -> dict[str, A
         server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         try:
-            assert server.stdout is not None
-            address = next(line.split()[-1] for line in server.stdout if line.startswith("watching at "))
+            lines: Any = server.stdout
+            address = next(line.split()[-1] for line in lines if line.startswith("watching at "))
             page = browser.new_page()
             blocks = Blocks(ur.Live(folder), page, address, rounds, block, server.pid)
             estimator = ur.PathGradient(image=ur.images.RecursiveControlVariate(), spp=spp)
@@ -152,34 +145,10 @@ def summary(ratios: list[float]) -> dict[str, float]:
     return {"median": float(middle), "standard_error": float(error), "low": float(low), "high": float(high)}
 
 
-def plot(results: dict[str, Any]) -> None:
-    """Each round's ratios."""
-    figure, axis = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    for mode, colour in zip(MODES[1:], ("#1f6fb4", "#d1782a"), strict=True):
-        ratios = [of[mode] / of["alone"] for of in results["rounds_ms"]]
-        axis.plot(ratios, "o-", color=colour, label=f"{mode}: {results['ratios'][mode]['median']:.3f}")
-    axis.axhline(1.03, color="#888888", ls="--", lw=1)
-    axis.set(xlabel="round", ylabel="time per step, relative to alone")
-    axis.legend(frameon=False)
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
+def run(resolution: int = 128, spp: int = 8, rounds: int = 12, block: float = 6.0) -> dict[str, Any]:
+    """Every round.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--resolution", type=int, default=128)
-    parser.add_argument("--spp", type=int, default=8)
-    parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--block", type=float, default=6.0, help="seconds")
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    if not asked.plot_only:
-        print(ur.use())
-        figures = measure(asked.resolution, asked.spp, asked.rounds, asked.block)
-        print(figures["ratios"], figures["processor_share"], figures["update_ms"])
-        write(HERE, {"resolution": asked.resolution, "spp": asked.spp, "block_seconds": asked.block, **figures})
-    plot(read(HERE))
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        block: seconds
+    """
+    return measure(resolution, spp, rounds, block)

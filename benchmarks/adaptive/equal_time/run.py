@@ -1,34 +1,25 @@
-"""Drawn pixels at equal time (Figs 4, 5 and 8 of the paper): `sun-glossy` with two losses, `plain-and-textured`, `two-planets`.
+"""Pixel mini-batches at equal time (Adaptive Figs 4, 5 and 8): `sun-glossy`, `plain-and-textured`, `two-planets`.
 
-    python benchmarks/adaptive/equal_time/run.py [--problem two-planets] [--seconds 10] [--seeds 5] [--resolution 192]
-
-Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many pixels for all, Adam,
-the learning rate of each tuned on a seed of its own for the whole budget. Pictures and textures have fewer pixels drawn per texel than
-texels, as in the paper. On `plain-and-textured` also five levels; `two-planets, memories` adds, on small pictures, a control variate and
-coupled meta-estimation, drawn and whole. Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios
-are to uniform mini-batches, at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may
-change between runs, the time of a path is measured in turns, after the race (`--costs-only`: that alone, of the races on file).
+Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many
+pixels for all, Adam, the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have
+fewer sampled pixels per texel than texels, as in the paper. On `plain-and-textured` also five levels; `two-planets,
+memories` adds, on small images, a control variate and coupled meta-estimation, with mini-batches and with whole images.
+Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios are to uniform mini-batches,
+at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may change between
+runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import read, write
-from races import Entrant, Runs, draw, over, race, tenths
-from schemes import COLOURS, pixels
-
 import unrender as ur
+from benchmarks.pixel_schemes import pixels
+from benchmarks.races import Entrant, Runs, over, race, tenths
 
-HERE = Path(__file__).resolve().parent
 FINE = {"resolution": 192, "texture_resolution": 192}
 TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "sun-glossy L2": ("sun-glossy", {"loss": "L2", **FINE}, 2048),
@@ -41,20 +32,22 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
 RATES = (0.01, 0.03)
 META_RATES = (0.001, 0.003)
 CV = ur.images.RecursiveControlVariate
+MERGE = ("entries.*.methods", "seconds_per_path.*")
+QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 
 
 def entrants(task: str, count: int) -> list[Entrant]:
     """Who races."""
     adam = ur.optimizers.Adam
 
-    def drawn(label: str, scheme: str, **options: Any) -> Entrant:
+    def entrant(label: str, scheme: str, **options: Any) -> Entrant:
         return Entrant(label, label, ur.PathGradient(pixels=pixels(scheme, count, **options), spp=2), adam, RATES)
 
-    found = [drawn("uniform", "uniform"), drawn("loss", "loss"), drawn("adaptive", "adaptive")]
+    found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        found.append(drawn("adaptive, as the paper", "adaptive", relative=False, levels=4))
+        found.append(entrant("adaptive, as the paper", "adaptive", relative=False, levels=4))
     if task == "plain-and-textured":
-        found.append(drawn("adaptive, five levels", "adaptive", levels=4))
+        found.append(entrant("adaptive, five levels", "adaptive", levels=4))
     if task == "two-planets, memories":
         adaptive = pixels("adaptive", count)
         meta = ur.optimizers.MetaAdam
@@ -94,66 +87,42 @@ def timed(methods: dict[str, Any], seconds: dict[str, float]) -> Runs:
     }
 
 
-def compare(methods: dict[str, Any], seconds: dict[str, float]) -> dict[str, Any]:
-    """Errors at equal time, and over uniform's by time and by samples."""
-    runs = timed(methods, seconds)
-    return {"errors": tenths(runs, 0), "over uniform": over(runs, "uniform")}
+def summarize(record: dict[str, Any]) -> dict[str, Any]:
+    """Each task's errors at equal time, and ratios to uniform mini-batches by time and by samples."""
+    entries = {}
+    for task, entry in record["entries"].items():
+        runs = timed(entry["methods"], record["seconds_per_path"][task])
+        entries[task] = {**entry, "errors": tenths(runs, 0), "over uniform": over(runs, "uniform")}
+    return {"entries": entries}
 
 
-def plot(results: dict[str, Any]) -> None:
-    """Error over time, one axis per task."""
-    entries = results["entries"]
-    figure, axes = plt.subplots(1, len(entries), figsize=(5 * len(entries), 4), squeeze=False, layout="constrained")
-    for axis, (name, entry) in zip(axes[0], entries.items(), strict=True):
-        for method, runs in timed(entry["methods"], entry["seconds_per_path"]).items():
-            draw(axis, {"runs": runs}, 0, COLOURS[method], f"{method}: {entry['errors'][method][-1]:.3f}")
-        axis.set(title=name, xlabel="seconds", ylabel="parameter error / initial", yscale="log")
-        axis.legend(fontsize=7)
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
+def run(
+    problem: tuple[str, ...] = tuple(TASKS),
+    seconds: float = 8.0,
+    seeds: int = 5,
+    resolution: int | None = None,
+    count: int | None = None,
+    only: tuple[str, ...] = (),
+    part: tuple[str, ...] = ("race", "cost"),
+    rounds: int = 5,
+) -> Iterator[dict[str, Any]]:
+    """A part per task.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problem", action="append", choices=list(TASKS))
-    parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--resolution", type=int, help="film size, for GPUs")
-    parser.add_argument("--count", type=int, help="pixels a step")
-    parser.add_argument("--only", action="append", metavar="NAME", help="run these again, keep the others' figures")
-    parser.add_argument("--costs-only", action="store_true")
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    if not asked.plot_only:
-        ur.use()
-        entries: dict[str, Any] = read(HERE)["entries"] if (HERE / "results.json").is_file() else {}
-        for task in asked.problem or (entries if asked.costs_only else TASKS):
-            name, options, count = TASKS[task]
-            options = {**options, **({"resolution": asked.resolution} if asked.resolution else {})}
-            problem = ur.gallery.problem(name, **options)
-            count = asked.count or count
-            everyone = entrants(task, count)
-            chosen = [e for e in everyone if not asked.only or e.name in asked.only]
-            kept = entries.get(task, {}).get("methods", {}) if asked.only or asked.costs_only else {}
-            methods = {
-                **kept,
-                **({} if asked.costs_only else race(problem, chosen, asked.seeds, seconds=asked.seconds)),
-            }
-            seconds = costs(problem, [e for e in everyone if e.name in methods], RATES[0])
-            compared = compare(methods, seconds)
-            for by, found in compared["over uniform"].items():
-                for method, ratio in found.items():
-                    print(task, by, method, [round(r, 3) for r in ratio], flush=True)
-            budget = {"options": options, "count": count, "seconds": asked.seconds, "seeds": asked.seeds}
-            entries[task] = {
-                **(entries[task] if asked.costs_only else budget),
-                "methods": methods,
-                "seconds_per_path": seconds,
-                **compared,
-            }
-            write(HERE, {"entries": entries})
-    plot(read(HERE))
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        seconds: budget of every run
+        resolution: film size, for GPUs
+        count: pixels a step
+        only: methods to run; the others' figures stay
+        part: measured; the other's figures stay
+        rounds: of turns of the cost
+    """
+    for task in problem:
+        name, options, usual = TASKS[task]
+        options = {**options, **({"resolution": resolution} if resolution else {})}
+        made, pixel_count, found = ur.gallery.problem(name, **options), count or usual, {}
+        everyone = entrants(task, pixel_count)
+        if "race" in part:
+            chosen = [e for e in everyone if not only or e.name in only]
+            conditions = {"options": options, "count": pixel_count, "seconds": seconds, "seeds": seeds}
+            found["entries"] = {task: {**conditions, "methods": race(made, chosen, seeds, seconds=seconds)}}
+        yield {**found, "seconds_per_path": {task: costs(made, everyone, RATES[0], rounds)}}

@@ -1,4 +1,4 @@
-"""The tasks of Wang et al., Table 2, with random starts."""
+"""The tasks of HO Table 2, with random starts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender.core.trees import Tree
+from benchmarks.internals import Tree
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _quad(rng: np.random.Generator, initial: np.ndarray, truth: np.ndarray) -> n
 
 
 def _beside(rng: np.random.Generator, initial: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Anywhere in the picture's middle that does not touch the place sought: distances of 0.45 to 1.2."""
+    """Anywhere in the middle of the image that does not touch the true place: distances of 0.45 to 1.2."""
     while True:
         point = rng.uniform(-1.3, 0.1, 2)
         if 0.45 < np.abs(point - truth).max() < 1.2:

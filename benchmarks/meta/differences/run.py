@@ -1,77 +1,56 @@
-"""What finite differences of gradients cost, and how their variance falls with the step (Balint et al. 2023, Eq. 14 and section 7).
+"""Finite differences of gradients (Meta Eq. 14 and section 7): what they cost, and how their variance falls with the step.
 
-    python benchmarks/meta/differences/run.py [--resolution 32] [--runs 48] [--spp 4]
-
-Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose length is
-varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with its log-log slope.
-Cost: an estimate by plain gradients at 4 spp, of the paper's meta-estimation and of the coupled form, and the parts of the meta step.
+Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose
+length is varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with
+its log-log slope. Cost: an estimate by plain gradients, of the paper's meta-estimation and of the coupled form, and the
+parts of a meta step.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import median_time, read, write
-
 import unrender as ur
-from unrender.core import arrays, trees
-from unrender.core.random import Key
-from unrender.core.trees import Tree
-from unrender.estimators.sample_groups import gather
-from unrender.images.base import PairRequest
-from unrender.images.plain import PlainState
-from unrender.rendering.renderer import SampleRequest
+from benchmarks.internals import Key, SampleRequest, arrays, coupled_gradients, loss_derivative, prepare, trees
+from benchmarks.paths import truth
+from benchmarks.runner.timing import medians, turns
 
-HERE = Path(__file__).resolve().parent
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
 STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 """Share of the way from the start to the truth."""
-
-
-def difference(problem: ur.Problem, current: Tree, previous: Tree, space: Any, spp: int, key: Key) -> tuple[Tree, Tree]:
-    """(F, ΔF) on `spp` coupled samples."""
-    found = gather(
-        problem, current, ur.images.Plain(), PlainState(), spp, key, pair_request=PairRequest(previous, space)
-    )
-    assert found.previous is not None
-    return found.gradient, trees.subtract(found.gradient, found.previous)
+MERGE = ("variance.problems", "cost")
+QUICK = {"problem": ("indirect-room",), "resolution": 8, "cost_resolution": (8,), "runs": 3, "spp": 2}
 
 
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
     """Summed over elements, per space: of the gradient, and of its difference for each step length; and the slope."""
-    start, truth = problem.initial(), {k: problem.renderer.array(v) for k, v in problem.truth.items()}
+    start, end = problem.initial(), truth(problem)
+    prepare(problem, start, "path")
+
+    def flat(tree: Any) -> np.ndarray:
+        return np.concatenate([arrays.numpy(x).ravel() for x in tree.values()])
+
     found: dict[str, Any] = {"steps": STEPS}
     for space in ("path", "primary"):
         rows: list[float] = []
         gradient = 0.0
         for share in STEPS:
-            previous = {k: x + (truth[k] - x) * arrays.scalar(share, x) for k, x in start.items()}
+            previous = {k: x + (end[k] - x) * arrays.scalar(share, x) for k, x in start.items()}
             arrays.evaluate(previous)
-            both = [difference(problem, start, previous, space, spp, Key(1, run)) for run in range(runs)]
-            flat = [
-                np.stack([np.concatenate([arrays.numpy(x).ravel() for x in pair[side].values()]) for pair in both])
-                for side in (0, 1)
-            ]
-            gradient = float(flat[0].var(0, ddof=1).sum())
-            rows.append(float(flat[1].var(0, ddof=1).sum()))
+            pairs = [coupled_gradients(problem, start, previous, space, spp, Key(1, n)) for n in range(runs)]
+            gradient = float(np.stack([flat(F) for F, _ in pairs]).var(0, ddof=1).sum())
+            rows.append(float(np.stack([flat(trees.subtract(F, H)) for F, H in pairs]).var(0, ddof=1).sum()))
         slope = float(np.polyfit(np.log(STEPS), np.log(rows), 1)[0])
         found[space] = {"gradient": gradient, "difference": rows, "slope": slope}
-        print(
-            f"{problem.name} {space}: slope {slope:.3f}, Var ΔF / Var F {[f'{r / gradient:.2g}' for r in rows]}",
-            flush=True,
-        )
+        print(problem.name, space, f"slope {slope:.3f}", [f"{r / gradient:.2g}" for r in rows], flush=True)
     return found
 
 
 def costs(problem: ur.Problem) -> dict[str, float]:
-    """Milliseconds of whole estimates, and of what a meta step is made of."""
+    """Milliseconds of whole estimates, and of the parts of a meta step."""
     parameters = problem.initial()
     previous = trees.map(lambda x: x * 0.99, parameters)
     estimators = {
@@ -82,85 +61,57 @@ def costs(problem: ur.Problem) -> dict[str, float]:
         "plain 2 spp": ur.PathGradient(spp=2),
     }
     found: dict[str, float] = {}
-    for name, estimator in estimators.items():
-        kept = [estimator.init(problem, parameters)]
-        points = [parameters, previous]
+    for name, estimator in estimators.items():  # one after the other, as each prepares the renderer for itself
+        states = [estimator.init(problem, parameters)]
 
-        def step(seed: int, estimator: Any = estimator, kept: Any = kept, points: Any = points) -> None:
-            # A new array per step, as a descent gives: the scenes take it in again.
-            points.append(trees.map(lambda x: x * 1.0, points[seed % 2]))
-            kept[0] = estimator.estimate(problem, points[-1], kept[0], Key(0, seed))[1]
+        def step(seed: int, estimator: Any = estimator, states: list[Any] = states) -> None:
+            # A new array per step, as in a descent, so that the scenes are updated.
+            moved = trees.map(lambda x: x * 1.0, (parameters, previous)[seed % 2])
+            states[0] = estimator.estimate(problem, moved, states[0], Key(0, seed))[1]
 
-        found[name] = median_time(step)[0]
-    request = SampleRequest(problem.views[0].sensor, 1, 5)
-    session = problem.renderer.prepare(list(parameters), "path")
-    pair = session.image_pair(parameters, previous, request, "path")
-    weights = problem.loss_derivative(0, pair.images)
-    found["one pair of images, 1 spp"] = median_time(
-        lambda seed: session.image_pair(parameters, previous, SampleRequest(request.sensor, 1, seed), "path")
-    )[0]
-    found["one pair of adjoints, 1 spp"] = median_time(
-        lambda seed: session.adjoint_pair(parameters, previous, pair.paths, weights, weights)
-    )[0]
-    found["one image, 1 spp"] = median_time(
-        lambda seed: session.image(parameters, SampleRequest(request.sensor, 1, seed))
-    )[0]
-    found["one adjoint, 1 spp"] = median_time(lambda seed: session.adjoint(parameters, pair.paths, weights))[0]
+        found |= medians(turns({name: step}))
+    session = prepare(problem, parameters, "path")
+
+    def request(seed: int) -> SampleRequest:
+        return SampleRequest(problem.views[0].sensor, 1, seed)
+
+    pair = session.image_pair(parameters, previous, request(5), "path")
+    weights = loss_derivative(problem, 0, pair.images)
+    parts = {
+        "one pair of images, 1 spp": lambda n: session.image_pair(parameters, previous, request(n), "path"),
+        "one pair of adjoints, 1 spp": lambda n: session.adjoint_pair(
+            parameters, previous, pair.paths, weights, weights
+        ),
+        "one image, 1 spp": lambda n: session.image(parameters, request(n)),
+        "one adjoint, 1 spp": lambda n: session.adjoint(parameters, pair.paths, weights),
+    }
+    found |= medians(turns(parts))
     found["meta / plain 4 spp"] = found["meta 2 + 1"] / found["plain 4 spp"]
     print(problem.name, {k: round(v, 2) for k, v in found.items()}, flush=True)
     return found
 
 
-def plot(results: dict[str, Any]) -> None:
-    """Variance of the difference over that of the gradient against the step, both spaces."""
-    figure, axis = plt.subplots(figsize=(6, 4.5), layout="constrained")
-    for colour, (name, found) in zip(
-        ("#1f6fb4", "#d1782a", "#1a8f4c", "#8a3fa8"), results["variance"].items(), strict=True
-    ):
-        for space, style in (("path", "o-"), ("primary", "s:")):
-            ratio = np.array(found[space]["difference"]) / found[space]["gradient"]
-            label = f"{name}, {space}: slope {found[space]['slope']:.2f}"
-            axis.loglog(found["steps"], ratio, style, color=colour, label=label, ms=4)
-    axis.set(xlabel="step, share of the way to the truth", ylabel="Var ΔF / Var F")
-    axis.legend(fontsize=7)
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
+def run(
+    problem: tuple[str, ...] = PROBLEMS,
+    part: tuple[str, ...] = ("variance", "cost"),
+    resolution: int = 32,
+    cost_resolution: tuple[int, ...] = (96, 256),
+    spp: int = 4,
+    runs: int = 48,
+) -> Iterator[dict[str, Any]]:
+    """Costs at each size, then variances.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--resolution", type=int, default=32)
-    parser.add_argument("--cost-resolution", type=int, nargs="+", default=[96, 256])
-    parser.add_argument("--costs-only", action="store_true", help="keep the variances that were measured before")
-    parser.add_argument("--spp", type=int, default=4)
-    parser.add_argument("--runs", type=int, default=48)
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    if not asked.plot_only:
-        ur.use()
-        loss = "RelativeL2"
-        cost: dict[str, Any] = read(HERE)["cost"] if asked.costs_only else {}
-        for size in asked.cost_resolution:
-            large = {"resolution": size, "reference_spp": 16}
-            cost[str(size)] = {n: costs(ur.gallery.problem(n, loss=loss, **large)) for n in PROBLEMS}
-        if asked.costs_only:
-            kept = ("resolution", "spp", "runs", "variance")
-            write(HERE, {**{key: read(HERE)[key] for key in kept}, "cost": cost})
-            return plot(read(HERE))
-        small = {"resolution": asked.resolution, "texture_resolution": 16, "reference_spp": 512}
-        variance = {n: variances(ur.gallery.problem(n, loss=loss, **small), asked.spp, asked.runs) for n in PROBLEMS}
-        write(
-            HERE,
-            {
-                "resolution": asked.resolution,
-                "spp": asked.spp,
-                "runs": asked.runs,
-                "variance": variance,
-                "cost": cost,
-            },
-        )
-    plot(read(HERE))
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        part: measured; the other's figures stay
+        resolution: of the variances
+        spp: of the variances
+        runs: of the variances
+    """
+    loss = "RelativeL2"
+    for size in cost_resolution if "cost" in part else ():
+        options = {"resolution": size, "reference_spp": 16, "loss": loss}
+        yield {"cost": {str(size): {name: costs(ur.gallery.problem(name, **options)) for name in problem}}}
+    if "variance" in part:
+        options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
+        found = {name: variances(ur.gallery.problem(name, **options), spp, runs) for name in problem}
+        yield {"variance": {"resolution": resolution, "spp": spp, "runs": runs, "problems": found}}

@@ -1,52 +1,35 @@
-"""What the order of use and update costs (paper Fig. 4): bias where the weight sees the samples that it weighs.
-
-    python benchmarks/rcv/fig4_order/run.py [--resolution 32] [--spp 4] [--steps 32] [--runs 32]
+"""Statistics updated before or after use (RCV Fig. 4): the bias of a weight that depends on the samples it weighs.
 
 On `indirect-room`, once with parameters that do not change and once on a fixed path from the initial values to the
 truth. Statistics are updated after use (`RecursiveControlVariate()`) or before (`update_before_use=True`). Their
 bias, relative to the mean of the image, is measured twice: as the mean over runs less a converged image at the same
-parameters, and, far more sharply, less the same recursion on the same samples with weights fixed beforehand (those of
-other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp of one step times
+parameters, and, far more precisely, less the same recursion on the same samples with weights fixed beforehand (those
+of other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp of one step times
 Var[plain] / Var[control variate].
 
-At few samples a part of the bias is not of the order: while a pixel has seen equal samples only (often 0), its variance
-is 0, so is its weight, and those samples are forgotten once another comes. `--spp 32` shows the order alone.
+At few samples a part of the bias does not come from the order: while a pixel has seen equal samples only (often 0), its
+variance is 0, so is its weight, and those samples are forgotten once another comes. `--spp 32` shows the order alone.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from along import Moments, bias, converged, drift, follow, gallery, paired_bias, read_maps, write_maps
-from common import read, write
-
 import unrender as ur
-from unrender.core import arrays
-from unrender.core.random import Key
-from unrender.core.trees import Tree
-from unrender.rendering.renderer import SampleRequest
-from unrender.statistics.recursion import advance
+from benchmarks.internals import Key, SampleRequest, Tree, advance, arrays, prepare
+from benchmarks.moments import Moments, bias, paired_bias
+from benchmarks.paths import converged, follow, geometric
 
-HERE = Path(__file__).resolve().parent
-METHODS = {
-    "plain": ("plain render", "#888888"),
-    "before": ("updated before use", "#c0392b"),
-    "after": ("updated after use", "#1f6fb4"),
-}
-PATHS = {"still": "unchanging parameters", "drift": "drifting parameters"}
+METHODS = ("plain", "before", "after")
 ORDERS = {
     "before": ur.images.RecursiveControlVariate(update_before_use=True),
     "after": ur.images.RecursiveControlVariate(),
 }
 PILOT_SEEDS = (1_000_001, 1_000_002)
+QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3, "reference_spp": 128}
 
 
 def pilot_weights(problem: ur.Problem, path: list[Tree], spp: int) -> list[Any]:
@@ -60,13 +43,11 @@ def pilot_weights(problem: ur.Problem, path: list[Tree], spp: int) -> list[Any]:
 
 def fixed(problem: ur.Problem, path: list[Tree], weights: list[Any], spp: int, seed: int) -> Iterator[np.ndarray]:
     """The recursion (6) with given weights, on the samples that `follow` takes: unbiased."""
-    session = problem.renderer.prepare(list(path[0]), "path")
-    memory: Any = None
+    session, memory = prepare(problem, path[0], "path"), None
     for step, (now, before) in enumerate(zip(path, [path[0], *path], strict=False)):
         request = SampleRequest(problem.views[0].sensor, spp, Key(seed, step).uint32())
-        rendering = session.image_pair(now, before, request, "path")
-        assert rendering.previous is not None
-        F, H = (arrays.numpy(images[0]).astype(np.float64) for images in (rendering.images, rendering.previous))
+        pair = session.image_pair(now, before, request, "path")
+        F, H = (arrays.numpy(images[0]).astype(np.float64) for images in (pair.images, pair.previous))
         memory = F if memory is None else advance(memory, F, H, weights[step])
         yield memory
 
@@ -112,88 +93,26 @@ def measure(
     return {"methods": methods}, {**maps, "reference": references[end].mean}
 
 
-def report(path: str, result: dict[str, Any]) -> None:
-    """The last step in words."""
-    for name, entry in result["methods"].items():
-        label = METHODS[name][0] if name in METHODS else "before less after"
-        for how in ("converged", "paired"):
-            if how in entry:
-                last = entry[how][-1]
-                signed, error = last["signed"], last["signed_error"]
-                print(
-                    f"{path}, {label}, {how}: bias {signed:+.3%} ± {error:.3%} ({signed / error:+.1f} σ), "
-                    f"rms {last['rms']:.2%} ({last['square'] / last['square_error']:+.1f} σ)"
-                )
-        if "equivalent_spp" in entry:
-            print(f"{path}, {label}: equivalent to {entry['equivalent_spp']:.0f} spp")
+def run(
+    resolution: int = 32,
+    spp: int = 4,
+    steps: int = 32,
+    runs: int = 32,
+    half_life: float = 8.0,
+    reference_spp: int = 8192,
+) -> dict[str, Any]:
+    """Bias and variance of every method on both paths.
 
-
-def plot(results: dict[str, Any]) -> None:
-    """A row per path: signed bias over steps, the rendered scene, |bias| maps of the two orders."""
-    maps = read_maps(HERE)
-    figure, axes = plt.subplots(2, 4, figsize=(14, 7), layout="constrained", width_ratios=[1.5, 1, 1, 1])
-    for line, (path, title) in zip(axes, PATHS.items(), strict=True):
-        result = results["paths"][path]
-        for name, (label, colour) in METHODS.items():
-            for how, style in (("converged", "none"), ("paired", "-")):
-                if how not in result["methods"][name] or (name == "plain"):
-                    continue
-                rows = result["methods"][name][how]
-                x = [row["step"] for row in rows]
-                y, e = ([100 * row[key] for row in rows] for key in ("signed", "signed_error"))
-                against = "converged image" if how == "converged" else "fixed weights, same samples"
-                marks: dict[str, Any] = {"capsize": 2, "marker": "o" if how == "paired" else "x", "ms": 4, "ls": style}
-                alpha = 1.0 if how == "paired" else 0.45
-                line[0].errorbar(x, y, e, color=colour, alpha=alpha, label=f"{label}, less {against}", **marks)
-        line[0].axhline(0, color="black", lw=0.7)
-        line[0].set(xlabel="step", ylabel="mean bias, % of the image's mean", title=f"{title} (± standard error)")
-        line[0].legend(fontsize=7)
-        line[1].imshow(
-            np.clip(maps[f"{path}/reference"] / np.quantile(maps[f"{path}/reference"], 0.98), 0, 1) ** (1 / 2.2)
-        )
-        line[1].set_title(f"converged, step {results['steps'] - 1}", fontsize=9)
-        top = 100 * float(np.quantile(maps[f"{path}/before"], 0.98))
-        drawn = None
-        for axis, name in zip(line[2:], ("before", "after"), strict=True):
-            drawn = axis.imshow(100 * maps[f"{path}/{name}"], vmin=0, vmax=top, cmap="magma")
-            entry = result["methods"][name]
-            last = entry["paired"][-1]
-            words = f"bias {last['signed']:+.2%} ± {last['signed_error']:.2%}, rms {last['rms']:.2%}"
-            axis.set_title(f"{METHODS[name][0]}\n{words}\nequivalent to {entry['equivalent_spp']:.0f} spp", fontsize=9)
-        assert drawn is not None
-        figure.colorbar(drawn, ax=line[3], label="|mean over runs less fixed weights|,\n% of the image's mean")
-        for axis in line[1:]:
-            axis.axis("off")
-    figure.suptitle(f"indirect-room, {results['resolution']}², {results['spp']} spp a step, {results['runs']} runs")
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--resolution", type=int, default=32)
-    parser.add_argument("--spp", type=int, default=4)
-    parser.add_argument("--steps", type=int, default=32)
-    parser.add_argument("--runs", type=int, default=32)
-    parser.add_argument("--half-life", type=float, default=8.0, help="steps in which the drift halves what is left")
-    parser.add_argument("--reference-spp", type=int, default=8192)
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    if not asked.plot_only:
-        ur.use()
-        problem = gallery("indirect-room", asked.resolution, asked.resolution, reference_spp=16)
-        moving = drift(problem, asked.steps, asked.half_life)
-        chosen = sorted({*(2**k for k in range(1, 12) if 2**k < asked.steps - 1), asked.steps - 1})
-        found, maps = {}, {}
-        for name, path in {"still": [problem.initial()] * asked.steps, "drift": moving}.items():
-            found[name], pictures = measure(problem, path, asked.spp, asked.runs, chosen, asked.reference_spp)
-            maps.update({f"{name}/{key}": value for key, value in pictures.items()})
-            report(name, found[name])
-        sizes = {k: getattr(asked, k) for k in ("resolution", "spp", "steps", "runs", "half_life", "reference_spp")}
-        write(HERE, {**sizes, "paths": found})
-        write_maps(HERE, maps)
-    plot(read(HERE))
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        half_life: steps in which the moving path halves the distance that is left
+    """
+    problem = ur.gallery.problem(
+        "indirect-room", resolution=resolution, texture_resolution=resolution, reference_spp=16
+    )
+    chosen = sorted({*(2**k for k in range(1, 12) if 2**k < steps - 1), steps - 1})
+    paths = {"still": [problem.initial()] * steps, "drift": geometric(problem, steps, half_life)}
+    found, maps = {}, {}
+    for name, path in paths.items():
+        found[name], images = measure(problem, path, spp, runs, chosen, reference_spp)
+        maps.update({f"{name}/{key}": value for key, value in images.items()})
+    return {"paths": found, "maps": maps}

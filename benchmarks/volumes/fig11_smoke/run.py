@@ -1,43 +1,35 @@
-"""How many more samples the picture needs without its control variate (Fig. 11 of the recursive control variates): `smoke`, L1.
+"""Samples that a control variate of the image saves (RCV Fig. 11): `smoke`, L1.
 
-    python benchmarks/volumes/fig11_smoke/run.py [--budget steps] [--steps 300] [--seconds 10] [--seeds 2] [--resolution 24] [--grid 16]
+Differential ratio tracking with 1 adjoint path per pixel throughout; the image with 1 to 32 paths per pixel without a
+control variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget:
+the albedo's, extinction's being 10 times that. At equal steps, and some of them at equal time.
 
-Differential ratio tracking with 1 adjoint path per pixel throughout; the picture with 1 to 32 paths per pixel without a control
-variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget: the albedo's, extinction's
-being 10 times that. At equal steps, and some of them at equal time.
-
-Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient (extinction times
-albedo), averaged: the albedo of empty voxels shows in no picture. "needs" says how many samples a plain picture needs for the error that
-a control variate leaves: between the two neighbours in spp, along a line in logarithms.
+Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient
+(extinction times albedo), averaged: the albedo of empty voxels shows in no image. "needs" says how many samples a plain
+image needs for the error that a control variate leaves: between the two neighbours in spp, along a line in logarithms.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import read, write
-from judged import at, compete
-from races import Entrant, colours, draw
-from smoke_error import measure
-
 import unrender as ur
+from benchmarks.measured_races import compete, scaled
+from benchmarks.races import Entrant
+from benchmarks.volumes.smoke_error import measure
 
-HERE = Path(__file__).resolve().parent
 PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
 RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}
+MERGE = ("budgets.*.methods",)
+QUICK = {"budget": ("steps",), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
 
 
 def entrants(budget: str) -> list[Entrant]:
-    """Who races: the picture's samples differ, the derivative's do not."""
-    adam, cv = at(ur.optimizers.Adam), ur.images.RecursiveControlVariate
+    """Who races: the image's samples differ, the derivative's do not."""
+    adam, cv = scaled(ur.optimizers.Adam), ur.images.RecursiveControlVariate
     plain = [
         Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, RATES[budget])
         for n in PLAIN[budget]
@@ -63,65 +55,39 @@ def needs(found: dict[str, Any], name: str) -> dict[str, Any]:
     return {"spp": between, "least": spp[first], "times": between / own}
 
 
-def plot(results: dict[str, Any]) -> None:
-    """Final errors by samples, and error along the descents."""
-    budgets = [budget for budget in PLAIN if budget in results]
-    figure, axes = plt.subplots(1, 1 + len(budgets), figsize=(5 * (1 + len(budgets)), 4.3), layout="constrained")
-    found = results[budgets[0]]
-    plain = [name for name in found if name.startswith("plain")]
-    spp = [int(name.split(", ")[1]) for name in plain]
-    middle, low, high = np.array([found[name]["final"]["both"] for name in plain]).T
-    axes[0].errorbar(spp, middle, [middle - low, high - middle], marker="o", color="#d1782a", label="plain")
-    blues = {"rcv, 1": "#1f6fb4", "rcv, 2": "#7fb2dd"}
-    for name, blue in blues.items():
-        axes[0].axhline(found[name]["final"]["both"][0], color=blue, label=name)
-    axes[0].set(title=f"equal {budgets[0]}: error at the end", xlabel="paths per pixel of the picture", xscale="log")
-    axes[0].set_xticks(spp, [str(n) for n in spp])
-    axes[0].legend(fontsize=8)
-    shades = dict(zip((f"plain, {n}" for n in PLAIN["steps"]), colours(len(PLAIN["steps"])), strict=True)) | blues
-    for axis, budget in zip(axes[1:], budgets, strict=True):
-        for name, entry in results[budget].items():
-            if name in shades:
-                curves = {"runs": entry["runs"]["both"]}
-                draw(axis, curves, 0, shades[name], f"{name}: {entry['final']['both'][0]:.3f}")
-        axis.set(title=f"equal {budget}", xlabel="seconds", ylabel="error / initial")
-        axis.legend(fontsize=7)
-    figure.savefig(HERE / "figure.png", dpi=110)
-    print(f"wrote {HERE / 'figure.png'}")
+def summarize(record: dict[str, Any]) -> dict[str, Any]:
+    """Methods in order, and what plain images need at equal steps."""
+    budgets: dict[str, Any] = {}
+    for budget in (b for b in PLAIN if b in record["budgets"]):
+        entry, names = record["budgets"][budget], [entrant.name for entrant in entrants(budget)]
+        budgets[budget] = {**entry, "methods": {n: entry["methods"][n] for n in names if n in entry["methods"]}}
+    found, methods = {"budgets": budgets}, budgets.get("steps", {}).get("methods", {})
+    if len(methods) == len(entrants("steps")):
+        found["needs"] = {f"rcv, {n}": needs(methods, f"rcv, {n}") for n in WITH}
+    return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--budget", choices=list(PLAIN), action="append", help="this alone; the other's figures stay")
-    parser.add_argument("--only", action="append", help="these entrants alone; others' figures stay")
-    parser.add_argument("--resolution", type=int, default=24)
-    parser.add_argument("--grid", type=int, default=16)
-    asked = parser.parse_args()
-    ur.use()
-    problem = ur.gallery.problem("smoke", resolution=asked.resolution, grid_resolution=asked.grid, reference_spp=4096)
-    found: dict[str, Any] = read(HERE) if (HERE / "results.json").is_file() else {}
-    settings = {name: getattr(asked, name) for name in ("seconds", "steps", "seeds", "resolution", "grid")}
-    if found.get("settings") != settings:
-        found = {"settings": settings}
-    for budget in asked.budget or PLAIN:
-        limit = {"seconds": asked.seconds} if budget == "time" else {"steps": asked.steps}
-        for entrant in entrants(budget):
-            if entrant.name in (asked.only or [entrant.name]):
-                entry = compete(problem, entrant, measure(problem), "both", asked.seeds, **limit)
-                found.setdefault(budget, {})[entrant.name] = entry
-        names = [entrant.name for entrant in entrants(budget)]
-        if budget == "steps" and all(name in found[budget] for name in names):
-            found["needs"] = {f"rcv, {n}": needs(found[budget], f"rcv, {n}") for n in WITH}
-        found[budget] = {name: found[budget][name] for name in names if name in found[budget]}
-    write(HERE, found)
-    results = read(HERE)
-    if "needs" in results:
-        print(results["needs"])
-        plot(results)
+def run(
+    budget: tuple[str, ...] = tuple(PLAIN),
+    seconds: float = 10.0,
+    steps: int = 300,
+    seeds: int = 2,
+    only: tuple[str, ...] = (),
+    resolution: int = 24,
+    grid: int = 16,
+) -> Iterator[dict[str, Any]]:
+    """A part per budget.
 
-
-if __name__ == "__main__":
-    main()
+    Args:
+        budget: those to race; the other's figures stay
+        seconds: of every run at equal time
+        steps: of every run at equal steps
+        only: methods to run; the others' figures stay
+        grid: voxels along a side
+    """
+    problem = ur.gallery.problem("smoke", resolution=resolution, grid_resolution=grid, reference_spp=4096)
+    for by in budget:
+        limit = {"seconds": seconds} if by == "time" else {"steps": steps}
+        chosen = [entrant for entrant in entrants(by) if not only or entrant.name in only]
+        methods = compete(problem, chosen, measure(problem), "both", seeds, **limit)
+        yield {"budgets": {by: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}}

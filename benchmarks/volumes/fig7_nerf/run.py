@@ -1,45 +1,30 @@
-"""Meta-estimation of a radiance field at equal time (Figs 7 and 8 of its paper): `nerf-volume`, without coarse to fine.
+"""Meta-estimation of a radiance field at equal time (Meta Figs 7 and 8): `nerf-volume`, at one resolution.
 
-    python benchmarks/volumes/fig7_nerf/run.py [--seconds 12] [--seeds 2] [--grid 64] [--resolution 64] [--schedule falling] [--only meta]
+Adam on plain gradients at 2, 4 and 8 samples per pixel, against meta-estimation with MetaAdam in the paper's form (1
+difference, 2 proportional samples), in the coupled one, and in that on a control variate's images; two of them with more
+samples as well. Each is tuned on a seed of its own for the whole budget: the emission's learning rate, extinction's
+being 20 times that; constant, or falling along half a cosine over the steps that fit into the budget.
 
-Adam on plain gradients at 2, 4 and 8 samples per pixel, against meta-estimation with MetaAdam in the paper's form (1 difference,
-2 proportional samples), in the coupled one, and in that on a control variate's images; two of them with more samples as well. Each is
-tuned on a seed of its own for the whole budget: the emission's learning rate, extinction's being 20 times that; constant, or falling
-along half a cosine over the steps that fit into the budget.
-
-The field has no truth, so errors are of pictures: root mean square over the 8 views that the descent sees, and over 4 between them that it
-does not, relative to where it began. They are free of rendering noise: products of two independent renders' differences. Tuned is by
-the views seen.
+The field has no truth, so errors are of images: root mean square over the 8 views that the descent sees, and over 4
+between them that it does not, relative to where it began. They are free of rendering noise: products of two independent
+renders' differences. Learning rates are tuned by the views seen.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import read, write
-from judged import at, compete, follow
-from races import TUNING_SEED, Entrant, colours, draw
-
 import unrender as ur
-from unrender.core import arrays
-from unrender.core.random import Key
-from unrender.core.trees import Tree
-from unrender.estimators.base import Estimator
-from unrender.rendering.renderer import SampleRequest
-from unrender.schedules.functions import Constant, Cosine, Schedule
+from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, prepare
+from benchmarks.measured_races import compete, follow, scaled
+from benchmarks.races import TUNING_SEED, Entrant
+from unrender.schedules import Constant, Cosine, Schedule
 
-HERE = Path(__file__).resolve().parent
 SPP = (2, 4, 8)
 VIEWS = 12
-GRID = 64
 UNSEEN = (1, 4, 7, 10)
 RATES = {
     ("Adam", "constant"): (0.01, 0.02, 0.04),
@@ -49,13 +34,17 @@ RATES = {
 }
 SCHEDULES = ("constant", "falling")
 FLOOR = 0.05
-GREENS = ("#8fd3aa", "#1a8f4c", "#7fb2dd", "#5b7f3a", "#1f6fb4")
+MERGE = ("schedules.*.methods",)
+QUICK = {
+    "seconds": 0.5, "seeds": 1, "resolution": 8, "grid": 8, "schedule": ("constant",), "only": ("Adam, 2 spp", "meta"),
+    "reference_spp": 16,
+}  # fmt: skip
 
 
 def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
     """Who races, by a kind of schedule."""
 
-    adam, meta = at(ur.optimizers.Adam, schedule), at(ur.optimizers.MetaAdam, schedule)
+    adam, meta = scaled(ur.optimizers.Adam, schedule), scaled(ur.optimizers.MetaAdam, schedule)
     control = ur.images.RecursiveControlVariate()
     others: dict[str, Estimator] = {
         "meta": ur.MetaEstimator(),
@@ -68,12 +57,12 @@ def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
     return found + [Entrant(name, "meta", estimator, meta, RATES["meta", kind]) for name, estimator in others.items()]
 
 
-class Pictures:
-    """How far pictures of all views are from their references, relative to the start; by a renderer of its own."""
+class ImageErrors:
+    """How far images of all views are from their references, relative to the start; by a renderer of its own."""
 
     def __init__(self, made: ur.Problem, options: dict[str, Any], spp: int = 16):
-        renderer = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1}).renderer
-        self.session = renderer.prepare(list(made.initial()), None)
+        own = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1})
+        self.session = prepare(own, made.initial())
         self.references = [np.asarray(view.reference, np.float64) for view in made.views]
         self.sensors, self.spp = [view.sensor for view in made.views], spp
         self.start = self.errors(made.initial())
@@ -91,83 +80,48 @@ class Pictures:
         return {name: max(float(np.mean(x)), 0.0) ** 0.5 for name, x in squares.items()}
 
 
-def run(problem: ur.Problem, pictures: Pictures, name: str, kind: str, seconds: float, seeds: int) -> dict[str, Any]:
+def measure(
+    problem: ur.Problem, errors: ImageErrors, name: str, kind: str, seconds: float, seeds: int
+) -> dict[str, Any]:
     """One entrant's figures."""
 
     def entrant(schedule: Schedule) -> Entrant:
         return next(e for e in entrants(kind, schedule) if e.name == name)
 
-    # Compiles and records what is left after a warm-up, watched as the runs are, and tells what a step takes.
+    # Compiles and records what is left after a warm-up, measured as the runs are, and gives the time of a step.
     trial = entrant(Constant())
-    watch = follow(problem, trial, pictures, trial.rates[0], TUNING_SEED, 0.2, steps=15)
-    clocks = [seconds for seconds, _, _ in watch.points["seen"]]
+    recorder = follow(problem, trial, errors, trial.rates[0], TUNING_SEED, 0.2, steps=15)
+    clocks = [clock for clock, _, _ in recorder.points["seen"]]
     steps = max(1, round(seconds * 6 / (clocks[-1] - clocks[-3])))
     schedule = Constant() if kind == "constant" else Cosine(steps, FLOOR)
-    return compete(problem, entrant(schedule), pictures, "seen", seeds, seconds=seconds)
+    return compete(problem, [entrant(schedule)], errors, "seen", seeds, seconds=seconds)
 
 
-def plot(folder: Path, results: dict[str, Any]) -> None:
-    """Errors over time: a row per schedule; seen and unseen views."""
-    kinds = [kind for kind in SCHEDULES if kind in results["schedules"]]
-    figure, axes = plt.subplots(
-        len(kinds), 2, figsize=(11, 4.2 * len(kinds)), squeeze=False, sharey=True, layout="constrained"
-    )
-    names = [entrant.name for entrant in entrants(SCHEDULES[0], Constant())]
-    shades = dict(zip(names, [*colours(len(SPP)), *GREENS], strict=True))
-    for row, kind in zip(axes, kinds, strict=True):
-        found = results["schedules"][kind]
-        for axis, views in zip(row, ("seen", "unseen"), strict=True):
-            for name in (name for name in names if name in found):
-                curves = {"runs": found[name]["runs"][views]}
-                draw(axis, curves, 0, shades[name], f"{name}: {found[name]['final'][views][0]:.3f}")
-            axis.set(
-                title=f"{kind} rates, views {views}",
-                xlabel="seconds",
-                ylabel="error of pictures / initial",
-                yscale="log",
-            )
-            axis.legend(fontsize=8)
-    figure.savefig(folder / "figure.png", dpi=110)
-    print(f"wrote {folder / 'figure.png'}")
+def run(
+    seconds: float = 12.0,
+    seeds: int = 2,
+    resolution: int = 64,
+    grid: int = 64,
+    schedule: tuple[str, ...] = SCHEDULES,
+    only: tuple[str, ...] = (),
+    reference_spp: int = 1024,
+) -> Iterator[dict[str, Any]]:
+    """A part per schedule and method.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=12.0)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--resolution", type=int, default=64)
-    parser.add_argument("--grid", type=int, default=GRID, help="others than 64 have a folder of their own")
-    parser.add_argument("--schedule", choices=SCHEDULES, action="append", help="these alone; others' figures stay")
-    parser.add_argument("--only", action="append", help="these entrants alone; others' figures stay")
-    parser.add_argument("--plot-only", action="store_true")
-    asked = parser.parse_args()
-    folder = HERE if asked.grid == GRID else HERE / f"grid{asked.grid}"
-    if asked.plot_only:
-        plot(folder, read(folder))
-        return
-    ur.use()
-    options = {"resolution": asked.resolution, "grid_resolution": asked.grid, "views": VIEWS, "reference_spp": 1024}
+    Args:
+        seconds: budget of every run
+        grid: voxels along a side
+        schedule: of learning rates; the other's figures stay
+        only: methods to run; the others' figures stay
+    """
+    options = {
+        "resolution": resolution, "grid_resolution": grid, "views": VIEWS, "reference_spp": reference_spp
+    }  # fmt: skip
     made = ur.gallery.problem("nerf-volume", **options)
     views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
     problem = ur.Problem(made.renderer, made.parameters, views, made.loss, made.max_depth, name="nerf-volume")
-    pictures = Pictures(made, options)
-    found: dict[str, Any] = read(folder) if (folder / "results.json").is_file() else {}
-    settings = {name: getattr(asked, name) for name in ("seconds", "seeds", "resolution", "grid")}
-    for kind in asked.schedule or SCHEDULES:
-        if found.setdefault("settings", {}).get(kind, settings) != settings:
-            found["schedules"][kind] = {}
-        found["settings"][kind] = settings
-        names = [
-            entrant.name
-            for entrant in entrants(SCHEDULES[0], Constant())
-            if entrant.name in (asked.only or [entrant.name])
-        ]
-        for name in names:
-            entry = run(problem, pictures, name, kind, asked.seconds, asked.seeds)
-            found.setdefault("schedules", {}).setdefault(kind, {})[name] = entry
-            write(folder, found)
-    plot(folder, read(folder))
-
-
-if __name__ == "__main__":
-    main()
+    errors, conditions = ImageErrors(made, options), {"seconds": seconds, "seeds": seeds, "resolution": resolution}
+    for kind in schedule:
+        for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):
+            methods = measure(problem, errors, name, kind, seconds, seeds)
+            yield {"schedules": {kind: {**conditions, "grid": grid, "methods": methods}}}

@@ -1,35 +1,20 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+"""Gradients of voxels in participating media: differential ratio tracking and `prbvolpath` against finite differences.
 
-"""Gradients of voxels that are empty, thin, middling and at the majorant, half of them black: ours and `prbvolpath`'s, in standard errors
-from finite differences.
-
-    python benchmarks/volumes/gradients/run.py [--runs 48]
-
-Finite differences are of pairs of states on one set of paths, to both sides, or to second order upwards where the value is zero.
+Voxels are empty, thin, middling and at the majorant, half of them black. Finite differences are of pairs of states on
+one set of paths, to both sides, or to second order upwards where the value is zero. Differences from them are in
+standard errors.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import write
-
-import unrender as ur
+from benchmarks.internals import SampleRequest, dr, mi, mitsuba_session
 from unrender.gallery import parts, volumes
-from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.renderer import SampleRequest
 
-HERE = Path(__file__).resolve().parent
 SIZE, SPP, VOXELS, DEPTH = 16, 64, 6, 5
 LEVELS = {"empty": 0.0, "thin": 0.02, "middling": 1.0, "at the majorant": 4.0}
 _rng = np.random.default_rng(0)
@@ -37,6 +22,7 @@ KIND = _rng.permutation(np.arange(VOXELS**3) % 4).reshape(VOXELS, VOXELS, VOXELS
 BLACK = _rng.permutation(np.arange(VOXELS**3) % 2).reshape(VOXELS, VOXELS, VOXELS, 1) == 0
 WEIGHT = np.random.default_rng(2).uniform(0.2, 1.8, (1, SIZE, SIZE, 3))
 EXTINCTION, ALBEDO = (f"cloud.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
+QUICK = {"runs": 2}
 
 
 def scene() -> dict[str, Any]:
@@ -86,38 +72,40 @@ def stock(current: dict[str, Any]) -> Callable[[int], dict[str, np.ndarray]]:
     return gradient
 
 
-def main() -> None:
-    """Measure, and write results.json."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--runs", type=int, default=48)
-    asked = parser.parse_args()
-    print(ur.use())
-    renderer = MitsubaRenderer(scene, DEPTH)
-    session = renderer.prepare([EXTINCTION, ALBEDO], "path")
-    current, weight = renderer.values([EXTINCTION, ALBEDO]), renderer.array(WEIGHT)
+def finite_difference(
+    session: Any, current: dict[str, Any], key: str, along: np.ndarray, step: float, upwards: bool, seed: int
+) -> float:
+    """The derivative along a direction, from states on one set of paths."""
+    value = np.array(current[key]).astype(np.float64)
+
+    def difference(high: np.ndarray, low: np.ndarray, number: int) -> float:
+        one, other = ({**current, key: session.array(state)} for state in (high, low))
+        pair = session.image_pair(one, other, SampleRequest(0, 4 * SPP, number), "path")
+        return float(((np.array(pair.images).astype(np.float64) - np.array(pair.previous)) * WEIGHT).sum())
+
+    once = difference(value + step * along, value - (not upwards) * step * along, seed)
+    if not upwards:
+        return once / (2 * step)
+    return (4 * once - difference(value + 2 * step * along, value, seed + 1)) / (2 * step)
+
+
+def run(runs: int = 48) -> dict[str, Any]:
+    """Derivatives along each direction, with standard errors and z-scores."""
+    session, current = mitsuba_session(scene, DEPTH, [EXTINCTION, ALBEDO], "path")
+    weight = session.array(WEIGHT)
     methods = {
         "differential ratio tracking": lambda seed: session.adjoint(
             current, session.image(current, SampleRequest(0, SPP, seed)).paths, weight
         ),
         "prbvolpath": stock(current),
     }
-    gradients = {name: [method(1000 + run) for run in range(asked.runs)] for name, method in methods.items()}
-
-    def difference(key: str, high: np.ndarray, low: np.ndarray, seed: int) -> float:
-        states = [{**current, key: renderer.array(value)} for value in (high, low)]
-        pair = session.image_pair(states[0], states[1], SampleRequest(0, 4 * SPP, seed), "path")
-        return float(((np.array(pair.images).astype(np.float64) - np.array(pair.previous)) * WEIGHT).sum())
-
-    table = {}
+    gradients = {name: [method(1000 + number) for number in range(runs)] for name, method in methods.items()}
+    table: dict[str, Any] = {}
     for name, (key, along, step, upwards) in directions().items():
-        value, rows = np.array(current[key]).astype(np.float64), []
-        for run in range(max(8, asked.runs // 3)):
-            once = difference(key, value + step * along, value - (not upwards) * step * along, 5000 + 2 * run)
-            if upwards:
-                twice = difference(key, value + 2 * step * along, value, 5001 + 2 * run)
-                rows.append((4 * once - twice) / (2 * step))
-            else:
-                rows.append(once / (2 * step))
+        rows = [
+            finite_difference(session, current, key, along, step, upwards, 5000 + 2 * number)
+            for number in range(max(8, runs // 3))
+        ]
         expected, error = np.mean(rows), np.std(rows, ddof=1) / len(rows) ** 0.5
         table[name] = {"finite differences": [float(expected), float(error)]}
         for method, found in gradients.items():
@@ -125,9 +113,5 @@ def main() -> None:
             own = np.std(sums, ddof=1) / len(sums) ** 0.5
             z = (np.mean(sums) - expected) / np.hypot(own, error)
             table[name][method] = [float(np.mean(sums)), float(own), float(z)]
-        print(name, table[name])
-    write(HERE, {"runs": asked.runs, "spp": SPP, "depth": DEPTH, "directions": table})
-
-
-if __name__ == "__main__":
-    main()
+        print(name, table[name], flush=True)
+    return {"spp": SPP, "depth": DEPTH, "directions": table}

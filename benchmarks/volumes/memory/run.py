@@ -1,65 +1,45 @@
 """Memory of a radiance field's grids, by method: `nerf-volume` at 64³, 128³ and 256³ voxels.
 
-    python benchmarks/volumes/memory/run.py [--grid 256] [--steps 4]
-
-Each method in a process of its own: its greatest resident size after a few steps, less that of the same method at 16³, over the bytes of
-the unknowns (extinction and emission, 4 floats a voxel). So many copies of the unknowns a method needs, scenes, gradients, states and what
-NumPy holds included.
+Each method in a process of its own: its greatest resident size after a few steps, less that of the same method at 16³,
+over the bytes of the unknowns (extinction and emission, 4 floats a voxel). So many copies of the unknowns a method needs,
+scenes, gradients, states and NumPy's arrays included.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from common import write
-
 import unrender as ur
-from unrender.methods import method
+from benchmarks.internals import method_parts
+from benchmarks.runner.timing import in_new_process
 
-HERE = Path(__file__).resolve().parent
 METHODS = ("plain", "rcv", "meta", "coupled")
-SMALL, GRIDS = 16, (64, 128, 256)
+SMALL = 16
+QUICK = {"method": ("plain",), "grid": (20,), "steps": 2}
 
 
-def peak(by: str, grid: int, steps: int) -> float:
+def peak(method: str, grid: int, steps: int) -> float:
     """Bytes, of this process."""
     ur.use()
     problem = ur.gallery.problem("nerf-volume", resolution=32, grid_resolution=grid, views=2, reference_spp=1)
-    ur.optimize(problem, *method(by).start({}), steps)
+    ur.optimize(problem, *method_parts(method), steps=steps)
     return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--grid", type=int, action="append", help="voxels along a side")
-    parser.add_argument("--steps", type=int, default=4)
-    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.child:
-        print(json.dumps(peak(asked.child[0], int(asked.child[1]), asked.steps)))
-        return
+def run(method: tuple[str, ...] = METHODS, grid: tuple[int, ...] = (64, 128, 256), steps: int = 4) -> dict[str, Any]:
+    """Bytes, and copies of the unknowns.
 
-    def child(by: str, grid: int) -> float:
-        line = [sys.executable, __file__, "--steps", str(asked.steps), "--child", by, str(grid)]
-        return json.loads(subprocess.run(line, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
-
+    Args:
+        grid: voxels along a side
+    """
     found: dict[str, Any] = {}
-    for by in METHODS:
-        nothing = child(by, SMALL)
-        found[by] = {"small_bytes": nothing}
-        for grid in asked.grid or GRIDS:
-            size, unknowns = child(by, grid), 16.0 * grid**3
-            found[by][str(grid)] = {"bytes": size, "unknowns": unknowns, "copies": (size - nothing) / unknowns}
-            print(by, grid, f"{size / 1e9:.2f} GB", f"{found[by][str(grid)]['copies']:.1f} copies", flush=True)
-    write(HERE, {"methods": found})
-
-
-if __name__ == "__main__":
-    main()
+    for name in method:
+        nothing = in_new_process(peak, name, SMALL, steps)
+        found[name] = {"small_bytes": nothing}
+        for side in grid:
+            size, unknowns = in_new_process(peak, name, side, steps), 16.0 * side**3
+            copies = (size - nothing) / unknowns
+            found[name][str(side)] = {"bytes": size, "unknowns": unknowns, "copies": copies}
+            print(name, side, f"{size / 1e9:.2f} GB", f"{copies:.1f} copies", flush=True)
+    return {"methods": found}

@@ -1,0 +1,29 @@
+"""The variance of the gradient at a problem's start, measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import Key
+
+
+def gradients(
+    problem: ur.Problem, estimator: ur.PathGradient, runs: int, seed: int = 0
+) -> tuple[np.ndarray, int, dict[int, np.ndarray]]:
+    """(runs, n) independent estimates at the start, paths of one, and the pixel probabilities they used."""
+    at = problem.initial()
+    state = estimator.init(problem, at)
+    first, state = estimator.estimate(problem, at, state, Key(2 * seed))
+    rows, samples = [], 0
+    for run in range(runs):
+        found, state = estimator.estimate(problem, at, state, Key(2 * seed + 1, run))
+        rows.append(np.concatenate([np.array(g).ravel() for g in found.gradient.values()]))
+        samples = found.info["samples"]
+    return np.array(rows), samples, first.info.get("pixel_probability", {})
+
+
+def spread(rows: np.ndarray) -> tuple[float, float]:
+    """The variance summed over parameters, and its standard error, from four parts."""
+    parts = [np.var(part, axis=0, ddof=1).sum() for part in np.array_split(rows, 4)]
+    return float(np.var(rows, axis=0, ddof=1).sum()), float(np.std(parts, ddof=1) / 2)

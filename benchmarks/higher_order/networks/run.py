@@ -1,0 +1,171 @@
+"""Smoothed derivatives behind a network (HO Table 2, CNN and CNN5): learning poses from images without labels.
+
+A network answers with the pose of a mug in an image; its answer is rendered and compared with the image, and the
+derivative of that comparison is sampled. Needs PyTorch. CNN answers with the angle; CNN5, one network as well, with five
+numbers: the paper says rotation, position and colour, which is read as the angle, the place across the image, and the
+cup's red, green and blue. Methods: OurG, the aggregate gradient of the black box through the network with Adam; OurHVPA,
+Newton-CG on products with the Hessian of the whole, network and black box; OurJoint, the same with gradient and products
+from the same renders, plain and with its steps through Adam. FR22 is OurG with the product of gradient kernels; for one
+output they are the same. CMA-ES on 268 000 weights has no chance and is left out, as is a Hessian. Error: root mean
+square over the images of the answers, relative to the first, each number over its range. Seconds are the processor's.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.higher_order.networks.cnn import RESOLUTION, PoseNetwork, parameter_count, torch
+from benchmarks.internals import SampleRequest, dr, prepare
+
+GOALS = (0.1, 0.01)
+COLOUR = "mug.bsdf.brdf_0.reflectance.value"
+ANSWERS: dict[str, dict[str, Any]] = {
+    "CNN": {"mug.rotation.y": 0.9},
+    "CNN5": {"mug.rotation.y": 0.6, "mug.translation.x": 0.3, COLOUR: (0.25, 0.25, 0.25)},
+}
+"""Each number's range to either side: of the truth, and what the network's outputs are multiples of."""
+REST: dict[str, Any] = {COLOUR: (0.45, 0.45, 0.45)}
+"""Their middles, where they are not 0."""
+SIGMA = 0.25
+"""In units of the ranges."""
+GRID = {
+    "OurG": (3e-4, 1e-3, 3e-3),
+    "OurHVPA": (0.03, 0.1),
+    "OurJoint": (0.03, 0.1),
+    "OurJoint, Adam": (3e-4, 1e-3, 3e-3),
+}
+"""Of each method: Adam's learning rates, or trust radii."""
+MERGE = ("tasks.*.methods",)
+QUICK = {"task": ("CNN",), "runs": 1, "seconds": 0.3, "images": 2, "size": 8}
+
+
+class Data:
+    """Images of mugs and the black box: the loss of poses, each against the image that it belongs to.
+
+    Args:
+        task: which numbers are unknown.
+        count: of images.
+        size: of the rendered answers, pixels along a side.
+        seed: of the poses.
+    """
+
+    def __init__(self, task: str, count: int, size: int, seed: int):
+        self.keys = list(ANSWERS[task])
+        self.widths = [np.size(ANSWERS[task][key]) for key in self.keys]
+        self.ranges = np.concatenate([np.atleast_1d(ANSWERS[task][key]) for key in self.keys])
+        self.rest = np.concatenate([np.atleast_1d(REST.get(key, 0.0)) for key in self.keys])
+        self.truth = np.random.default_rng(seed).uniform(-1, 1, (count, len(self.ranges)))
+        self.renderer = self._renderer(size)
+        self.references = self._render(self.renderer, self.truth, 64, 1)
+        images = self._render(self._renderer(RESOLUTION), self.truth, 64, 2)
+        self.images = torch.tensor(images, dtype=torch.float32)
+        self.evaluations = 0
+        self.step = 0
+
+    def _renderer(self, size: int) -> Any:
+        problem = ur.gallery.problem("mug", resolution=size, reference_spp=1)
+        return prepare(problem, self.keys, None, derivatives=False)
+
+    def _render(self, renderer: Any, poses: np.ndarray, spp: int, seed: int) -> np.ndarray:
+        values = self.rest + self.ranges * np.clip(poses, -2.5, 2.5)
+        ends = np.cumsum(self.widths)
+        parts = np.split(values, ends[:-1], axis=1)
+        state = {
+            key: np.clip(part, 0.0, 1.0) if key == COLOUR else part[:, 0]
+            for key, part in zip(self.keys, parts, strict=True)
+        }
+        images = renderer.image_batch(state, SampleRequest(0, spp, seed))
+        dr.eval(images)
+        return images.numpy()
+
+    def losses(self, points: np.ndarray, items: np.ndarray) -> np.ndarray:
+        """(B, n) and the indices (B,) of the images they belong to, to (B,): mean square of the difference, one sample per pixel."""
+        self.evaluations += len(points)
+        images = self._render(self.renderer, points, 1, 1000 + self.step)
+        return ((images - self.references[items]) ** 2).mean(axis=(1, 2, 3)) * 100.0
+
+    def error(self, network: Any) -> float:
+        """Root mean square of the answers, in units of the ranges."""
+        with torch.no_grad():
+            found = network(self.images).double().numpy()
+        return float(np.sqrt(np.mean((found - self.truth) ** 2)))
+
+
+def train(
+    task: str, method: str, rate: float, seconds: float, seed: int, count: int, size: int, samples: int = 8
+) -> dict[str, Any]:
+    """One run: errors over time, relative to the first."""
+    data = Data(task, count, size, 5)
+    torch.manual_seed(seed)
+    network = PoseNetwork(len(data.ranges))
+    weights = list(network.parameters())
+    adam = torch.optim.Adam(weights, lr=rate)
+    curve, clock = [(0.0, data.error(network))], 0.0
+    sigma = SIGMA
+
+    joint = method.startswith("OurJoint")
+
+    def loss() -> Any:
+        answers = network(data.images)
+        options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "together": joint}
+        return ur.grey_box.loss(data.losses, answers, sigma, samples, **options).mean()
+
+    def gradient_step() -> None:
+        adam.zero_grad()
+        loss().backward()
+        adam.step()
+
+    steps: dict[str, Callable[[], Any]] = {
+        "OurG": gradient_step,
+        "OurHVPA": lambda: ur.grey_box.newton_cg_step(loss, weights, trust_radius=rate, iterations=2),
+        "OurJoint": lambda: ur.grey_box.newton_cg_step(loss, weights, trust_radius=rate, iterations=4),
+        "OurJoint, Adam": lambda: ur.grey_box.newton_cg_step(loss, weights, 1.0, iterations=4, optimizer=adam),
+    }
+    while clock < seconds:
+        sigma = SIGMA * max(0.15, 1 - clock / seconds)
+        began = time.process_time()
+        steps[method]()
+        clock += time.process_time() - began
+        data.step += 1
+        curve.append((clock, data.error(network)))
+    first = curve[0][1]
+    times, errors = np.array([t for t, _ in curve]), np.array([e for _, e in curve]) / first
+    smooth = np.convolve(errors, np.ones(10) / 10, mode="valid")
+    reached = [float(times[9:][np.argmax(smooth <= goal)]) if (smooth <= goal).any() else math.inf for goal in GOALS]
+    keep = np.unique(np.round(np.geomspace(1, len(times), 100)).astype(int) - 1)
+    return {
+        "reached": reached,
+        "final": float(smooth[-1]),
+        "steps": data.step,
+        "evaluations": data.evaluations,
+        "curve": [times[keep].round(3).tolist(), errors[keep].round(5).tolist()],
+    }
+
+
+def run(
+    task: tuple[str, ...] = tuple(ANSWERS), runs: int = 5, seconds: float = 40.0, images: int = 16, size: int = 32
+) -> Iterator[dict[str, Any]]:
+    """A part per task.
+
+    Args:
+        seconds: processor time of a run
+        images: that the network learns from
+        size: of the rendered answers, pixels along a side
+    """
+    torch.set_num_threads(1)
+    for name in task:
+        weights = parameter_count(PoseNetwork(sum(np.size(width) for width in ANSWERS[name].values())))
+        methods: dict[str, Any] = {}
+        for method, rates in GRID.items():
+            tried = {r: train(name, method, r, seconds / 4, 1000, images, size)["final"] for r in rates}
+            best = min(tried, key=lambda rate, tried=tried: tried[rate])
+            found = [train(name, method, best, seconds, seed, images, size) for seed in range(runs)]
+            methods[method] = {"rate": best, "tried": tried, "runs": found}
+            print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
+        yield {"tasks": {name: {"weights": weights, "methods": methods}}}

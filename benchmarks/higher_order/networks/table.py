@@ -1,0 +1,31 @@
+"""Table."""
+
+import math
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Errors of the networks' answers, and when they had fallen by 90 and 99 %."""
+    settings = record["settings"]
+    rows = []
+    for name, task in record["tasks"].items():
+        for method, entry in task["methods"].items():
+            finals = sorted(run["final"] for run in entry["runs"])
+            steps = sorted(run["steps"] for run in entry["runs"])
+            middle = finals[len(finals) // 2]
+            spread = f"{middle:.3f} ({finals[0]:.3f} to {finals[-1]:.3f})"
+            times = [sorted(run["reached"][goal] for run in entry["runs"])[len(finals) // 2] for goal in range(2)]
+            rows.append(
+                [
+                    f"{name}, {task['weights']} weights",
+                    method,
+                    f"{entry['rate']:g}",
+                    spread,
+                    *[f"{t:.3g}" if math.isfinite(t) else "—" for t in times],
+                    steps[len(steps) // 2],
+                ]
+            )
+    head = ["task", "method", "rate or radius", "final error: median (range)", "s to 90 %", "99 %", "steps"]
+    return f"{settings['runs']} runs of {settings['seconds']:g} s.\n\n{markdown.table(head, rows)}"

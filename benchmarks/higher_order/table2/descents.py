@@ -1,0 +1,140 @@
+"""One run of a method on a task, and its times to the goals."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import Key, black_box, prepare, vectors
+
+GOALS = (0.1, 0.01, 0.001)
+"""Errors relative to the start: reductions of 90, 99 and 99.9 %."""
+
+WINDOW = 10
+"""Steps over which an error is averaged, as in the paper."""
+
+_PATIENCE = 20.0
+"""Wall-clock seconds that a run may take for each of the processor's."""
+
+_IMAGES = 48
+_IMAGE_SPP = 16
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A run: after how many seconds the parameters were where, and how far from the truth in the image and in themselves, relative to
+    the start.
+
+    Attributes:
+        seconds: (T,), the start (0) first.
+        parameter: (T,), root mean square error of all parameters.
+        image: (T,), loss less that of the truth at the same random numbers; NaN where it was not measured.
+        evaluations: renders per view in all.
+    """
+
+    seconds: np.ndarray
+    parameter: np.ndarray
+    image: np.ndarray
+    evaluations: float
+
+    def reached(self, which: str) -> list[float]:
+        """Seconds to each goal, inf where it was not met."""
+        values = getattr(self, which)
+        known = np.isfinite(values)
+        seconds, values = self.seconds[known], values[known]
+        if which == "parameter":
+            kernel = np.ones(min(WINDOW, len(values)))
+            count = np.convolve(np.ones(len(values)), kernel)[: len(values)]
+            values = np.convolve(values, kernel)[: len(values)] / count
+        return [float(seconds[np.argmax(values <= goal)]) if (values <= goal).any() else math.inf for goal in GOALS]
+
+
+class _Track(ur.Callback):
+    """Keeps where a run went; ends it once the last goal is met in parameters, or the budget spent.
+
+    Its clock is the processor's time of this process, warm-up and its own work left out: with one thread that is the time on a machine
+    that has nothing else to do.
+    """
+
+    def __init__(self, truth: np.ndarray, start: np.ndarray, budget: float):
+        self.truth, self.points, self.seconds, self.samples = truth, [start], [0.0], 0.0
+        self.budget, self.clock, self.resumed = budget, 0.0, 0.0
+        self.scale = float(np.sqrt(np.mean((start - truth) ** 2)))
+        self.errors = [1.0]
+
+    def on_start(self, run: Any) -> None:
+        self.resumed = time.process_time()
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        self.clock += time.process_time() - self.resumed
+        self.add(vectors.ravel(run.parameters), self.clock)
+        self.samples = record["samples"]
+        if np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1]:
+            run.stop("goal")
+        if self.clock >= self.budget:
+            run.stop("seconds")
+        self.resumed = time.process_time()
+
+    def add(self, point: np.ndarray, seconds: float) -> None:
+        self.points.append(point)
+        self.seconds.append(seconds)
+        self.errors.append(float(np.sqrt(np.mean((point - self.truth) ** 2))) / self.scale)
+
+
+def descend(problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int) -> Descent:
+    """One run of the library's."""
+    truth, start = truth_of(problem), vectors.ravel(problem.initial())
+    track = _Track(truth, start, seconds)
+    ur.optimize(problem, estimator, optimizer, seconds=_PATIENCE * seconds, seed=seed, callbacks=[track])
+    size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
+    return measured(problem, track.points, track.seconds, track.errors, track.samples / size)
+
+
+def measured(
+    problem: ur.Problem, points: Sequence[np.ndarray], seconds: Sequence[float], errors: Sequence[float], work: float
+) -> Descent:
+    """A descent with its errors in the image at some steps, evenly spread over the logarithm of their number."""
+    parameters = problem.initial()
+    prepare(problem, parameters, None, derivatives=False)
+    chosen = np.unique(np.round(np.geomspace(1, len(points), _IMAGES)).astype(int) - 1)
+    evaluate = black_box(problem, parameters, _IMAGE_SPP, Key(99))
+    stack = _stack(problem, points, chosen)
+    losses = np.concatenate([evaluate(part) for part in np.array_split(stack, max(len(stack) // 8, 1))])
+    image = np.full(len(points), np.nan)
+    image[chosen] = np.abs(losses[1:] - losses[0])
+    return Descent(np.array(seconds), np.array(errors), image / image[0], work)
+
+
+def _stack(problem: ur.Problem, points: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:
+    return np.stack([truth_of(problem), *(points[index] for index in chosen)])
+
+
+def truth_of(problem: ur.Problem) -> np.ndarray:
+    """The true parameters, flattened in key order."""
+    return np.concatenate([np.ravel(problem.truth[key]) for key in problem.initial()]).astype(float)
+
+
+def numbers(descent: Descent) -> dict[str, Any]:
+    """For results.json: times to the goals, and a curve of at most 120 points."""
+    keep = np.unique(np.round(np.geomspace(1, len(descent.seconds), 120)).astype(int) - 1)
+    return {
+        "parameter": descent.reached("parameter"),
+        "image": descent.reached("image"),
+        "steps": len(descent.seconds) - 1,
+        "evaluations": descent.evaluations,
+        "final": float(descent.parameter[-WINDOW:].mean()),
+        "parameter_curve": [
+            descent.seconds[keep].round(4).tolist(),
+            [float(f"{e:.4g}") for e in descent.parameter[keep]],
+        ],
+        "image_curve": [
+            descent.seconds[np.isfinite(descent.image)].round(4).tolist(),
+            [float(f"{e:.4g}") for e in descent.image[np.isfinite(descent.image)]],
+        ],
+    }

@@ -1,0 +1,60 @@
+"""Table."""
+
+import itertools
+from typing import Any
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Seconds to each reduction of the error, and FR22's and CMA-ES's against the best of ours."""
+    settings = record["settings"]
+
+    def seconds(values: list[float | None]) -> list[str]:
+        return ["—" if value is None else f"{value:.3g}" for value in values]
+
+    rows = []
+    for name, task in record["tasks"].items():
+        for method, entry in task["methods"].items():
+            summary = entry["summary"]
+            there = " / ".join(map(str, summary["parameter_count"])) + f" of {len(entry['runs'])}"
+            rows.append([name, method, *seconds(summary["image"]), *seconds(summary["parameter"]), there])
+    goals = ["image 90 %", "99 %", "99.9 %", "parameters 90 %", "99 %", "99.9 %"]
+    count = f"Random starts, {settings['resolution']}²; median seconds of the processor, — where half the runs or more never got there."
+    entries = [entry for task in record["tasks"].values() for entry in task["methods"].values()]
+    commands = dict.fromkeys(entry["command"] for entry in entries if "command" in entry)
+    made = "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands)
+    parts = [count, markdown.table(["task", "method", *goals, "runs that got there"], rows), made]
+    for rival in ("FR22", "CMA-ES"):
+        parts += [
+            f"{rival}'s time over the best of the Our methods, per goal (>: its budget over theirs, where it never got there):"
+        ]
+        parts += [_gains(record["tasks"], rival, goals)]
+    return "\n\n".join(parts)
+
+
+def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:
+    """A row of ratios per task, their mean, and the mean of all."""
+    rows, everything = [], []
+    for name, task in tasks.items():
+        if rival not in task["methods"]:
+            continue
+        mine = [entry for method, entry in task["methods"].items() if method.startswith("Our")]
+        ours, longest = ([entry["summary"] for entry in mine], max(entry["seconds"] for entry in mine))
+        theirs, known, cells = task["methods"][rival], [], []
+        for which, goal in itertools.product(("image", "parameter"), range(3)):
+            times = [summary[which][goal] for summary in ours if summary[which][goal] is not None]
+            time = theirs["summary"][which][goal]
+            if not times and time is None:
+                cells.append("—")
+                continue
+            ratio = (time or theirs["seconds"]) / min([*times, longest])
+            known.append(ratio)
+            cells.append(f"{'> ' * (time is None)}{'< ' * (not times)}{ratio:.2f}")
+        everything += known
+        rows.append([name, *cells, f"{sum(known) / len(known):.2f}" if known else "—"])
+    mean = (
+        f"Mean of all {len(everything)}, bounds counted as they are: {sum(everything) / max(len(everything), 1):.2f}."
+    )
+    return markdown.table(["task", *goals, "mean"], rows) + f"\n\n{mean}"

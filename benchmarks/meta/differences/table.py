@@ -1,0 +1,29 @@
+"""Table."""
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Meta: variance and cost of differences."""
+    variance = record["variance"]
+    rows = []
+    for name, entry in variance["problems"].items():
+        for space in ("path", "primary"):
+            f = entry[space]
+            ratios = [f"{v / f['gradient']:.1e}" for v in f["difference"]]
+            rows.append([name, space, f"{f['slope']:.2f}", *ratios])
+    steps = next(iter(variance["problems"].values()))["steps"]
+    sizes = f"{variance['resolution']}², {variance['spp']} spp, {variance['runs']} runs."
+    sizes += " Var ΔF / Var F by step, a share of the way to the truth:"
+    first = markdown.table(["problem", "space", "slope, log-log", *(f"{s:g}" for s in steps)], rows)
+    blocks = [sizes, first]
+    for size, cost in record["cost"].items():
+        keys = list(next(iter(cost.values())))
+        blocks.append(f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {size}²:")
+        blocks.append(
+            markdown.table(
+                ["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys]
+            )
+        )
+    return "\n\n".join(blocks)

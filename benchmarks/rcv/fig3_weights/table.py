@@ -1,0 +1,17 @@
+"""Table."""
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Fig. 3."""
+    settings = record["settings"]
+    rows = [
+        [rule, f"{f['weight'][-1]:.3f}", f"{f['variance'][-1]:.4f}", f"{f['bias']:+.2%} ± {f['bias_error']:.2%}"]
+        for rule, f in record["rules"].items()
+    ]
+    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['steps']} steps, {settings['runs']} runs"
+    return f"{sizes}; at the last step, variance relative to one render's.\n\n" + markdown.table(
+        ["rule", "weight", "variance", "bias"], rows
+    )

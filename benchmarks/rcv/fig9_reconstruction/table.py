@@ -1,0 +1,36 @@
+"""Table."""
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Equal-time reconstruction."""
+    rows = []
+    for entry in record["entries"].values():
+        summary = entry["summary"]
+        for method in ("stock", "plain", "rcv"):
+            chosen, row = entry["methods"][method], summary[method]
+            middle, low, high = row["final"]
+            other = ""
+            if method != "rcv":
+                reached = [t for t in row["rcv_reaches_its_best_after"] if t is not None]
+                share = f"{len(reached)} of {len(entry['methods']['rcv']['runs'])}"
+                when = f"{sorted(reached)[len(reached) // 2]:.1f} s ({share})" if reached else "never"
+                other = f"{1 / row['ratio']:.2f}× | {row['it_reaches_its_best_after']:.1f} s | {when}"
+            else:
+                other = "1 | | "
+            rows.append(
+                [
+                    entry["problem"],
+                    entry["loss"],
+                    f"{entry['seconds']:g} s",
+                    f"{method} ({chosen['spp']} spp, {chosen['rate']:g})",
+                    f"{middle:.3f} ({low:.3f} to {high:.3f})",
+                    f"{row['best']:.3f}",
+                    *other.split(" | "),
+                ]
+            )
+    head = ["problem", "loss", "budget", "method (spp, rate)", "final error", "best on the way"]
+    head += ["× rcv's final", "its best at", "rcv gets there at"]
+    return markdown.table(head, rows)

@@ -1,0 +1,61 @@
+"""The benchmarks, found by their folders."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+ROOT = Path(__file__).resolve().parents[2]
+"""The repository."""
+PACKAGE = ROOT / "benchmarks"
+ORDER = (
+    "speed", "rcv.fig9_reconstruction", "real_input", "rcv", "meta", "higher_order", "adaptive", "volumes",
+    "coarse_to_fine", "checkpoints", "watch",
+)  # fmt: skip
+"""The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One folder.
+
+    Attributes:
+        name: of the folder, with dots: "rcv.fig4_order".
+        folder: with run.py, plot.py, table.py, notes.md, and, once measured, results.json, maps.npz and figure.png.
+    """
+
+    name: str
+    folder: Path
+
+    def module(self, kind: str) -> ModuleType:
+        """Its run, plot or table module."""
+        return importlib.import_module(f"benchmarks.{self.name}.{kind}")
+
+    def has(self, kind: str) -> bool:
+        """Whether it has this module."""
+        return (self.folder / f"{kind}.py").is_file()
+
+    @property
+    def docstring(self) -> str:
+        """What run.py says of itself, read without importing it."""
+        return ast.get_docstring(ast.parse((self.folder / "run.py").read_text())) or ""
+
+    @property
+    def summary(self) -> str:
+        """One line."""
+        return self.docstring.partition("\n")[0]
+
+
+def benchmarks() -> dict[str, Benchmark]:
+    """All, by name, in order."""
+    folders = (path.parent for path in PACKAGE.rglob("run.py") if path.parent != PACKAGE)
+    found = [Benchmark(".".join(folder.relative_to(PACKAGE).parts), folder) for folder in folders]
+
+    def rank(benchmark: Benchmark) -> tuple[int, str]:
+        prefixes = (n for n, prefix in enumerate(ORDER) if f"{benchmark.name}.".startswith(f"{prefix}."))
+        return next(prefixes, len(ORDER)), benchmark.name
+
+    return {benchmark.name: benchmark for benchmark in sorted(found, key=rank)}

@@ -1,0 +1,50 @@
+"""Timing in turns (A B A B ...), so that a machine whose speed changes slows all contenders alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from benchmarks.internals import dr
+
+Times = dict[str, list[float]]
+
+
+def turns(contenders: Mapping[str, Callable[[int], Any]], repeats: int = 15, warm: int = 4) -> Times:
+    """Milliseconds of each call of each contender, a function of the turn's number that must evaluate what it makes."""
+    times: Times = {name: [] for name in contenders}
+    for number in range(warm + repeats):
+        for name, contender in contenders.items():
+            dr.sync_thread()
+            began = time.perf_counter()
+            contender(number)
+            dr.sync_thread()
+            if number >= warm:
+                times[name].append(1e3 * (time.perf_counter() - began))
+    return times
+
+
+def medians(times: Times) -> dict[str, float]:
+    """The median of each contender."""
+    return {name: float(np.median(found)) for name, found in times.items()}
+
+
+def percentiles(values: Any) -> list[float]:
+    """Median, 10th and 90th percentile."""
+    return [float(q) for q in np.percentile(values, [50, 10, 90])]
+
+
+def ratio(times: Times, one: str, other: str) -> list[float]:
+    """10th percentile, median and 90th percentile of the ratio, turn by turn."""
+    return [float(q) for q in np.quantile(np.array(times[one]) / np.array(times[other]), [0.1, 0.5, 0.9])]
+
+
+def in_new_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """The result of a module's function in a process of its own, for peaks of memory."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()

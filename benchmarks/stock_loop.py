@@ -1,0 +1,70 @@
+"""The usual loop, as Mitsuba's tutorials write it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
+
+
+def stock_loop(
+    problem: ur.Problem,
+    spp: int,
+    learning_rate: float,
+    seconds: float = float("inf"),
+    steps: int = sys.maxsize,
+    seed: int = 0,
+    every: int = 5,
+) -> list[dict[str, Any]]:
+    """`mi.render` with `prb`, `dr.backward`, `mi.ad.Adam`, values clipped.
+
+    Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
+    """
+    scene, parameters = stock_scene(problem)
+    integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
+    start = problem.initial()
+    history: list[dict[str, Any]] = []
+    for warm in (True, False):
+        rates = {key: problem.learning_rates.get(key, learning_rate) for key in start}
+        optimizer = mi.ad.Adam(lr=learning_rate)
+        for key, value in start.items():
+            optimizer[key] = from_tensor(value, parameters[key])
+        optimizer.set_learning_rate(rates)
+        parameters.update(optimizer)
+        clock, step = 0.0, 0
+        while clock < seconds and step < (2 if warm else steps):
+            began = time.perf_counter()
+            loss: Any = 0.0
+            for view in range(len(problem.views)):
+                number = (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
+                image = mi.render(
+                    scene,
+                    parameters,
+                    sensor=problem.views[view].sensor,
+                    integrator=integrator,
+                    spp=spp,
+                    seed=number,
+                    seed_grad=number + 1,
+                )
+                loss += problem.loss_value(view, image)
+            dr.backward(loss)
+            optimizer.step()
+            for key in start:
+                low, high = problem.bounds[key]
+                optimizer[key] = project(optimizer[key], low, high)
+            parameters.update(optimizer)
+            value = float(np.array(dr.detach(loss)).reshape(-1)[0])
+            dr.sync_thread()
+            clock += time.perf_counter() - began
+            step += 1
+            if not warm and (step % every == 0 or clock >= seconds or step >= steps):
+                now = {key: mi.TensorXf(dr.ravel(dr.detach(optimizer[key])), tuple(start[key].shape)) for key in start}
+                history.append(
+                    {"step": step - 1, "seconds": clock, "loss": value, "parameter_error": problem.parameter_error(now)}
+                )
+    return history

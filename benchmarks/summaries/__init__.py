@@ -1,1 +1,0 @@
-"""What docs/results.md says of the benchmarks, by subject."""

@@ -1,0 +1,171 @@
+"""The benchmarks' runner, without rendering: folders, options, records, turns, the results page."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.runner import cli, records, results_page
+from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
+from benchmarks.runner.machine import Load
+from benchmarks.runner.options import add_options, defaults
+from benchmarks.runner.timing import ratio, turns
+
+ALL = benchmarks()
+TOY = ["--seeds", "2", "--tuning-seeds", "1", "--steps", "3", "5", "--rates", "1"]
+
+
+@pytest.fixture(params=ALL)
+def benchmark(request: pytest.FixtureRequest) -> Benchmark:
+    if request.param == "higher_order.networks":
+        pytest.importorskip("torch")
+    return ALL[request.param]
+
+
+def test_every_benchmark_is_whole_and_its_toy_sizes_are_options(benchmark: Benchmark) -> None:
+    run = benchmark.module("run")
+    assert benchmark.has("table")
+    assert benchmark.summary
+    assert set(run.QUICK) <= set(inspect.signature(run.run).parameters)
+    parser = argparse.ArgumentParser()
+    names = add_options(parser, run.run)
+    without_default = set(names) - set(defaults(run.run))
+    assert not vars(parser.parse_args(["."] * len(without_default))).keys() - without_default
+
+
+def test_notes_are_dated_by_the_figures_they_speak_of(benchmark: Benchmark) -> None:
+    record = records.read(benchmark.folder)
+    _, notes = results_page.split_notes(benchmark)
+    assert record is not None
+    assert re.findall(r"^Findings on the figures of (\d{4}-\d\d-\d\d)\.$", notes, flags=re.MULTILINE) == [
+        record["date"]
+    ]
+    assert record["command"].startswith(f"python -m benchmarks {benchmark.name}")
+
+
+def test_the_results_page_is_what_the_records_say(tmp_path: Path) -> None:
+    written = results_page.write_page(tmp_path / "results.md").read_text()
+    assert written == (ROOT / "docs" / "results.md").read_text()
+    assert written.count("\n## ") == len(ALL)
+
+
+def test_nothing_is_added_to_the_search_path() -> None:
+    for file in (ROOT / "benchmarks").rglob("*.py"):
+        assert "sys.path" not in file.read_text(), file
+
+
+def example(
+    folder: Path,
+    scene: tuple[str, ...] = ("a", "b"),
+    sizes: tuple[int, ...] = (1, 2),
+    only: tuple[str, ...] = (),
+    seconds: float | None = None,
+    fast: bool = False,
+) -> None:
+    """An example.
+
+    Args:
+        folder: where
+        seconds: budget
+            of a run
+    """
+
+
+def parse(*words: str) -> dict[str, Any]:
+    parser = argparse.ArgumentParser()
+    add_options(parser, example)
+    return vars(parser.parse_args(words))
+
+
+def test_options_have_the_parameters_types() -> None:
+    words = ["here", "--sizes", "3", "4", "--seconds", "2", "--fast", "--only", "x", "--scene", "b"]
+    expected = {"sizes": [3, 4], "seconds": 2.0, "fast": True, "only": ["x"], "scene": ["b"]}
+    assert parse(*words) == {"folder": Path("here"), **expected}
+    assert parse("here") == {"folder": Path("here")}
+
+
+def test_options_refuse_what_is_no_choice(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse("here", "--scene", "c")
+    assert "'c'" in capsys.readouterr().err
+
+
+def test_help_tells_what_the_docstring_says() -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser, example)
+    assert "budget of a run" in parser.format_help()
+
+
+def test_merge_keeps_what_was_not_measured_again() -> None:
+    old = {"date": "1", "tasks": {"a": {"spp": 2, "methods": {"x": 1, "y": 2}}, "b": {"spp": 2, "methods": {"x": 3}}}}
+    new = {"date": "2", "tasks": {"a": {"spp": 2, "methods": {"y": 5}}}}
+    merged = records.merge(old, new, ["tasks", "*", "methods"])
+    assert merged == {
+        "date": "2",
+        "tasks": {"a": {"spp": 2, "methods": {"x": 1, "y": 5}}, "b": {"spp": 2, "methods": {"x": 3}}},
+    }
+
+
+def test_merge_drops_what_was_measured_under_other_conditions() -> None:
+    old = {"tasks": {"a": {"spp": 2, "methods": {"x": 1}}}}
+    new = {"tasks": {"a": {"spp": 4, "methods": {"y": 5}}}}
+    assert records.merge(old, new, ["tasks", "*", "methods"]) == new
+
+
+def test_merge_takes_tuples_for_the_lists_that_json_makes_of_them() -> None:
+    old = json.loads(json.dumps({"tasks": {"a": {"steps": (1, 2), "methods": {"x": 1}}}}))
+    new = {"tasks": {"a": {"steps": (1, 2), "methods": {"y": 5}}}}
+    assert records.merge(old, new, ["tasks", "*", "methods"])["tasks"]["a"]["methods"] == {"x": 1, "y": 5}
+
+
+def test_merge_keeps_a_part_that_the_new_record_lacks() -> None:
+    old, new = {"cost": {"32": 1}, "variance": {"a": 2}}, {"variance": {"b": 3}}
+    assert records.merge(old, new, ["cost"]) == {"cost": {"32": 1}, "variance": {"b": 3}}
+    assert records.merge(old, new, ["variance"]) == {"variance": {"a": 2, "b": 3}}
+
+
+def test_contenders_are_timed_in_turns() -> None:
+    calls: list[tuple[str, int]] = []
+    times = turns({"a": lambda n: calls.append(("a", n)), "b": lambda n: calls.append(("b", n))}, repeats=2, warm=1)
+    assert calls == [("a", 0), ("b", 0), ("a", 1), ("b", 1), ("a", 2), ("b", 2)]
+    assert {name: len(found) for name, found in times.items()} == {"a": 2, "b": 2}
+    low, middle, high = ratio({"a": [2.0, 4.0, 6.0], "b": [1.0, 1.0, 1.0]}, "a", "b")
+    assert low < middle == 4.0 < high
+
+
+def test_the_load_of_others_is_a_share() -> None:
+    after = Load(moment=0.01).after()
+    assert {"before", "during", "average_after"} == set(after)
+    assert after["during"] is None or after["during"] >= 0
+
+
+def test_a_benchmark_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["meta.fig2_exponential", *TOY, "--out", str(tmp_path)]) == 0
+    record = records.read(tmp_path)
+    assert record is not None
+    assert {"command", "date", "hardware", "versions", "load", "settings", "methods"} <= set(record)
+    assert record["settings"] == {"seeds": 2, "tuning_seeds": 1, "steps": [3, 5], "rates": 1}
+    assert "| coupled |" in capsys.readouterr().out
+    (tmp_path / "figure.png").unlink()
+    before = (tmp_path / "results.json").read_bytes()
+    assert cli.main(["meta.fig2_exponential", "--plots-only", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "figure.png").is_file()
+    assert (tmp_path / "results.json").read_bytes() == before
+
+
+def test_the_list_has_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name in ALL:
+        assert sum(line.startswith(f"{name} ") for line in lines) == 1
+
+
+def test_an_unknown_benchmark_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["rcv.fig99"]) == 2
+    assert capsys.readouterr().err == "no benchmark 'rcv.fig99'; python -m benchmarks lists them\n"
