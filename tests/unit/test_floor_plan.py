@@ -20,12 +20,12 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 
 
 def modules() -> dict[str, Path]:
-    """Every module of the package by its dotted name below `unrender`; the package's own `__init__` and `__main__` are the roof."""
+    """Every module of the package by its dotted name below `unrender`, but for the roof above all floors: the public names."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
-        if name not in ("", "__main__"):
+        if name not in ("", "__main__", "protocols"):
             found[name] = path
     return found
 
@@ -38,9 +38,11 @@ def imports(tree: ast.Module, known: dict[str, Path]) -> Iterator[tuple[str, int
             lazy |= {id(x) for x in ast.walk(node)}
     for node in ast.walk(tree):
         names: list[str] = []
+        if not isinstance(node, (ast.Import, ast.ImportFrom)):
+            continue
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         for name in names:
             if name.startswith("unrender."):

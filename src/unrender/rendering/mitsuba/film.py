@@ -1,6 +1,3 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportCallIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportAttributeAccessIssue=false, reportReturnType=false
-
 """From pixels to camera rays, from path radiance back to pixels: one box filter, independent samples.
 
 The film's own reconstruction filter is not used. Per-pixel statistics need pixels whose samples are their own, so every
@@ -33,8 +30,8 @@ class RepeatingSampler:
     def seed(self, seed: Any, lanes: int) -> None:
         """Start anew with `lanes` lanes."""
         lane = dr.arange(mi.UInt32, lanes) % self.period
-        state, sequence = mi.sample_tea_32(seed, lane)
-        self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+        state, sequence = mi.sample_tea_32(seed, lane)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
 
     def next_1d(self) -> Any:
         """A uniform number per lane."""
@@ -111,7 +108,10 @@ def rays_of_many(
         time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
     aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
     ray, weight = dr.gather(mi.SensorPtr, sensors, which).sample_ray_differential(
-        time, 0.5, mi.Point2f(position.x / width, position.y / height), aperture
+        time,
+        0.5,
+        mi.Point2f(position.x / width, position.y / height),
+        aperture,  # pyright: ignore[reportArgumentType]
     )
     ray.scale_differential(spp**-0.5)
     return ray, weight
@@ -168,7 +168,7 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any
     group = index // pixels
     index = (index - group * pixels) * groups + group
     channels = mi.Color3f(*(dr.gather(mi.Float, sums[c], index) for c in range(3)))
-    return mi.TensorXf(dr.ravel(channels) / size, (groups, *shape))
+    return mi.TensorXf(dr.ravel(channels) / size, (groups, *shape))  # pyright: ignore[reportOperatorIssue]
 
 
 def film_adjoint(weights: Any, spp: int, count: int) -> Any:

@@ -1,6 +1,3 @@
-# Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false, reportOperatorIssue=false
-
 """Rigid poses of shapes and sensors as parameters, a pose per lane.
 
 For every shape that is no emitter and for every sensor, the renderer offers parameters that Mitsuba does not have:
@@ -108,7 +105,7 @@ class Pose:
 
     def point(self, p: Any) -> Any:
         """Where a point goes."""
-        return self.centre + self.translation + self.scale * (self.matrix @ (p - self.centre))
+        return self.centre + self.translation + self.scale * (self.matrix @ (p - self.centre))  # pyright: ignore[reportOperatorIssue]
 
 
 def _rotation(vector: Any) -> Any:
@@ -203,7 +200,7 @@ class Assembly:
             matrix = dr.select(hit, pose.matrix, matrix)
             scale = dr.select(hit, pose.scale, scale)
         valid = active & nearest.is_valid()
-        inside.maxt = dr.inf
+        inside.maxt = dr.inf  # pyright: ignore[reportAttributeAccessIssue]
         si = nearest.compute_surface_interaction(inside, ray_flags, valid)
         si.p = dr.select(valid, ray(si.t), si.p)
         si.n = mi.Normal3f(matrix @ si.n)
