@@ -20,6 +20,7 @@ import unrender as ur
 from unrender import losses, optimizers
 from unrender.core import registry, tables
 from unrender.core.errors import InputError
+from unrender.gallery import fields
 from unrender.methods import methods
 from unrender.runs.folder.state import Packed, pack, unpack
 
@@ -126,7 +127,7 @@ def test_gallery_problems_are_named_in_lower_case() -> None:
     class TwoNumbers:
         """Two numbers."""
 
-        loss: losses.Loss = field(default=losses.L2(), metadata=ur.gallery.fields.LOSS)
+        loss: losses.Loss = field(default=losses.L2(), metadata=fields.LOSS)
 
         def problem(self, name: str) -> ur.Problem:
             return ur.gallery.problem("quad", loss=self.loss)

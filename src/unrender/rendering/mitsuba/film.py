@@ -108,8 +108,8 @@ def rays_of_many(
         time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
     aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
     ray, weight = dr.gather(mi.SensorPtr, sensors, which).sample_ray_differential(
-        time,
-        0.5,
+        time,  # pyright: ignore[reportArgumentType]
+        0.5,  # pyright: ignore[reportArgumentType]
         mi.Point2f(position.x / width, position.y / height),
         aperture,  # pyright: ignore[reportArgumentType]
     )

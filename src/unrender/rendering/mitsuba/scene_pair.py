@@ -113,7 +113,7 @@ class ScenePair:
         if self._tables is None:
             current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
             self._tables = {
-                "bsdf": _table(current.bsdf(), previous.bsdf()),
+                "bsdf": _table(current.bsdf(), previous.bsdf()),  # pyright: ignore[reportAttributeAccessIssue]
                 "emitter": _table(self.current.emitters_dr(), self.previous.emitters_dr()),
                 "shape": _table(current, previous),
                 "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
@@ -124,11 +124,11 @@ class ScenePair:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current
         scene's BSDFs and, through the pointer tables, of the previous scene's."""
         kinds = {
-            int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(traits.bsdf)).numpy()[0]): traits.delta
+            int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(traits.bsdf)).numpy()[0]): traits.delta  # pyright: ignore[reportAttributeAccessIssue]
             for traits in all_traits
             if traits.changes_delta
         }
-        pointers = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr().bsdf()).numpy()
+        pointers = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr().bsdf()).numpy()  # pyright: ignore[reportAttributeAccessIssue]
         kinds = {number: kind for number, kind in kinds.items() if number in pointers}
         if kinds:  # only then is the second load worth its while
             previous = self.tables()["bsdf"].numpy()
@@ -165,7 +165,7 @@ class ScenePair:
             if grids.shapes() != other.shapes():
                 return {}
             majorants = dr.maximum(majorants, other.values())
-        return {"frames": grids.frames, "layout": grids.layout, "every": grids.every, "majorants": majorants}
+        return {"frames": grids.frames, "layout": grids.layout, "every": grids.every, "majorants": majorants}  # pyright: ignore[reportReturnType]
 
     def _grids(self, previous: bool) -> MajorantSupergrids:
         if previous not in self._majorants or not self._majorants[previous].fits():
@@ -247,7 +247,7 @@ class ScenePair:
 
 def _id(medium: mi.Medium | None) -> int:
     """Its registry id, 0 for None."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium)).numpy()[0])
+    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium)).numpy()[0])  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _media_ids(scene: mi.Scene) -> mi.UInt32:
@@ -255,8 +255,8 @@ def _media_ids(scene: mi.Scene) -> mi.UInt32:
 
 
 def _table(current: Any, previous: Any) -> mi.UInt32:
-    source = dr.reinterpret_array(mi.UInt32, current).numpy()
-    target = dr.reinterpret_array(mi.UInt32, previous).numpy()
+    source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]
     if source.shape != target.shape:
         raise InputError("scene: two loads of the description differ in their shapes or emitters")
     table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)

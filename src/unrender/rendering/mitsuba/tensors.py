@@ -37,10 +37,10 @@ def to_tensor(value: Any) -> mi.TensorXf:
     """The tensor (`mi.TensorXf`, detached) that stands for a Mitsuba value."""
     shape = native_shape(value)
     if isinstance(value, (int, float)):
-        return mi.TensorXf(np.float32(value))
+        return mi.TensorXf(np.float32(value))  # pyright: ignore[reportArgumentType]
     if dr.is_tensor_v(value):
         return mi.TensorXf(dr.detach(value))
-    return mi.TensorXf(dr.ravel(dr.detach(value)), shape)
+    return mi.TensorXf(dr.ravel(dr.detach(value)), shape)  # pyright: ignore[reportArgumentType]
 
 
 def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
