@@ -21,6 +21,20 @@ from unrender.backend import install_hints, llvm
 from unrender.core.errors import VariantError
 from unrender.core.suggestions import did_you_mean
 
+__all__ = [
+    "CUDA",
+    "LLVM",
+    "VARIANTS",
+    "current",
+    "ensure",
+    "gpu_problem",
+    "has_cuda_driver",
+    "llvm_version",
+    "prepare",
+    "use",
+    "use_threads",
+]
+
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
 VARIANTS = (CUDA, LLVM)

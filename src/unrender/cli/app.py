@@ -17,6 +17,8 @@ from unrender.cli.run import run
 from unrender.cli.watch import watch
 from unrender.runs.result import versions
 
+__all__ = ["app"]
+
 app = typer.Typer(
     help="Recover what a scene is made of (textures, materials, light) from images of it.",
     add_completion=False,

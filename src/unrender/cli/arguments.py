@@ -18,6 +18,25 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.problem.problem import Problem
 
+__all__ = [
+    "DEFAULT_STEPS",
+    "CheckpointEvery",
+    "FinalSpp",
+    "Overwrite",
+    "ProblemName",
+    "ProblemSettings",
+    "Threads",
+    "Variant",
+    "budget",
+    "check_problem",
+    "folder",
+    "literal",
+    "open_problem",
+    "remove_if_empty",
+    "settings",
+    "use_variant",
+]
+
 DEFAULT_STEPS = 300
 
 ProblemName = Annotated[

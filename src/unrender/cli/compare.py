@@ -23,6 +23,8 @@ from unrender.methods import Method, method
 from unrender.report import formatting
 from unrender.report.equal_time import Comparison, Spread
 
+__all__ = ["DEFAULT_SECONDS", "INTERRUPTED", "compare"]
+
 INTERRUPTED = 130
 DEFAULT_SECONDS = 20.0
 _MARKS = ("compare.json", "*-seed*/run.json")

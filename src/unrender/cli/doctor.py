@@ -18,6 +18,8 @@ from rich.table import Table
 from unrender.backend import llvm, variant
 from unrender.core.errors import VariantError
 
+__all__ = ["TOLERANCE", "doctor", "gradient_error"]
+
 TOLERANCE = 1e-3
 """The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
 

@@ -20,6 +20,8 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 
+__all__ = ["Plan", "execute", "image_errors", "introduce", "summarise"]
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -13,6 +13,8 @@ from unrender.cli import arguments
 from unrender.cli.arguments import Variant
 from unrender.core.errors import InputError
 
+__all__ = ["export"]
+
 
 def export(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")],

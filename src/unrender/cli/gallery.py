@@ -22,6 +22,8 @@ from unrender.io.files import write
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
 
+__all__ = ["gallery"]
+
 _SPP = 64
 
 

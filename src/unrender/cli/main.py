@@ -16,6 +16,8 @@ from unrender.backend import variant
 from unrender.cli.doctor import doctor
 from unrender.core.errors import UnrenderError, VariantError
 
+__all__ = ["main"]
+
 INPUT, ENVIRONMENT, INTERRUPTED = 2, 3, 130
 
 # Typer may bring its own copy of click, so its errors are found from the one that typer exports.

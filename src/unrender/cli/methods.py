@@ -12,6 +12,8 @@ from rich.table import Table
 from unrender.methods import Method, method
 from unrender.methods import methods as registered
 
+__all__ = ["methods"]
+
 
 def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None) -> None:
     """List the methods, their options and defaults."""

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
+__all__ = ["Progress"]
+
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 2.0
 _SMOOTHING = 0.1

@@ -9,6 +9,8 @@ import typer
 
 from unrender import report as pages
 
+__all__ = ["report"]
+
 
 def report(directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]) -> None:
     """Write the page of a run folder anew, and print where it is."""

@@ -17,6 +17,8 @@ from unrender.runs import reopen
 from unrender.runs.live import Live
 from unrender.runs.resume import load_run, resume_run
 
+__all__ = ["resume"]
+
 
 def resume(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")],

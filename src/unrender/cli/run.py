@@ -19,6 +19,8 @@ from unrender.methods import method
 from unrender.problem.problem import Problem
 from unrender.runs.result import Result
 
+__all__ = ["INTERRUPTED", "conclude", "run"]
+
 INTERRUPTED = 130
 
 

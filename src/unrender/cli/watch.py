@@ -14,6 +14,8 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.watch import server
 
+__all__ = ["watch"]
+
 _NICE = 10
 
 

@@ -11,6 +11,45 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+__all__ = [
+    "Array",
+    "absolute",
+    "add_first_axis",
+    "all_finite",
+    "arange",
+    "clip",
+    "concatenate",
+    "evaluate",
+    "exp",
+    "gather",
+    "gather_rows",
+    "integer",
+    "is_drjit",
+    "is_finite",
+    "like",
+    "like_integers",
+    "log",
+    "maximum",
+    "mean",
+    "mean_over_first",
+    "mean_over_rest",
+    "minimum",
+    "number",
+    "numpy",
+    "owned",
+    "random_below",
+    "random_integers",
+    "rows",
+    "scalar",
+    "searchsorted",
+    "shape",
+    "sign",
+    "sqrt",
+    "total",
+    "where",
+    "zeros_like",
+]
+
 Array = Any
 """A NumPy array, or a Dr.Jit array or tensor."""
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from unrender.core.errors import InputError
 
+__all__ = ["integer", "number"]
+
 
 def number(
     owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False

@@ -1,5 +1,7 @@
 """The errors a caller may catch. Each carries one line that says what is wrong and what would be right."""
 
+__all__ = ["InputError", "UnrenderError", "VariantError"]
+
 
 class UnrenderError(Exception):
     """Base of every error that `unrender` raises on purpose."""

@@ -14,6 +14,19 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
+__all__ = [
+    "RELATIVE_EPSILON",
+    "displayed",
+    "exposure",
+    "flip",
+    "has_flip",
+    "psnr",
+    "relative_mse",
+    "rmse",
+    "srgb",
+    "ssim",
+]
+
 RELATIVE_EPSILON = 1e-2
 """Added to the squared reference by `relative_mse`, so that black pixels do not decide."""
 _WHITE_PERCENTILE = 95.0

@@ -19,6 +19,8 @@ import mitsuba as mi
 from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 
+__all__ = ["Place", "SceneGraph"]
+
 _LABEL = re.compile(r"n(\d+)")
 _MARK = "unrender_node"
 _NAMELESS = re.compile(r"|object_\d+|_.*|elm__\d+")

@@ -16,6 +16,8 @@ from unrender.evaluation.metrics import srgb
 from unrender.exporting.ready_made import as_bitmap, file_name
 from unrender.io.volumes import write_grid
 
+__all__ = ["write"]
+
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
 _LARGEST = 64
 """Numbers of a parameter that are written out as text."""

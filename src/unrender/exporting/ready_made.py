@@ -18,6 +18,8 @@ from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 
+__all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make"]
+
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """The folders of a scene's files."""
 

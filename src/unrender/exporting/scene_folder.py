@@ -26,6 +26,8 @@ from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
+__all__ = ["SCENE", "Exported", "export"]
+
 SCENE = "scene.xml"
 _FOLDERS = {
     mi.ObjectType.Shape: ready_made.MESHES,

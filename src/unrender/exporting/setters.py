@@ -13,6 +13,8 @@ from unrender.exporting.graph import Place, SceneGraph
 from unrender.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name
 from unrender.io.volumes import write_grid
 
+__all__ = ["store"]
+
 _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 _METALS = ("conductor", "roughconductor")
 _VERTEX = ("vertex_", "face_")

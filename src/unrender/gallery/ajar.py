@@ -17,6 +17,8 @@ from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
+__all__ = ["Ajar"]
+
 _LEAVES = 7
 
 

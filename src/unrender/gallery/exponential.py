@@ -14,6 +14,8 @@ from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.numpy.exponential import RATE, ExponentialRenderer
 
+__all__ = ["Exponential"]
+
 _MEAN, _START = 2.0, 1.5
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
+__all__ = ["centred", "option", "standing"]
+
 _KINDS = (".ply", ".obj")
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from unrender.rendering.mitsuba.described import load_described
 
+__all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "sweep", "triangles"]
+
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
     """A smooth mesh through a grid of points.

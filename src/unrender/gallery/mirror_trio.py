@@ -17,6 +17,8 @@ from unrender.gallery import fields, meshes, parts
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 
+__all__ = ["MirrorTrio"]
+
 _ALPHA = 0.06
 """The mirror's roughness in truth."""
 

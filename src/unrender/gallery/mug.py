@@ -16,6 +16,8 @@ from unrender.gallery import fields, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 
+__all__ = ["Mug"]
+
 _SIDE = np.radians(105.0)
 """Where the handle is in truth: 0 is towards the camera, a right angle to its right."""
 

@@ -16,6 +16,8 @@ from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba.scene_loading import load
 
+__all__ = ["NerfVolume"]
+
 
 @register(name="nerf-volume", position=25)
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+__all__ = ["Vector", "camera", "colour", "diffuse", "light", "rectangle", "room", "twosided", "uplight"]
+
 Vector = Sequence[float] | np.ndarray
 
 

@@ -17,6 +17,8 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
+__all__ = ["PlainAndTextured"]
+
 
 @register(name="plain-and-textured", position=10)
 @dataclass(frozen=True)

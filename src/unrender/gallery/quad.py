@@ -14,6 +14,8 @@ from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.numpy.quadratic import POINT, QuadraticRenderer
 
+__all__ = ["Quad"]
+
 _MATRIX = np.array([[5.0, 3.75], [3.75, 5.0]])
 _START = (1.5, 1.0)
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from unrender.gallery import parts
 
+__all__ = ["CLEAR", "environment", "picture"]
+
 CLEAR = ((0.12, 0.25, 0.6), (0.65, 0.7, 0.75), (0.2, 0.18, 0.15))
 """Of zenith, horizon, and what is below it: noon over bare ground."""
 

@@ -17,6 +17,8 @@ from unrender.gallery import fields, textures, volumes
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
+__all__ = ["Smoke"]
+
 
 @register(name="smoke", position=24)
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba.scene_loading import load
 
+__all__ = ["SphereToMesh"]
+
 _RADIUS = 0.7
 """Of the sphere; the body fits into a ball of radius 1 or so."""
 

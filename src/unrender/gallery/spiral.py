@@ -16,6 +16,8 @@ from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.problem.parameter import Parameter
 
+__all__ = ["Spiral"]
+
 _TURNS = 2.5
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from unrender.gallery import parts
 from unrender.problem.parameter import Parameter
 
+__all__ = ["sun", "unknown"]
+
 
 def sun(towards: parts.Vector, *rgb: float) -> dict[str, Any]:
     """Light from one direction.

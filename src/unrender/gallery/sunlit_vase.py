@@ -16,6 +16,8 @@ from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
+__all__ = ["SunlitVase"]
+
 _SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
 """Direction to the sun."""
 _SUN_RADIUS = np.radians(2.5)

@@ -14,6 +14,8 @@ from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
+__all__ = ["Tea"]
+
 
 @register(name="tea", position=23)
 @dataclass(frozen=True)

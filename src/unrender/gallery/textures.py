@@ -12,6 +12,8 @@ import numpy as np
 import skimage.data
 from skimage.transform import resize
 
+__all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp", "to_linear"]
+
 Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
 """Those that lie inside scikit-image's wheel, so that nothing is downloaded."""
 

@@ -17,6 +17,8 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
+__all__ = ["TwoPlanets", "blue", "red"]
+
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the planets and of the two sides of the glass."""
 

@@ -15,6 +15,8 @@ from PIL import Image, UnidentifiedImageError
 
 from unrender.core.errors import InputError
 
+__all__ = ["MOST_VALUES", "Sizes", "check"]
+
 MOST_VALUES = 1 << 28
 """Pixels times channels of the largest picture that is decoded: one gigabyte in single precision."""
 

@@ -12,6 +12,8 @@ from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, image_size
 
+__all__ = ["READABLE", "Picture", "luminance", "read", "resize", "srgb_to_linear"]
+
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name endings that `read` knows."""
 

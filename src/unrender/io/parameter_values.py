@@ -10,6 +10,8 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io import images, resampling, volumes
 
+__all__ = ["fill"]
+
 
 def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     """`initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).

@@ -16,6 +16,8 @@ from xml.parsers import expat
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 
+__all__ = ["of"]
+
 _DEEPEST = 128
 _DEEPEST_INCLUDE = 16
 _MOST_INCLUDES = 1000

@@ -7,6 +7,8 @@ from typing import Any
 
 from unrender.core.errors import InputError
 
+__all__ = ["Place", "find", "parse"]
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:  # pragma: no cover

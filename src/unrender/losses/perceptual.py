@@ -20,6 +20,8 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 
+__all__ = ["LAYERS", "Perceptual"]
+
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 """Channels of the convolutions; the resolution is halved between blocks."""
 

@@ -8,6 +8,8 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 
+__all__ = ["L1", "L2", "Huber", "RelativeL2"]
+
 
 @register(position=1)
 @dataclass(frozen=True)

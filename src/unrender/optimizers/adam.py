@@ -15,6 +15,8 @@ from unrender.optimizers import rates
 from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
 
+__all__ = ["Adam", "AdamState"]
+
 
 @dataclass(frozen=True)
 class AdamState:

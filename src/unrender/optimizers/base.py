@@ -9,6 +9,8 @@ from typing import Any, Protocol
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 
+__all__ = ["Optimizer"]
+
 
 class Optimizer(Protocol):
     """Computes steps from estimates. Immutable; all that changes is in the state."""

@@ -19,6 +19,8 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.optimizers import rates
 
+__all__ = ["CMAES", "CMAESState"]
+
 _TOLERANCE = 0.01
 """Distance of the parameters from the mean, in standard deviations, up to which they count as equal."""
 

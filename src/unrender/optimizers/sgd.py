@@ -14,6 +14,8 @@ from unrender.optimizers import rates
 from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 
+__all__ = ["SGD", "SGDState"]
+
 
 @dataclass(frozen=True)
 class SGDState:

@@ -6,6 +6,8 @@ from typing import Protocol
 
 from unrender.core.arrays import Array
 
+__all__ = ["Preconditioner"]
+
 
 class Preconditioner(Protocol):
     """A symmetric positive linear map S of one parameter's gradients and steps.

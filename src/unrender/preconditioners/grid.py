@@ -18,6 +18,8 @@ import scipy.fft
 import scipy.sparse
 from cholespy import CholeskySolverF, MatrixType  # type: ignore  (a compiled module without stubs)
 
+__all__ = ["CholeskySolver", "Solver", "TransformSolver", "laplacian", "solver"]
+
 
 class Solver(Protocol):
     """(I + λ L)^-1 on one grid."""

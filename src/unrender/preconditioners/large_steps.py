@@ -15,6 +15,8 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.preconditioners import grid
 
+__all__ = ["LargeSteps"]
+
 
 @register
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
+__all__ = ["MARGIN", "project"]
+
 MARGIN = 1e-4
 """Distance from a bound at which parameters are clamped, as a fraction of their range (of 1 where it is open). At a reflectance of
 exactly 0 no light arrives through a surface and its gradient is 0 for ever; a lobe of probability exactly 0 is never sampled again."""

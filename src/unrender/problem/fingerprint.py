@@ -14,6 +14,8 @@ from unrender.core import arrays
 from unrender.io import scene_files
 from unrender.problem.problem import Problem
 
+__all__ = ["differences", "digest", "fingerprint"]
+
 _DIGEST = "sha256:"
 _MOST_OBJECTS = 64
 _known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDictionary()

@@ -13,6 +13,8 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.problem.view import View
 
+__all__ = ["ON_DEVICE", "References"]
+
 ON_DEVICE = 1 << 29
 """Bytes of references up to which they are copied to the device; larger sets stay in host memory."""
 

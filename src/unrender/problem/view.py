@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+__all__ = ["View"]
+
 
 @dataclass(frozen=True)
 class View:

@@ -19,6 +19,8 @@ from unrender.report.overview_figure import overview_figure
 from unrender.report.plots import Chart, Line
 from unrender.runs.folder.reader import RunFolder, read
 
+__all__ = ["compare", "load_comparison", "write_comparison"]
+
 _VIEWS = 4
 _MAPS = 8
 

@@ -9,6 +9,8 @@ from unrender.report.curves import Series
 from unrender.report.plots import Chart, Line
 from unrender.runs.folder.reader import RunFolder
 
+__all__ = ["charts", "charts_of_runs"]
+
 
 def charts(run: RunFolder, axis: str) -> list[Chart]:
     """Parameter errors, loss, and gradient noise of one run, along "seconds" or "samples"."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+__all__ = ["count", "duration", "number"]
+
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
 

@@ -14,6 +14,8 @@ from unrender.io import bounded_files
 from unrender.report.html import flatten
 from unrender.runs.folder.reader import RunFolder
 
+__all__ = ["Group", "check_comparable", "group"]
+
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
 _TOLERANCE = 0.01
 _ARGUMENT = re.compile(r"(\w+)=([^=(),]+)(?=[,)])")

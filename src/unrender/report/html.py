@@ -15,6 +15,8 @@ from markupsafe import Markup
 from unrender.report import formatting
 from unrender.runs.folder.schema import RunRecord
 
+__all__ = ["environment", "facts", "flatten", "loader", "render", "source"]
+
 _SCRIPT = "viewer.js"
 
 

@@ -14,6 +14,8 @@ from unrender.report import formatting, panels, plots, tone_mapping
 from unrender.report.curves import Band
 from unrender.report.equal_time import Comparison, Metric
 
+__all__ = ["overview_figure"]
+
 _COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _COLUMNS = 6
 _WIDTH = 10.0

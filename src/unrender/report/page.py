@@ -9,6 +9,8 @@ from unrender.io.files import write
 from unrender.report import convergence, html, image_metrics, panels, plots, tables
 from unrender.runs.folder.reader import read
 
+__all__ = ["page"]
+
 _VIEWS = 8
 _MAPS = 24
 

@@ -11,6 +11,19 @@ from unrender.report import formatting, tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
 
+__all__ = [
+    "ColourScale",
+    "Figure",
+    "Panel",
+    "Slider",
+    "is_map",
+    "map_of_methods",
+    "map_of_run",
+    "plane",
+    "view_of_methods",
+    "view_of_run",
+]
+
 _VALUES_IN_A_TABLE = 16
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from unrender.report import formatting
 
+__all__ = ["AXES", "Axis", "Chart", "Curve", "Line", "axis_format", "chart", "is_logarithmic"]
+
 AXES = ("seconds", "samples")
 """Horizontal axes."""
 WIDTH, HEIGHT = 420, 270

@@ -9,6 +9,8 @@ import numpy as np
 from unrender.report import curves, formatting, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
+__all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "parameter_row", "tiles", "view_rows"]
+
 STOP_REASONS = {
     "steps": "all steps done",
     "seconds": "stopped when time was up",

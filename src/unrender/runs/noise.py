@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 
+__all__ = ["GradientNoise"]
+
 _DECAY = 0.9
 
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
+__all__ = ["TensorBoard"]
+
 _LARGEST = 512
 _VIEWS = 8
 

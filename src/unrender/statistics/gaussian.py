@@ -21,6 +21,24 @@ from functools import cache
 
 import numpy as np
 
+__all__ = [
+    "CURVATURE_MASS",
+    "GRADIENT_MASS",
+    "curvature_density",
+    "curvature_distribution",
+    "curvature_sample",
+    "gradient_density",
+    "gradient_kernel",
+    "gradient_mixture",
+    "gradient_ratio",
+    "gradient_sample",
+    "hessian_kernel",
+    "hessian_mixture",
+    "hessian_ratio",
+    "joint_mixture",
+    "joint_ratio",
+]
+
 _TABLE_REACH = 10.0
 _TABLE_SIZE = 20_001
 

@@ -35,6 +35,19 @@ from unrender.core.arrays import Array
 from unrender.statistics.control_weight import control_variate_variance, control_weight
 from unrender.statistics.recursion import advance
 
+__all__ = [
+    "BETA_DIFFERENCE",
+    "BETA_PROPORTIONAL",
+    "Moments",
+    "State",
+    "clip_alpha",
+    "init",
+    "meta_variance",
+    "optimal_alpha",
+    "update",
+    "update_coupled",
+]
+
 BETA_PROPORTIONAL = 0.99
 """β_F: large, since Var F is stable and should hardly depend on any one sample."""
 

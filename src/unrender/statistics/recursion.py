@@ -5,6 +5,8 @@ from __future__ import annotations
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
+__all__ = ["advance"]
+
 
 def advance(memory: Array, current: Array, previous: Array, weight: Array) -> Array:
     """M_n = F + w (M_{n-1} − H): Eq. 6 of Nicolet et al. 2023.

@@ -32,6 +32,8 @@ from dataclasses import dataclass
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
+__all__ = ["State", "covariance", "init", "update"]
+
 
 @dataclass(frozen=True)
 class State:

@@ -19,6 +19,8 @@ from unrender.runs.folder.reader import RunFolder
 from unrender.watch import monitor
 from unrender.watch.monitor import Snapshot
 
+__all__ = ["PictureCache", "RunRow", "environment", "render", "source"]
+
 _COLOURS = 6
 _MAPS = 8
 _CACHED_PAGES = 8

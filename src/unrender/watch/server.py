@@ -28,6 +28,8 @@ from unrender.runs.folder.schema import COMMANDS, CONTROL
 from unrender.watch import dashboard
 from unrender.watch.monitor import RunMonitor
 
+__all__ = ["HOST", "Address", "application", "listen", "serve"]
+
 HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
 _LONGEST_COMMAND = 1024

@@ -17,6 +17,8 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 
+__all__ = ["emits", "register"]
+
 
 def register() -> None:
     """Make the plugin known to the variant that is set. Again does nothing."""

@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "rays", "rays_of_many"]
+
 
 @dataclass
 class RepeatingSampler:

@@ -14,6 +14,8 @@ from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.io.volumes import read_grid
 
+__all__ = ["MediumKey", "attached_media", "extinction_transforms"]
+
 MediumKey = tuple[str, str, int]
 """The id of a shape or sensor; "interior", "exterior" or "medium"; how many of the same name came before, since shapes of an XML file may
 have no id."""

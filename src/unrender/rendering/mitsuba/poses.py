@@ -28,6 +28,8 @@ from scipy.spatial.transform import Rotation
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ParameterInfo
 
+__all__ = ["Assembly", "Pose", "PoseKey", "PosedScene", "info", "keys", "matrices"]
+
 _AXES = ("x", "y", "z")
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+")
 

@@ -20,6 +20,8 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
+__all__ = ["AnalyticPaths", "AnalyticRenderer"]
+
 
 @dataclass(frozen=True)
 class AnalyticPaths:

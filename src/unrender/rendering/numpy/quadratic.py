@@ -15,6 +15,8 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
+__all__ = ["POINT", "QuadraticRenderer"]
+
 POINT = "x"
 """The key of its one parameter."""
 

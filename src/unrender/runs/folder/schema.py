@@ -27,6 +27,21 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io.bounded_files import printable
 
+__all__ = [
+    "COMMANDS",
+    "HISTORY_AXES",
+    "HISTORY_COLUMNS",
+    "PICTURE_NAME",
+    "REPORT",
+    "LiveStatus",
+    "Manifest",
+    "Model",
+    "ProblemRecord",
+    "RunRecord",
+    "serialize",
+    "validate",
+]
+
 # ---------------------------------------------------------------------- names of files
 
 RECORD, METHOD, HISTORY, LOCK, CONTROL = "run.json", "method.toml", "history.jsonl", "lock", "control.json"

@@ -18,6 +18,8 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
+__all__ = ["PathContext", "PathKernel", "ReplayState", "ScatteringVertex", "largest", "relative", "total"]
+
 
 @dataclass
 class ReplayState:

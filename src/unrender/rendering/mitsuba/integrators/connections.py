@@ -13,6 +13,8 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, largest
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 
+__all__ = ["Connection", "ConnectionSample", "connect"]
+
 
 @dataclass
 class ConnectionSample:

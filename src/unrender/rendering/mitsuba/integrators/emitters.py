@@ -14,6 +14,8 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
 
+__all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
+
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
     """The power heuristic with exponent 2, detached."""

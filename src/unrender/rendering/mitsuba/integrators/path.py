@@ -23,6 +23,8 @@ from unrender.rendering.mitsuba.integrators.base import (
     relative,
 )
 
+__all__ = ["ROULETTE_FLOOR", "BsdfDirection", "PathPair", "PathState"]
+
 ROULETTE_FLOOR = 0.25
 """Roulette looks at the current throughput alone, so that the adjoint can replay it without the previous state. This floor
 keeps paths alive that only the previous state still uses: both images stay unbiased whatever the ratio of throughputs."""

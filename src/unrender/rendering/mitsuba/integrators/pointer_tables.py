@@ -10,6 +10,8 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.array_types import UInt32
 
+__all__ = ["Pointer", "StatePointers", "registry_id", "remap"]
+
 Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
 
 

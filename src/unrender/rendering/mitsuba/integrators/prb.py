@@ -11,6 +11,8 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators.array_types import Spectrum
 from unrender.rendering.mitsuba.integrators.base import ReplayState
 
+__all__ = ["PrbKernel"]
+
 
 class PrbKernel:
     """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.

@@ -33,6 +33,8 @@ from unrender.rendering.mitsuba.integrators.volume_path import (
     VolumePathState,
 )
 
+__all__ = ["VolumePair", "independent"]
+
 _KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
 """Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
 

@@ -13,6 +13,8 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
 
+__all__ = ["Flight", "PathStart", "SampledDirection", "Vertex", "VolumeContext", "VolumePathState"]
+
 
 class PathStart:
     """Where paths begin: on rays, or in a medium at distance `t` along rays, where they scatter first.
