@@ -46,8 +46,8 @@ def mitsuba_variant() -> str:
         pytest.exit(str(error), returncode=3)  # once, not once per test
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        # Each worker would start a thread per core, and they would wait for each other.
-        dr.set_thread_count(max(1, dr.thread_count() // workers))
+        # Each worker would start a thread per core, and they would wait for each other. With one thread Mitsuba's EXR writer hangs.
+        dr.set_thread_count(max(2, dr.thread_count() // workers))
     return name
 
 

@@ -131,6 +131,24 @@ def use_threads(count: int) -> None:
         dr.set_thread_count(count)
 
 
+@contextlib.contextmanager
+def two_threads() -> Iterator[None]:
+    """Let Dr.Jit have a second thread meanwhile where it has one alone: Mitsuba's OpenEXR would wait for ever to read or write a file."""
+    ensure()
+    import drjit as dr
+
+    if dr.thread_count() > 1:
+        yield
+        return
+    dr.sync_thread()
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(1)
+
+
 def current() -> str | None:
     """The variant that Mitsuba is set to, whoever set it; None before any was chosen. Imports nothing."""
     mi = sys.modules.get("mitsuba")

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from unrender.evaluation.metrics import srgb
-from unrender.exporting.ready_made import as_bitmap, file_name
+from unrender.exporting.ready_made import as_bitmap, file_name, write_bitmap
 from unrender.io.volumes import write_grid
 
 __all__ = ["write"]
@@ -55,7 +55,7 @@ def _large(key: str, value: np.ndarray, folder: Path) -> dict[str, Any]:
     (folder / FOLDER).mkdir(exist_ok=True)
     base = f"{FOLDER}/{file_name(key.removesuffix('.data'))}"
     if value.ndim == 3 and value.shape[2] in (1, 3, 4):
-        as_bitmap(value).write(str(folder / f"{base}.exr"))
+        write_bitmap(as_bitmap(value), folder / f"{base}.exr")
         colour = value.shape[2] >= 3 and "normalmap" not in key
         shown = np.ascontiguousarray(value[..., :3] if value.shape[2] >= 3 else value[..., 0])
         levels = np.clip(srgb(shown) if colour else shown, 0, 1)

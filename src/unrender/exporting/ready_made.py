@@ -14,11 +14,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 
-__all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make"]
+__all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make", "write_bitmap"]
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """The folders of a scene's files."""
@@ -94,7 +95,7 @@ class FilesOnly:
         bitmap = value if isinstance(value, mi.Bitmap) else as_bitmap(np.array(value))
         eight = bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16)
         path = self._path(BITMAPS, place[:-1], ".png" if eight else ".exr")
-        bitmap.write(str(path))
+        write_bitmap(bitmap, path)
         return str(path)
 
     def _volume(self, value: Any, place: tuple[str, ...]) -> str:
@@ -142,6 +143,12 @@ def as_bitmap(values: np.ndarray) -> Any:
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
         raise InputError(f"no picture has {values.shape[-1]} channels; expected 1, 3 or 4")
     return mi.Bitmap(pixels)
+
+
+def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
+    """Write a picture in the format of its file's ending."""
+    with variant.two_threads():
+        bitmap.write(str(path))
 
 
 def file_name(text: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.backend.variant import ensure
+from unrender.backend import variant
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.exporting import maps, ready_made
@@ -82,7 +82,7 @@ def export(
         InputError: the run folder or the problem cannot be read, `out` cannot be written, or a parameter has no place in a description.
             Nothing is left behind then.
     """
-    ensure()
+    variant.ensure()
     out = Path(out)
     _check_place(out, overwrite)
     if isinstance(what, (str, Path)):
@@ -241,7 +241,8 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         a line for each parameter that has another name now.
     """
     try:
-        found = mi.traverse(mi.load_file(str(path), parallel=False, optimize=False))
+        with variant.two_threads():
+            found = mi.traverse(mi.load_file(str(path), parallel=False, optimize=False))
     except Exception as error:
         raise InputError(
             f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.exporting.graph import Place, SceneGraph
-from unrender.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name
+from unrender.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name, write_bitmap
 from unrender.io.volumes import write_grid
 
 __all__ = ["store"]
@@ -80,7 +80,7 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
     elif plugin in ("bitmap", "envmap"):
         path = _path(folder, BITMAPS, name, ".exr")
         # Mitsuba repeats the first column behind the last one, and the last before the first.
-        as_bitmap(value[:, 1:-1, :3] if plugin == "envmap" else value).write(str(path))
+        write_bitmap(as_bitmap(value[:, 1:-1, :3] if plugin == "envmap" else value), path)
     else:
         raise InputError(f"a {plugin} reads its values from no file that could be written")
     for other in ("bitmap", "data", "grid"):

@@ -92,7 +92,8 @@ def _read(path: Path, linearise: bool) -> Picture:
     import mitsuba as mi
 
     try:
-        bitmap = mi.Bitmap(str(path))
+        with variant.two_threads():
+            bitmap = mi.Bitmap(str(path))
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             return Picture(_colour_channels(bitmap))
         encoded = bool(bitmap.srgb_gamma())

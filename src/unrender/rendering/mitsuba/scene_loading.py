@@ -9,7 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from unrender.backend.variant import ensure
+from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive
 from unrender.rendering.mitsuba.grid_transforms import attached_media
@@ -31,7 +31,7 @@ def load(description: SceneDescription) -> mi.Scene:
 
 def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]:
     """As `load`, and what was loaded: the file's path, or the dictionary."""
-    ensure()
+    variant.ensure()
     emissive.register()
     if callable(description):
         description = description()
@@ -40,9 +40,11 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
             path = Path(description)
             if not path.is_file():
                 raise InputError(f"scene {path}: no such file")
-            scene = mi.load_file(str(path), parallel=False, optimize=False)
+            with variant.two_threads():
+                scene = mi.load_file(str(path), parallel=False, optimize=False)
         elif isinstance(description, dict):
-            scene = mi.load_dict(description, parallel=False, optimize=False)
+            with variant.two_threads():
+                scene = mi.load_dict(description, parallel=False, optimize=False)
         else:
             raise InputError(f"scene: expected an .xml path or a Mitsuba dictionary, got {type(description).__name__}")
     except InputError:

@@ -1,0 +1,43 @@
+"""One thread: OpenEXR in Mitsuba waits for ever for a second one, which it is lent to read and write files."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = """
+import sys
+import numpy as np
+import mitsuba as mi
+import unrender as ur
+from unrender.backend import variant
+from unrender.exporting.ready_made import as_bitmap, write_bitmap
+from unrender.io import images
+
+folder = sys.argv[1]
+variant.use_threads(1)
+sky = np.random.default_rng(1).uniform(0.1, 1.0, (256, 512, 3))
+write_bitmap(as_bitmap(sky), folder + "/sky.exr")
+assert np.allclose(images.read(folder + "/sky.exr").values, sky, atol=1e-2)
+scene = {
+    "type": "scene",
+    "sky": {"type": "envmap", "filename": folder + "/sky.exr"},
+    "ball": {"type": "sphere", "id": "ball", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+}
+problem = ur.Problem(scene, [ur.Parameter("ball.bsdf.reflectance.value")], [ur.View(np.full((4, 4, 3), 0.2))])
+ur.optimize(problem, ur.PathGradient(), ur.optimizers.Adam(), steps=2)
+import drjit as dr
+assert dr.thread_count() == 1
+"""
+
+
+def test_exr_files_are_read_and_written(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "import unrender as ur; ur.use('llvm_ad_rgb')\n" + SCRIPT, str(tmp_path)],
+        timeout=300,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
