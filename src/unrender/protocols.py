@@ -1,34 +1,53 @@
-"""What components are, for those who write their own: each protocol lists the methods that an object must have.
+"""What components are, for those who write their own: protocols, and the types that their methods take and return.
 
-No class needs to inherit from them: an object that has the methods is one (`typing.Protocol`). `Callback` is the exception, a class
-whose methods do nothing until they are overridden.
+No class needs to inherit from a protocol: an object that has its methods is one (`typing.Protocol`). `Callback` is a base class, whose
+methods do nothing until they are overridden. Estimators say by capability types what they provide, optimizers what they require.
 """
 
 from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.capabilities import (
+    Capabilities,
+    Capability,
+    Gradient,
+    Hessian,
+    HessianProduct,
+    LossFunction,
+    Smoothing,
+    Variance,
+)
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.losses.base import Loss
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.preconditioners.base import Preconditioner
-from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, SampleRequest
+from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, RenderSession, SampleRequest
 from unrender.runs.callbacks import Callback
 from unrender.schedules.functions import Schedule
 
 __all__ = [
     "Callback",
+    "Capabilities",
+    "Capability",
     "Estimate",
     "Estimator",
+    "Gradient",
+    "Hessian",
+    "HessianProduct",
     "ImageEstimate",
     "ImageEstimator",
     "Loss",
+    "LossFunction",
     "MiniBatch",
     "Optimizer",
     "PairRequest",
     "ParameterInfo",
     "PixelSampler",
     "Preconditioner",
+    "RenderSession",
     "Renderer",
     "Rendering",
     "SampleRequest",
     "Schedule",
+    "Smoothing",
+    "Variance",
 ]
