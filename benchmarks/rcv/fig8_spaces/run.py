@@ -66,7 +66,10 @@ def measure(
 
 
 def costs(problem: ur.Problem, path: list[Tree], spp: int) -> dict[str, dict[str, float]]:
-    """Median milliseconds of an image (view 0) and of a gradient (all views), parameters changing at every call; one method after the other."""
+    """Median milliseconds of an image (view 0) and of a gradient (all views), one method after the other.
+
+    Parameters change at every call.
+    """
     found: dict[str, dict[str, float]] = {}
     for name, image in METHODS.items():
         estimator = ur.PathGradient(image, spp=spp)
