@@ -27,7 +27,7 @@ from unrender.pixels.base import PixelSampler
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
 from unrender.rendering.numpy.exponential import RATE
-from unrender.rendering.renderer import SampleRequest, Space
+from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
@@ -44,6 +44,7 @@ __all__ = [
     "Key",
     "Optimizer",
     "PixelSampler",
+    "Renderer",
     "SampleRequest",
     "Tree",
     "advance",
@@ -57,7 +58,7 @@ __all__ = [
     "loss_derivative",
     "method_parts",
     "mi",
-    "mitsuba_session",
+    "mitsuba_renderer",
     "pixel_probability",
     "prepare",
     "project",
@@ -70,18 +71,16 @@ __all__ = [
 ]
 
 
-def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivatives: bool = True) -> Any:
-    """The render session of the problem for these parameters: `image`, `image_pair`, `image_batch`, `adjoint`, `adjoint_pair`, each with
-    `SampleRequest`s. Arguments as of `Renderer.prepare`."""
+def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivatives: bool = True) -> RenderSession:
+    """The render session of the problem for these parameters; see `Renderer.prepare`."""
     return problem.renderer.prepare(list(keys), space, derivatives)
 
 
-def mitsuba_session(scene: Callable[[], Any], depth: int, keys: list[str], space: Space) -> tuple[Any, Tree]:
-    """The render session of a scene description for Mitsuba, and the values of its parameters."""
+def mitsuba_renderer(scene: Callable[[], Any], depth: int) -> Renderer:
+    """Mitsuba's renderer of a scene description."""
     from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
-    renderer = MitsubaRenderer(scene, depth)
-    return renderer.prepare(keys, space), renderer.values(keys)
+    return MitsubaRenderer(scene, depth)
 
 
 def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
