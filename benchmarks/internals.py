@@ -6,11 +6,11 @@ Dr.Jit and Mitsuba stand here untyped (`dr`, `mi`): their stubs know less than t
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from unrender.methods.catalogue import method
 
 import unrender as ur
 from unrender.core import arrays, trees, vectors
@@ -21,12 +21,15 @@ from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import gather
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
+from unrender.methods import method
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
 from unrender.rendering.numpy.exponential import RATE
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
+from unrender.runs import optimize as runs_optimize
+from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
 from unrender.statistics.recursion import advance
 
@@ -41,6 +44,7 @@ __all__ = [
     "Key",
     "Optimizer",
     "PixelSampler",
+    "Renderer",
     "SampleRequest",
     "Tree",
     "advance",
@@ -54,7 +58,7 @@ __all__ = [
     "loss_derivative",
     "method_parts",
     "mi",
-    "mitsuba_session",
+    "mitsuba_renderer",
     "pixel_probability",
     "prepare",
     "project",
@@ -67,27 +71,16 @@ __all__ = [
 ]
 
 
-def prepare(problem: ur.Problem, keys: Any, space: str | None = None, derivatives: bool = True) -> Any:
-    """What renders the problem with these parameters as variables: `image`, `image_pair`, `image_batch`, `adjoint`, `adjoint_pair`,
-    each with `SampleRequest`s.
-
-    Args:
-        keys: of the parameters that vary.
-        space: in which a pair of states shares its samples, "path" or "primary"; None for single images.
-        derivatives: whether adjoints are wanted.
-    """
-    renderer: Any = problem.renderer
-    renderer.select(list(keys), space, derivatives=derivatives)
-    return renderer
+def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivatives: bool = True) -> RenderSession:
+    """The render session of the problem for these parameters; see `Renderer.prepare`."""
+    return problem.renderer.prepare(list(keys), space, derivatives)
 
 
-def mitsuba_session(scene: Callable[[], Any], depth: int, keys: list[str], space: str) -> tuple[Any, Tree]:
-    """A prepared Mitsuba renderer of a scene description, and the values of its parameters."""
+def mitsuba_renderer(scene: Callable[[], Any], depth: int) -> Renderer:
+    """Mitsuba's renderer of a scene description."""
     from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
-    renderer = MitsubaRenderer(scene, depth)
-    renderer.select(keys, space)  # pyright: ignore[reportArgumentType]
-    return renderer, renderer.values(keys)
+    return MitsubaRenderer(scene, depth)
 
 
 def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
@@ -114,7 +107,7 @@ def _mitsuba(problem: ur.Problem) -> Any:
 
 def from_tensor(value: Any, like: Any) -> Any:
     """A tensor in the type that a scene's parameter has."""
-    from unrender.rendering.mitsuba.scene_pair import from_tensor as convert
+    from unrender.rendering.mitsuba.tensors import from_tensor as convert
 
     return convert(value, like)
 
@@ -146,22 +139,20 @@ def loss_derivative(problem: ur.Problem, view: int, images: Any) -> Any:
 def black_box(
     problem: ur.Problem, parameters: Mapping[str, Any], spp: int, key: Key
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The loss at points (B, n), all with the same random numbers, (B,). To be called after `prepare(..., derivatives=False)`."""
+    """The loss at points (B, n), all with the same random numbers, (B,)."""
     return BlackBox(problem, dict(parameters), spp, key).losses
 
 
 def pixel_probability(problem: ur.Problem, sampler: PixelSampler, key: Key) -> np.ndarray:
     """A pixel sampler's first probabilities for view 0, one per pixel, over uniform ones."""
     at = problem.initial()
-    prepare(problem, at, None)
-    sample, _ = sampler.draw(problem, at, sampler.init(problem, at), key)
-    return sample.probability[0]
+    batch, _ = sampler.draw(problem, at, sampler.init(problem, at), key)
+    return batch.probability[0]
 
 
 def method_parts(name: str, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
     """Estimator and optimizer of a method of the command line."""
-    estimator, optimizer, *_ = method(name).start(dict(settings or {}))
-    return estimator, optimizer
+    return method(name).start(settings)
 
 
 def time_run_folder(spent: dict[str, list[float]]) -> Callable[[], None]:
@@ -169,26 +160,22 @@ def time_run_folder(spent: dict[str, list[float]]) -> Callable[[], None]:
 
     Returns a function that ends it.
     """
-    import time
-
-    from unrender.runs import loop
-    from unrender.runs.folder.writer import RunWriter
 
     class TimedWriter(RunWriter):
-        def step(self, record: Any) -> None:
+        def append(self, record: Mapping[str, Any]) -> None:
             began = time.perf_counter()
-            super().step(record)
+            super().append(record)
             spent["history"].append(time.perf_counter() - began)
 
-        def checkpoint(self, *arguments: Any) -> None:
+        def write_checkpoint(self, *arguments: Any) -> None:
             began, before = time.perf_counter(), self._written_step
-            super().checkpoint(*arguments)
+            super().write_checkpoint(*arguments)
             if self._written_step != before:
                 spent["checkpoints"].append(time.perf_counter() - began)
 
-    loop.RunWriter = TimedWriter
+    runs_optimize.RunWriter = TimedWriter
 
     def end() -> None:
-        loop.RunWriter = RunWriter
+        runs_optimize.RunWriter = RunWriter
 
     return end

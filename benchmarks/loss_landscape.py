@@ -27,7 +27,7 @@ def slopes(problem: ur.Problem, at: State, factor: float, spp: int, change: floa
     for number in range(max(1, spp // 64)):
         request = SampleRequest(problem.views[0].sensor, 64, Key(31_337, number).uint32())
         pair = session.image_pair(higher, lower, request, "path")
-        found.add((arrays.numpy(pair.images[0]) - arrays.numpy(pair.previous[0])) / (2 * change))
+        found.add((arrays.numpy(pair.images)[0] - arrays.numpy(pair.previous)[0]) / (2 * change))
     return found.mean
 
 

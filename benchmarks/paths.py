@@ -76,7 +76,6 @@ def follow(
     problem: ur.Problem, image: ImageEstimator, path: Sequence[Tree], spp: int, seed: int
 ) -> Iterator[ImageEstimate]:
     """One run of an image estimator on view 0 along a path of parameters: its estimate at every step."""
-    prepare(problem, path[0], image.space)
     state = image.init(problem, path[0])
     for step, parameters in enumerate(path):
         estimate, state = image_step(problem, image, parameters, state, spp, Key(seed, step))

@@ -125,7 +125,7 @@ def run(
         default_resolution: of the time outside kernels (each problem's own)
     """
 
-    def room() -> ur.Problem:  # one for each contender, as each prepares the renderer for itself
+    def room() -> ur.Problem:  # one for each contender, whose scenes hold its own parameters
         return ur.gallery.problem("indirect-room", resolution=resolution, loss="L2")
 
     control_variate = ur.images.RecursiveControlVariate()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, dr, prepare, vectors
+from benchmarks.internals import Key, black_box, dr, vectors
 
 SIGMA = 0.05
 SAMPLES = 64
@@ -36,7 +36,7 @@ def _fr22(_: int) -> tuple[Any, Any]:
 
 def _joint(n: int) -> tuple[Any, Any]:
     optimizer = ur.optimizers.NewtonCG(trust_radius=0.5 * math.sqrt(n), iterations=1, line=True)
-    return _smoothed(order="hvp", arrival=True), optimizer
+    return _smoothed(order="hvp", adaptive_annealing=True), optimizer
 
 
 def _search(_: int) -> tuple[Any, Any]:
@@ -70,7 +70,6 @@ def one(problem: ur.Problem, method: str, seconds: float, seed: int) -> dict[str
     estimator, optimizer = METHODS[method](start.size)
     ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[track])
     chosen = np.unique(np.linspace(0, len(track.points) - 1, _POINTS).round().astype(int))
-    prepare(problem, problem.initial(), None, derivatives=False)
     evaluate = black_box(problem, problem.initial(), _EXACT_SPP, Key(99))
     losses = evaluate(np.stack([track.points[index] for index in chosen]))
     return {

@@ -61,18 +61,18 @@ class Data:
         self.ranges = np.concatenate([np.atleast_1d(ANSWERS[task][key]) for key in self.keys])
         self.rest = np.concatenate([np.atleast_1d(REST.get(key, 0.0)) for key in self.keys])
         self.truth = np.random.default_rng(seed).uniform(-1, 1, (count, len(self.ranges)))
-        self.renderer = self._renderer(size)
-        self.references = self._render(self.renderer, self.truth, 64, 1)
-        images = self._render(self._renderer(RESOLUTION), self.truth, 64, 2)
+        self.session = self._prepared(size)
+        self.references = self._render(self.session, self.truth, 64, 1)
+        images = self._render(self._prepared(RESOLUTION), self.truth, 64, 2)
         self.images = torch.tensor(images, dtype=torch.float32)
         self.evaluations = 0
         self.step = 0
 
-    def _renderer(self, size: int) -> Any:
+    def _prepared(self, size: int) -> Any:
         problem = ur.gallery.problem("mug", resolution=size, reference_spp=1)
         return prepare(problem, self.keys, None, derivatives=False)
 
-    def _render(self, renderer: Any, poses: np.ndarray, spp: int, seed: int) -> np.ndarray:
+    def _render(self, session: Any, poses: np.ndarray, spp: int, seed: int) -> np.ndarray:
         values = self.rest + self.ranges * np.clip(poses, -2.5, 2.5)
         ends = np.cumsum(self.widths)
         parts = np.split(values, ends[:-1], axis=1)
@@ -80,14 +80,14 @@ class Data:
             key: np.clip(part, 0.0, 1.0) if key == COLOUR else part[:, 0]
             for key, part in zip(self.keys, parts, strict=True)
         }
-        images = renderer.image_batch(state, SampleRequest(0, spp, seed))
+        images = session.image_batch(state, SampleRequest(0, spp, seed))
         dr.eval(images)
         return images.numpy()
 
     def losses(self, points: np.ndarray, items: np.ndarray) -> np.ndarray:
         """(B, n) and the indices (B,) of the images they belong to, to (B,): mean square of the difference, one sample per pixel."""
         self.evaluations += len(points)
-        images = self._render(self.renderer, points, 1, 1000 + self.step)
+        images = self._render(self.session, points, 1, 1000 + self.step)
         return ((images - self.references[items]) ** 2).mean(axis=(1, 2, 3)) * 100.0
 
     def error(self, network: Any) -> float:
@@ -113,7 +113,7 @@ def train(
 
     def loss() -> Any:
         answers = network(data.images)
-        options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "together": joint}
+        options: dict[str, Any] = {"seed": data.step, "epsilon": 0.3, "joint": joint}
         return ur.grey_box.loss(data.losses, answers, sigma, samples, **options).mean()
 
     def gradient_step() -> None:

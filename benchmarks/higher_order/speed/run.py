@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, dr, mi, prepare, stock_scene
+from benchmarks.internals import Key, black_box, dr, mi, stock_scene
 from benchmarks.kernel_history import kernels
 from benchmarks.runner.timing import medians, turns
 
@@ -24,7 +24,6 @@ QUICK = {"resolution": 8, "spp": 1, "detail": (1,), "batches": (1, 2)}
 def by_batch(problem: ur.Problem, spp: int, sizes: tuple[int, ...]) -> list[dict[str, float]]:
     """Per size of the batch: milliseconds per perturbation, wall and kernels, and kernels that were new after warm-up."""
     parameters = problem.initial()
-    prepare(problem, parameters, None, derivatives=False)
     rng = np.random.default_rng(0)
 
     def renders(points: np.ndarray) -> Any:

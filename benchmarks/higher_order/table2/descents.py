@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, prepare, vectors
+from benchmarks.internals import Key, black_box, vectors
 
 GOALS = (0.1, 0.01, 0.001)
 """Errors relative to the start: reductions of 90, 99 and 99.9 %."""
@@ -101,7 +101,6 @@ def measured(
 ) -> Descent:
     """A descent with its errors in the image at some steps, evenly spread over the logarithm of their number."""
     parameters = problem.initial()
-    prepare(problem, parameters, None, derivatives=False)
     chosen = np.unique(np.round(np.geomspace(1, len(points), _IMAGES)).astype(int) - 1)
     evaluate = black_box(problem, parameters, _IMAGE_SPP, Key(99))
     stack = _stack(problem, points, chosen)

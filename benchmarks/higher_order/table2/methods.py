@@ -44,7 +44,7 @@ def _shrinking(half_life: float, floor: float) -> ur.schedules.Exponential:
 
 def _smoothed(task: Task, c: Config, samples: int, **more: Any) -> ur.SmoothedDerivatives:
     schedule = _shrinking(c["half_life"], FLOOR)
-    return ur.SmoothedDerivatives(task.widths, samples, spp=task.spp, schedule=schedule, **{"together": False, **more})
+    return ur.SmoothedDerivatives(task.widths, samples, spp=task.spp, schedule=schedule, **{"joint": False, **more})
 
 
 def _adam(task: Task, c: Config) -> Any:
@@ -66,14 +66,14 @@ def _gradient(task: Task, n: int, c: Config) -> tuple[Any, Any]:
 
 def _hessian(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     samples = max(2 * _samples(n, c) // n, 4)
-    estimator = _smoothed(task, c, samples, order="hessian", aggregate=False, arrival=True)
+    estimator = _smoothed(task, c, samples, order="hessian", aggregate=False, adaptive_annealing=True)
     return estimator, ur.optimizers.Newton(**_newton(n, c))
 
 
 def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
     def make(task: Task, n: int, c: Config) -> tuple[Any, Any]:
         samples = _samples(n, c) if aggregate else max(_samples(n, c) // n, 4)
-        estimator = _smoothed(task, c, samples, order="hvp", aggregate=aggregate, arrival=True)
+        estimator = _smoothed(task, c, samples, order="hvp", aggregate=aggregate, adaptive_annealing=True)
         return estimator, ur.optimizers.NewtonCG(
             iterations=1 if n > _MANY else int(c.get("iterations", min(n, 3))), **_newton(n, c)
         )
@@ -82,7 +82,7 @@ def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
 
 
 def _joint(task: Task, n: int, c: Config) -> tuple[Any, Any]:
-    estimator = _smoothed(task, c, _samples(n, c), order="hvp", together=True, arrival=True)
+    estimator = _smoothed(task, c, _samples(n, c), order="hvp", joint=True, adaptive_annealing=True)
     many = n > _MANY
     return estimator, ur.optimizers.NewtonCG(iterations=1 if many else min(n, 5), line=many, **_newton(n, c))
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, prepare, vectors
+from benchmarks.internals import Key, black_box, vectors
 
 SIGMA = {"quad": 0.3, "box10": 0.3, "mug": 0.5}
 PLAIN = {"aggregate": False, "antithetic": False, "baseline": False, "low_discrepancy": False}
@@ -39,7 +39,6 @@ def efficiency(
 ) -> float:
     """Variance times evaluations. With `aggregate`, `samples` evaluations serve all elements; else they are divided among them."""
     parameters = problem.initial()
-    prepare(problem, parameters, None, derivatives=False)
     evaluate = black_box(problem, parameters, 1, Key(0))
     theta = vectors.ravel(parameters)
     counted = [0]

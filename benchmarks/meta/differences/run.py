@@ -28,7 +28,6 @@ QUICK = {"problem": ("indirect-room",), "resolution": 8, "cost_resolution": (8,)
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
     """Summed over elements, per space: of the gradient, and of its difference for each step length; and the slope."""
     start, end = problem.initial(), truth(problem)
-    prepare(problem, start, "path")
 
     def flat(tree: Any) -> np.ndarray:
         return np.concatenate([arrays.numpy(x).ravel() for x in tree.values()])
@@ -61,7 +60,7 @@ def costs(problem: ur.Problem) -> dict[str, float]:
         "plain 2 spp": ur.PathGradient(spp=2),
     }
     found: dict[str, float] = {}
-    for name, estimator in estimators.items():  # one after the other, as each prepares the renderer for itself
+    for name, estimator in estimators.items():
         states = [estimator.init(problem, parameters)]
 
         def step(seed: int, estimator: Any = estimator, states: list[Any] = states) -> None:

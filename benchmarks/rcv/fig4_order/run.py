@@ -47,7 +47,7 @@ def fixed(problem: ur.Problem, path: list[Tree], weights: list[Any], spp: int, s
     for step, (now, before) in enumerate(zip(path, [path[0], *path], strict=False)):
         request = SampleRequest(problem.views[0].sensor, spp, Key(seed, step).uint32())
         pair = session.image_pair(now, before, request, "path")
-        F, H = (arrays.numpy(images[0]).astype(np.float64) for images in (pair.images, pair.previous))
+        F, H = (arrays.numpy(images)[0].astype(np.float64) for images in (pair.images, pair.previous))
         memory = F if memory is None else advance(memory, F, H, weights[step])
         yield memory
 

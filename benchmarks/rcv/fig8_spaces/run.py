@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import ImageEstimator, Key, Tree, arrays, dr, image_step, prepare
+from benchmarks.internals import ImageEstimator, Key, Tree, arrays, dr, image_step
 from benchmarks.moments import Moments
 from benchmarks.paths import converged, descent, follow, weight_of
 from benchmarks.runner.timing import medians, turns
@@ -66,14 +66,13 @@ def measure(
 
 
 def costs(problem: ur.Problem, path: list[Tree], spp: int) -> dict[str, dict[str, float]]:
-    """Median milliseconds of an image (view 0) and of a gradient (all views), parameters changing at every call.
+    """Median milliseconds of an image (view 0) and of a gradient (all views), one method after the other.
 
-    One method after the other, as each prepares the renderer for itself.
+    Parameters change at every call.
     """
     found: dict[str, dict[str, float]] = {}
     for name, image in METHODS.items():
         estimator = ur.PathGradient(image, spp=spp)
-        prepare(problem, path[0], image.space)
         states: dict[str, Any] = {"image": image.init(problem, path[0]), "step": estimator.init(problem, path[0])}
 
         def one_image(n: int, image: ImageEstimator = image, states: dict[str, Any] = states) -> None:

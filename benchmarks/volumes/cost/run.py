@@ -66,9 +66,9 @@ def contenders(problem: ur.Problem, spp: int, sparse: bool) -> dict[str, Callabl
         key: core(len(value)) if sparse and key.endswith("sigma_t.data") else value
         for key, value in problem.truth.items()
     }
-    current = {key: session.array(value) for key, value in values.items()}
+    current = {key: problem.renderer.array(value) for key, value in values.items()}
     previous = {key: value * 0.98 for key, value in current.items()}
-    weight = session.array(np.ones((1, *np.asarray(problem.views[0].reference).shape)))
+    weight = problem.renderer.array(np.ones((1, *np.asarray(problem.views[0].reference).shape)))
     image = session.image(current, SampleRequest(0, spp, 1)).paths
     pair = session.image_pair(current, previous, SampleRequest(0, spp, 1), "path").paths
     return {

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.internals import SampleRequest, dr, mi, mitsuba_session
+from benchmarks.internals import Renderer, SampleRequest, dr, mi, mitsuba_renderer
 from unrender.gallery import parts, volumes
 
 SIZE, SPP, VOXELS, DEPTH = 16, 64, 6, 5
@@ -73,13 +73,13 @@ def stock(current: dict[str, Any]) -> Callable[[int], dict[str, np.ndarray]]:
 
 
 def finite_difference(
-    session: Any, current: dict[str, Any], key: str, along: np.ndarray, step: float, upwards: bool, seed: int
+    renderer: Renderer, current: dict[str, Any], key: str, along: np.ndarray, step: float, upwards: bool, seed: int
 ) -> float:
     """The derivative along a direction, from states on one set of paths."""
-    value = np.array(current[key]).astype(np.float64)
+    session, value = renderer.prepare(list(current), "path"), np.array(current[key]).astype(np.float64)
 
     def difference(high: np.ndarray, low: np.ndarray, number: int) -> float:
-        one, other = ({**current, key: session.array(state)} for state in (high, low))
+        one, other = ({**current, key: renderer.array(state)} for state in (high, low))
         pair = session.image_pair(one, other, SampleRequest(0, 4 * SPP, number), "path")
         return float(((np.array(pair.images).astype(np.float64) - np.array(pair.previous)) * WEIGHT).sum())
 
@@ -91,8 +91,8 @@ def finite_difference(
 
 def run(runs: int = 48) -> dict[str, Any]:
     """Derivatives along each direction, with standard errors and z-scores."""
-    session, current = mitsuba_session(scene, DEPTH, [EXTINCTION, ALBEDO], "path")
-    weight = session.array(WEIGHT)
+    renderer, keys = mitsuba_renderer(scene, DEPTH), [EXTINCTION, ALBEDO]
+    session, current, weight = renderer.prepare(keys, "path"), renderer.values(keys), renderer.array(WEIGHT)
     methods = {
         "differential ratio tracking": lambda seed: session.adjoint(
             current, session.image(current, SampleRequest(0, SPP, seed)).paths, weight
@@ -103,7 +103,7 @@ def run(runs: int = 48) -> dict[str, Any]:
     table: dict[str, Any] = {}
     for name, (key, along, step, upwards) in directions().items():
         rows = [
-            finite_difference(session, current, key, along, step, upwards, 5000 + 2 * number)
+            finite_difference(renderer, current, key, along, step, upwards, 5000 + 2 * number)
             for number in range(max(8, runs // 3))
         ]
         expected, error = np.mean(rows), np.std(rows, ddof=1) / len(rows) ** 0.5
