@@ -173,6 +173,7 @@ def kill_commands(tmp_path: Path, kills: int, seed: int) -> None:
         assert states(folder) == states(whole), (name, number)
 
 
+@pytest.mark.slow  # in the quick tier, one command is killed and resumed
 def test_some_are_killed(killer: Killer, tmp_path: Path) -> None:
     kill_analytic(killer, tmp_path, 5, seed=1)
 

@@ -15,7 +15,6 @@ import scipy.sparse.linalg
 from resizable import KEY, FieldRenderer, upsampled
 
 import unrender as ur
-from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.meta import MetaState
@@ -451,7 +450,8 @@ class Scenes(ur.Callback):
         self.seen.append([(state[WALL].shape[0], state[SMOKE].shape[0]) for state in states])
 
 
-@pytest.mark.parametrize("name", quick(["rcv", "coupled"], "rcv"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rcv", "coupled"])
 def test_the_scene_takes_each_resolution(folder: Path, name: str) -> None:
     found = ur.Problem.from_file(folder / "problem.toml")
     assert found.coarse_to_fine[WALL] == ur.CoarseToFine((2, 4))

@@ -109,7 +109,7 @@ def test_what_is_unknown_has_gradients_and_is_carried(small):
     for parameter in small.parameters:
         info = small.renderer.parameters()[parameter.key]
         assert info.differentiable, info.reason
-        assert info.carried, info.reason
+        assert info.shares_paths, info.reason
     assert small.notices == []
 
 

@@ -38,6 +38,7 @@ def derivative_on_the_same_paths(
     return (values[0] - values[1]) / (2 * STEP)
 
 
+@pytest.mark.slow  # in the quick tier, test_adjoint_pair.py compares the same replay
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths(name: str) -> None:
     description, changes = subject(name)

@@ -61,6 +61,7 @@ def test_equal_states_have_equal_gradients() -> None:
         assert all(close(a[key], b[key], 1e-4) for key in current), space
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
     """That of the previous scene is what the current one gives at the same parameters and random numbers, to rounding."""

@@ -14,7 +14,6 @@ from zoo import scene
 from zscores import z_scores
 
 import unrender as ur
-from tiers import quick
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -73,7 +72,8 @@ def whole() -> tuple[ur.Problem, np.ndarray]:
     return asked, gradients(asked, ur.PathGradient(spp=16), 400)
 
 
-@pytest.mark.parametrize("name", quick(SCHEMES, "adaptive"))
+@pytest.mark.slow  # in the quick tier, contract/test_pixels.py holds every sampler to it on an analytic renderer
+@pytest.mark.parametrize("name", SCHEMES)
 def test_mini_batches_are_unbiased(name: str, whole: tuple[ur.Problem, np.ndarray]) -> None:
     asked, expected = whole
     rows = gradients(asked, SCHEMES[name](), RUNS)

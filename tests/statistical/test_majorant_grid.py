@@ -57,7 +57,9 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
     assert verdict, figures
     monkeypatch.setattr(majorant_supergrid, "_MARGIN", 0.5)
     wrong = MitsubaRenderer(several(), DEPTH)
-    verdict, figures = agree(runs(wrong.image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
+    verdict, figures = agree(
+        runs(wrong.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected
+    )
     assert not verdict, f"majorants of half the extinction went unseen: {figures}"
 
 

@@ -6,6 +6,7 @@ every loaded scene, and forward differentiation must find no other one attached:
 
 from __future__ import annotations
 
+import gc
 import itertools
 import weakref
 from dataclasses import dataclass, replace
@@ -22,14 +23,45 @@ from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_ten
 
 __all__ = ["LoadedScene", "loaded_scenes"]
 
-_registry: weakref.WeakValueDictionary[int, LoadedScene] = weakref.WeakValueDictionary()
-_serial = itertools.count()
+
+class _Registry:
+    """All loaded scenes of this process, held weakly, in the order of loading.
+
+    Attributes:
+        any_died: whether one died since the last `collect`: its Mitsuba objects may live on in reference cycles.
+    """
+
+    def __init__(self) -> None:
+        self._scenes: dict[int, weakref.ref[LoadedScene]] = {}
+        self._serial = itertools.count()
+        self.any_died = False
+
+    def add(self, scene: LoadedScene) -> None:
+        number = next(self._serial)
+
+        def died(reference: weakref.ref[LoadedScene]) -> None:
+            del reference
+            self._scenes.pop(number, None)
+            self.any_died = True
+
+        self._scenes[number] = weakref.ref(scene, died)
+
+    def scenes(self) -> list[LoadedScene]:
+        return [scene for reference in list(self._scenes.values()) if (scene := reference()) is not None]
+
+    def collect(self) -> None:
+        """Free what dead scenes have left, which calls through pointers would still see."""
+        if self.any_died:
+            gc.collect()
+            self.any_died = False
+
+
+_registry = _Registry()
 
 
 def loaded_scenes() -> list[LoadedScene]:
     """All of this process, in the order of loading."""
-    found = [_registry.get(number) for number in sorted(_registry.keys())]
-    return [scene for scene in found if scene is not None]
+    return _registry.scenes()
 
 
 @dataclass(frozen=True)
@@ -70,7 +102,7 @@ class LoadedScene:
             if _is_array(value):
                 self._own[key] = _reference(value)
         self._settings: dict[str, _Setting] = {}
-        _registry[next(_serial)] = self
+        _registry.add(self)
 
     def value(self, key: str) -> mi.TensorXf:
         """The scene's own value of a parameter, as loaded."""
@@ -137,6 +169,7 @@ class LoadedScene:
 
         Afterwards what the scene holds has tangents, no way leads back to the leaves, and every other scene of the process is detached.
         """
+        _registry.collect()
         for other in loaded_scenes():
             if other is not self:
                 other.detach()
