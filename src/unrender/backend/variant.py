@@ -226,8 +226,8 @@ def _trial_problem(variant: str) -> str | None:
         return f"the trial on the GPU did not finish ({_one_line(error)})"
     if trial.returncode == 0:
         return None
-    said = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
-    return f"the trial on the GPU failed ({said[-1][:200] if said else f'exit status {trial.returncode}'})"
+    lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
+    return f"the trial on the GPU failed ({lines[-1][:200] if lines else f'exit status {trial.returncode}'})"
 
 
 def _mitsuba() -> Any:

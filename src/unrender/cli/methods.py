@@ -1,4 +1,4 @@
-"""`unrender methods`: what there is, and what it can be told."""
+"""`unrender methods`: what there is, and which options they have."""
 
 from __future__ import annotations
 

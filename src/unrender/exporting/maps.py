@@ -29,7 +29,7 @@ def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
     Maps (H, W, C) become an EXR file with the values as they are, and a PNG file for the eye; volumes a .vol file; other large arrays
     a .npy file. Returns one line for each thing that a file does not show.
     """
-    told: list[str] = []
+    notices: list[str] = []
     record: dict[str, Any] = {}
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -44,11 +44,11 @@ def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
         else:
             entry |= _large(key, value, folder)
             if entry.get("clipped"):
-                told.append(f"{key}: {entry['clipped']} values outside [0, 1] are clipped in {entry['files'][-1]}")
+                notices.append(f"{key}: {entry['clipped']} values outside [0, 1] are clipped in {entry['files'][-1]}")
         record[key] = entry
     (folder / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     (folder / TABLE).write_text(text.getvalue(), encoding="utf-8")
-    return told
+    return notices
 
 
 def _large(key: str, value: np.ndarray, folder: Path) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Factors of the learning rate, or of a smoothing's width, as functions of the step.
 
 A schedule is a callable that takes the number of steps already made (>= 0) and returns a factor >= 0. The number need not be whole: who
-measures progress otherwise than in steps (`SmoothedDerivatives(arrival=True)`) asks by that.
+measures progress otherwise than in steps (`SmoothedDerivatives(adaptive_annealing=True)`) asks by that.
 """
 
 from __future__ import annotations

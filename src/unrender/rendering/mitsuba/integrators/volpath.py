@@ -161,7 +161,7 @@ class VolumePair:
         path.L = context.accumulate(path.L, Le, Ld, *Lm)
         if not context.primal:
             self._differentiate(context, path, flight, connection, (Le, Ld, direction.values))
-        moved = self._go_on(path, vertex, direction)
+        moved = self._scatter_on(path, vertex, direction)
 
         # -------------------- Stopping criterion ---------------------
         most = largest(path.β)
@@ -266,7 +266,7 @@ class VolumePair:
             else:
                 dr.backward_from(context.adjoint_sum(Lo), flags=_KEEP)
 
-    def _go_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> Bool:
+    def _scatter_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> Bool:
         """Leave the vertex in the sampled direction. Tells which lanes scattered, or met a boundary that turned them."""
         si, bs, scatters, meets = vertex.si, direction.bs, vertex.scatters, vertex.meets
         connects = path.medium.use_emitter_sampling()
