@@ -566,9 +566,10 @@ def test_a_mesh_is_given_by_its_path(given):
 def test_equal_calls_give_equal_problems(name):
     first, second = (ur.gallery.problem(name, resolution=8, reference_spp=4) for _ in range(2))
     for a, b in zip(first.views, second.views, strict=True):
-        # Threads sum a mesh's vertex normals in the order in which they finish.
+        # Threads sum a mesh's vertex normals in the order in which they finish: the last digits differ, another seed's
+        # picture by percents.
         np.testing.assert_allclose(
-            np.asarray(a.reference), np.asarray(b.reference), rtol=1e-6 if name == "sphere-to-mesh" else 0.0
+            np.asarray(a.reference), np.asarray(b.reference), rtol=1e-4 if name == "sphere-to-mesh" else 0.0
         )
     for key, value in first.initial().items():
         np.testing.assert_array_equal(np.array(value), np.array(second.initial()[key]))
