@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import unrender as package
+from tiers import quick
 from unrender.cli import execute
 from unrender.runs.final_images import render_pictures
 
@@ -49,7 +50,7 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     assert f"{KEY} error 0.3109 before, 0.0" in " ".join(answer.out.split())
 
 
-@pytest.mark.parametrize("method", ["meta", "coupled"])
+@pytest.mark.parametrize("method", quick(["meta", "coupled"], "coupled"))
 def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsuba_variant: str, method: str):
     words = ["run", "problem.toml", "--method", method, "--steps", 120, "--out", "result", "--variant", mitsuba_variant]
     answer = unrender(*words, *QUICK, "--set", "learning_rate=0.004")
@@ -59,7 +60,7 @@ def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsub
     assert unrender("report", "result").status == 0
 
 
-@pytest.mark.parametrize("settings", [[], ["--set", "optimizer=newton"]], ids=["newton-cg", "newton"])
+@pytest.mark.parametrize("settings", quick([[], ["--set", "optimizer=newton"]], []), ids=["newton-cg", "newton"])
 def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_variant: str, settings: list[str]):
     """`mug`: its handle is hidden at the start."""
     del problem

@@ -13,7 +13,7 @@ from analytic import exact_gradient, others, problem
 from scipy import stats
 
 import unrender as ur
-from tiers import slow
+from tiers import quick, slow
 from unrender.core import registry
 from unrender.core.random import Key
 from unrender.images.base import ImageEstimate
@@ -83,6 +83,8 @@ BIASED = {
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
 BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
 BIASED |= set(others("estimator"))
+DEAR = {"meta, other statistics", "meta, adaptive pixels, other statistics", "coupled, other statistics"}
+"""Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
@@ -204,7 +206,7 @@ def worst_z(rows: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
     return float(np.abs(z).max()), float(stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2))
 
 
-@pytest.mark.parametrize("name", [name for name in ESTIMATORS if name not in BIASED])
+@pytest.mark.parametrize("name", [slow(name) if name in DEAR else name for name in ESTIMATORS if name not in BIASED])
 @pytest.mark.parametrize("loss", [ur.losses.L2(), slow(ur.losses.RelativeL2())], ids=["L2", "RelativeL2"])
 def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
     """For the control variate too: here its weight, from five steps, is all but independent of what it weighs."""
@@ -217,7 +219,7 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
     assert worst_z(rows * 1.1, exact)[0] > limit, "a planted bias of 10 % went unseen"
 
 
-@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize("joint", quick([True, False], True))
 @pytest.mark.parametrize("order", ["gradient", "hessian", "hvp"])
 def test_smoothed_derivatives_are_unbiased_where_images_have_no_noise(order: Any, joint: bool) -> None:
     """The loss is quadratic, and so its smoothed derivatives are its own."""
@@ -249,7 +251,7 @@ def test_smoothed_derivatives_are_unbiased_where_images_have_no_noise(order: Any
     assert worst_z(np.array(rows) * 1.2, exact)[0] > limit, "a planted bias of 20 % went unseen"
 
 
-@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("coupled", quick([False, True], True))
 def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(coupled: bool) -> None:
     """400 runs, alpha bounded, statistics from independent samples: the mean gradient is the true one at each of ten steps."""
     asked = problem(noise=0.9)

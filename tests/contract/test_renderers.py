@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from backends import BACKENDS, LAMP, TEXTURE, Backend, problem, surface
 from scipy import stats
 
 import unrender as ur
+from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -22,6 +23,14 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
 
 DIFFERENTIABLE = [name for name, backend in BACKENDS.items() if backend.derivatives]
+
+
+def without_media(names: Iterable[str]) -> list[Any]:
+    """`names` for a test, that of media in the long tier: its kernels take longest to compile."""
+    names = list(names)
+    return quick(names, *(name for name in names if name != "medium"))
+
+
 SPACES: tuple[Space, ...] = ("path", "primary")
 SPP = 64
 """Of most requests: kernels are compiled for it."""
@@ -218,14 +227,14 @@ class WrongSession:
         return {key: value * 1.05 for key, value in self._session.adjoint(parameters, paths, weights).items()}
 
 
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", without_media(DIFFERENTIABLE))
 def test_an_adjoint_that_is_a_twentieth_wrong_is_caught(name: str) -> None:
     backend = BACKENDS[name]
     with pytest.raises(AssertionError):
         check_adjoint(backend, WrongAdjoint(backend.renderer()))  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", without_media(DIFFERENTIABLE))
 @pytest.mark.parametrize("space", SPACES)
 def test_the_adjoints_of_a_pair_are_those_of_its_states(name: str, space: Space) -> None:
     backend = BACKENDS[name]
@@ -255,7 +264,7 @@ def test_the_adjoints_of_a_pair_are_those_of_its_states(name: str, space: Space)
     same(*session.adjoint_pair(current, current, equal.paths, weights, weights))
 
 
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", without_media(DIFFERENTIABLE))
 def test_tangent_moments_are_squares_of_the_derivatives_of_single_paths(name: str) -> None:
     """For one sample per pixel: by single parameters, and along all at once."""
     backend = BACKENDS[name]
@@ -428,7 +437,7 @@ def disturbance(backend: Backend, renderer: Renderer) -> Any:
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("name", without_media(BACKENDS))
 def test_equal_arguments_give_equal_results_whatever_other_sessions_do(name: str) -> None:
     """To the bit, against the same calls with nothing between them; and the scene keeps its own values."""
     backend = BACKENDS[name]
@@ -461,7 +470,7 @@ def test_sessions_of_poses_leave_the_scene_as_it_was() -> None:
     np.testing.assert_array_equal(numbers(again), images[1])
 
 
-@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("name", without_media(BACKENDS))
 def test_arguments_are_not_changed(name: str) -> None:
     backend = BACKENDS[name]
     renderer = backend.renderer()

@@ -13,6 +13,7 @@ import unrender as ur
 ESTIMATOR = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=4)
 
 
+@pytest.mark.slow
 def test_the_tutorials_cornell_box(assets: Path, tmp_path: Path) -> None:
     """A mirror, glass, an emitter on a mesh, BSDFs that nothing uses: the colour of the walls comes back."""
     text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')

@@ -47,6 +47,7 @@ def several() -> dict[str, Any]:
     return {**scene(sparse(), lights="lamp sky point"), "ball": ball}
 
 
+@pytest.mark.slow
 def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = MitsubaRenderer(several(), DEPTH)
     assert renderer.pair.majorants(previous=False, both=False)

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from zoo import DEPTH, LIGHTS, SUBJECTS, everything, scene, subject, texture, tiles, two_states
+from zoo import DEPTH, LIGHTS, ONE_SUBJECT, SUBJECTS, everything, scene, subject, texture, tiles, two_states
 from zscores import agree
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -38,7 +38,7 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
             assert verdict, figures
 
 
-@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize("name", ONE_SUBJECT)
 def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
     renderer = MitsubaRenderer(subject(name)[0], DEPTH)
     session = renderer.prepare(["floor.bsdf.reflectance.data"], None)

@@ -77,6 +77,7 @@ def test_posed_shapes_look_as_if_they_had_been_moved() -> None:
     assert not agree(found, theirs(scene(motion([0.2, 0.1, 0.3], shift, 1.0), (-0.35, -0.3, 0.2))))[0], "unscaled"
 
 
+@pytest.mark.slow
 def test_a_posed_sensor_sees_as_if_it_had_been_moved() -> None:
     shift = [0.2, -0.1, 0.15]
     found = ours({"sensor.translation": shift, "sensor.rotation": 0.2 * TURN, "ball.translation.y": -0.5})

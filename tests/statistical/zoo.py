@@ -150,6 +150,9 @@ ROW = 4
 
 # What a test over materials is run for: the scene of all of them, whose kernels are compiled once, and with more time each alone.
 SUBJECTS = quick([ALL, *MATERIALS], ALL)
+# For what compiles kernels of its own, half a minute of them for all materials together: one with textures and a rough
+# part in the quick tier, all of them together and each alone in the long one.
+ONE_SUBJECT = quick([ALL, *MATERIALS], "blend")
 
 
 def subject(name: str) -> tuple[dict[str, Any], dict[str, float]]:
