@@ -24,8 +24,8 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate
 ESTIMATORS: dict[str, Callable[[], Any]] = {
-    "plain, crossed halves": lambda: ur.PathGradient(spp=2),
-    "plain, crossed groups": lambda: ur.PathGradient(spp=6),
+    "plain, dual buffers": lambda: ur.PathGradient(spp=2),
+    "plain, leave-one-out groups": lambda: ur.PathGradient(spp=6),
     "plain, own paths": lambda: ur.PathGradient(spp=1),
     "plain, other spp": lambda: ur.PathGradient(spp=4, adjoint_spp=1),
     "control variate, path space": lambda: ur.PathGradient(CV(), spp=2),
@@ -321,7 +321,7 @@ def test_meta_takes_the_space_that_its_parameters_allow() -> None:
         assert found.info["space"] == dict.fromkeys(found.gradient, space)
 
 
-def test_groups_that_are_not_crossed_are_biased(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_groups_that_are_not_left_out_are_biased(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above sees what crossing is for."""
     monkeypatch.setattr(ImageEstimate, "others", lambda self: self.images)
     asked = problem(views=1, noise=0.9)
@@ -490,7 +490,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("spp", "groups"), [(1, 1), (2, 2), (3, 3), (6, 6), (17, 1), (24, 12), (64, 16)])
-def test_samples_form_as_many_groups_as_can_be_crossed(spp: int, groups: int) -> None:
+def test_samples_form_as_many_leave_one_out_groups_as_divide_them(spp: int, groups: int) -> None:
     assert ur.PathGradient(spp=spp).groups == groups
     assert ur.PathGradient(spp=spp, adjoint_spp=2).groups == 1
 

@@ -1,4 +1,4 @@
-"""The gallery's problems for drawn pixels: solvable at their truth, unsolved at their start, and difficult where they say so."""
+"""The gallery's problems for pixel mini-batches: solvable at their truth, unsolved at their start, and difficult where they say so."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def seen_through(extinction: np.ndarray, emission: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("voxels", quick([8, 20], 20))
 def test_slabs_that_glow_are_what_their_closed_form_says(voxels: int) -> None:
-    """With one majorant and with a coarse grid of them; alone, and both images of a pair."""
+    """With one majorant and with a supergrid of them; alone, and both images of a pair."""
     extinction, emission = slabs(voxels)
     renderer = MitsubaRenderer(before_the_sky(glow(extinction, emission, "nearest")), 2)
     keys = ["body.interior_medium.sigma_t.data", "body.interior_medium.emission.data"]

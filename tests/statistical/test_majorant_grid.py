@@ -42,7 +42,7 @@ def sparse() -> dict[str, Any]:
 
 
 def several() -> dict[str, Any]:
-    """A medium with a coarse grid, and before it a ball of one without."""
+    """A medium with a majorant supergrid, and before it a ball of one without."""
     ball = {"type": "sphere", "center": [0, -2.1, 0.9], "radius": 0.5, "bsdf": {"type": "null"}, "interior": fog()}
     return {**scene(sparse(), lights="lamp sky point"), "ball": ball}
 

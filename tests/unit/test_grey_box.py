@@ -16,13 +16,13 @@ import unrender as ur
 from unrender.core.random import Key
 
 
-def bowl(x: np.ndarray) -> np.ndarray:
+def paraboloid(x: np.ndarray) -> np.ndarray:
     """Of Hessian 2 in every direction, at every smoothing."""
     return np.sum((x - 0.5) ** 2, axis=1)
 
 
-def bowls(x: np.ndarray, items: np.ndarray) -> np.ndarray:
-    return bowl(x) + items
+def paraboloids(x: np.ndarray, items: np.ndarray) -> np.ndarray:
+    return paraboloid(x) + items
 
 
 class Counted:
@@ -60,27 +60,29 @@ def loss(torch: Any) -> Callable[..., Any]:
 
 def test_one_point_gives_its_value_and_the_smoothed_gradient(torch: Any, loss: Any) -> None:
     phi = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
-    value = loss(bowl, phi, [0.1, 0.2, 0.3], 64, seed=7, antithetic=False)
+    value = loss(paraboloid, phi, [0.1, 0.2, 0.3], 64, seed=7, antithetic=False)
     value.backward()
     assert value.shape == ()
     assert value.dtype == phi.dtype
     points = phi.detach().double().numpy()
-    assert value.item() == pytest.approx(bowl(points[None])[0])
-    expected, _ = ur.smoothed.gradient(bowl, points, [0.1, 0.2, 0.3], 64, Key(7).fold(0).uint32(), antithetic=False)
+    assert value.item() == pytest.approx(paraboloid(points[None])[0])
+    expected, _ = ur.smoothed.gradient(
+        paraboloid, points, [0.1, 0.2, 0.3], 64, Key(7).fold(0).uint32(), antithetic=False
+    )
     np.testing.assert_allclose(phi.grad.numpy(), expected, rtol=1e-6)
 
 
 def test_a_batch_gives_a_value_for_each_item(torch: Any, loss: Any) -> None:
     phi = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
-    values = loss(bowls, phi, 0.1, 16)
+    values = loss(paraboloids, phi, 0.1, 16)
     assert values.shape == (5,)
-    np.testing.assert_allclose(values.detach(), bowls(phi.detach().numpy(), np.arange(5)))
+    np.testing.assert_allclose(values.detach(), paraboloids(phi.detach().numpy(), np.arange(5)))
     with torch.no_grad():
-        assert torch.equal(loss(bowls, phi, 0.1, 16), values)
+        assert torch.equal(loss(paraboloids, phi, 0.1, 16), values)
 
 
 def test_each_order_is_one_call_of_the_black_box(torch: Any, loss: Any) -> None:
-    f = Counted(bowls)
+    f = Counted(paraboloids)
     phi = torch.rand(5, 3, requires_grad=True)
     total = loss(f, phi, 0.1, 16).sum()
     (gradient,) = torch.autograd.grad(total, phi, create_graph=True)
@@ -98,10 +100,10 @@ def test_each_order_is_one_call_of_the_black_box(torch: Any, loss: Any) -> None:
 
 
 def test_joint_products_cost_no_call_of_the_black_box(torch: Any, loss: Any) -> None:
-    f = Counted(bowls)
+    f = Counted(paraboloids)
     phi = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
     values = loss(f, phi, 0.1, 64, joint=True)
-    np.testing.assert_allclose(values.detach().numpy(), bowls(phi.detach().numpy(), np.arange(5)))
+    np.testing.assert_allclose(values.detach().numpy(), paraboloids(phi.detach().numpy(), np.arange(5)))
     (gradient,) = torch.autograd.grad(values.sum(), phi, create_graph=True)
     basis = [torch.autograd.grad(gradient, phi, v.expand(5, 3), retain_graph=True)[0].numpy() for v in torch.eye(3)]
     assert f.calls == [5 * (1 + 64)]
@@ -115,7 +117,7 @@ def test_first_and_second_order_take_the_same_draws_and_equal_seeds_repeat_them(
 
     def watched(x: np.ndarray) -> np.ndarray:
         seen.append(x)
-        return bowl(x)
+        return paraboloid(x)
 
     phi = torch.zeros(2, dtype=torch.float64, requires_grad=True)
     for seed in (3, 3, 4):
@@ -131,7 +133,7 @@ def test_first_and_second_order_take_the_same_draws_and_equal_seeds_repeat_them(
 
 def test_a_third_order_is_refused(torch: Any, loss: Any) -> None:
     phi = torch.zeros(2, requires_grad=True)
-    (gradient,) = torch.autograd.grad(loss(bowl, phi, 0.1, 16), phi, create_graph=True)
+    (gradient,) = torch.autograd.grad(loss(paraboloid, phi, 0.1, 16), phi, create_graph=True)
     (product,) = torch.autograd.grad(gradient.sum(), phi, create_graph=True)
     with pytest.raises(ur.InputError, match="no derivatives of third order"):
         torch.autograd.grad(product.sum(), phi)
@@ -140,17 +142,20 @@ def test_a_third_order_is_refused(torch: Any, loss: Any) -> None:
 def test_bad_input_is_one_line(torch: Any, loss: Any) -> None:
     phi = torch.zeros(2, requires_grad=True)
     for arguments, message in [
-        ((bowl, phi, 0.0, 16), "sigma must be above 0"),
-        ((bowl, phi, [0.1, -0.1], 16), "sigma must be above 0"),
-        ((bowl, phi, [0.1, 0.1, 0.1], 16), "sigma must be a finite number or a vector"),
-        ((bowl, phi, 0.1, 2), "samples must be a whole number of at least 4"),
-        ((bowl, [0.0, 0.0], 0.1, 16), "phi must be a floating-point tensor .* got list"),
-        ((bowl, torch.zeros(2, dtype=torch.int64), 0.1, 16), "phi must be a floating-point tensor .* got torch.int64"),
-        ((bowl, torch.zeros(2, 2, 2), 0.1, 16), r"phi must be a floating-point tensor .* \(2, 2, 2\)"),
-        ((bowl, torch.zeros(0, 2), 0.1, 16), r"phi must be a floating-point tensor .* \(0, 2\)"),
-        ((bowl, phi * torch.nan, 0.1, 16), "phi has elements that are not finite"),
+        ((paraboloid, phi, 0.0, 16), "sigma must be above 0"),
+        ((paraboloid, phi, [0.1, -0.1], 16), "sigma must be above 0"),
+        ((paraboloid, phi, [0.1, 0.1, 0.1], 16), "sigma must be a finite number or a vector"),
+        ((paraboloid, phi, 0.1, 2), "samples must be a whole number of at least 4"),
+        ((paraboloid, [0.0, 0.0], 0.1, 16), "phi must be a floating-point tensor .* got list"),
+        (
+            (paraboloid, torch.zeros(2, dtype=torch.int64), 0.1, 16),
+            "phi must be a floating-point tensor .* got torch.int64",
+        ),
+        ((paraboloid, torch.zeros(2, 2, 2), 0.1, 16), r"phi must be a floating-point tensor .* \(2, 2, 2\)"),
+        ((paraboloid, torch.zeros(0, 2), 0.1, 16), r"phi must be a floating-point tensor .* \(0, 2\)"),
+        ((paraboloid, phi * torch.nan, 0.1, 16), "phi has elements that are not finite"),
         ((lambda x: x, phi, 0.1, 16), r"f must return shape \(17,\) for \(17, 2\), got \(17, 2\)"),
-        ((lambda x: bowl(x) * np.nan, phi, 0.1, 16), "f is not finite at"),
+        ((lambda x: paraboloid(x) * np.nan, phi, 0.1, 16), "f is not finite at"),
         (
             (lambda x, items: np.where(items == 1, np.inf, 0), phi.expand(3, 2), 0.1, 16),
             "f is not finite at .*, item 1",
@@ -163,7 +168,7 @@ def test_bad_input_is_one_line(torch: Any, loss: Any) -> None:
 def test_a_black_box_that_fails_at_second_order_is_one_line_too(torch: Any, loss: Any) -> None:
     phi = torch.zeros(2, requires_grad=True)
     failing = []
-    value = loss(lambda x: bowl(x) * (np.nan if failing else 1), phi, 0.1, 16)
+    value = loss(lambda x: paraboloid(x) * (np.nan if failing else 1), phi, 0.1, 16)
     (gradient,) = torch.autograd.grad(value, phi, create_graph=True)
     failing.append(True)
     with pytest.raises(ur.InputError, match="f is not finite at"):
@@ -179,7 +184,7 @@ class Line:
         self.x = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.3, 0.3, 1.0]])
 
     def loss(self) -> Any:
-        return ur.grey_box.loss(lambda x, _: bowl(x), self.x @ self.weights.T, 0.1, 4096).mean()
+        return ur.grey_box.loss(lambda x, _: paraboloid(x), self.x @ self.weights.T, 0.1, 4096).mean()
 
 
 def test_newton_cg_reaches_the_least_of_a_quadratic_form(torch: Any) -> None:
@@ -193,7 +198,7 @@ def test_newton_cg_reaches_the_least_of_a_quadratic_form(torch: Any) -> None:
 def test_newton_cg_goes_to_the_radius_where_the_loss_bends_downwards(torch: Any) -> None:
     w = torch.tensor([0.3, 0.1], requires_grad=True)
     start = w.detach().clone()
-    ur.grey_box.newton_cg_step(lambda: ur.grey_box.loss(lambda x: -bowl(x), w, 0.1, 256), [w], trust_radius=0.25)
+    ur.grey_box.newton_cg_step(lambda: ur.grey_box.loss(lambda x: -paraboloid(x), w, 0.1, 256), [w], trust_radius=0.25)
     step = (w - start).detach()
     assert float(step.norm()) == pytest.approx(0.25, rel=1e-4)
     assert float(step.sum()) < 0  # away from the maximum at 0.5
@@ -255,7 +260,7 @@ def test_second_order_of_a_large_network_builds_no_matrix(torch: Any) -> None:
     x = torch.rand(4, 1024)
     with Largest() as largest:
         before = ur.grey_box.newton_cg_step(
-            lambda: ur.grey_box.loss(bowls, net(x), 0.1, 64).mean(), net.parameters(), trust_radius=0.05
+            lambda: ur.grey_box.loss(paraboloids, net(x), 0.1, 64).mean(), net.parameters(), trust_radius=0.05
         )
-    assert ur.grey_box.loss(bowls, net(x), 0.1, 64).mean().item() < before
+    assert ur.grey_box.loss(paraboloids, net(x), 0.1, 64).mean().item() < before
     assert largest.elements <= count

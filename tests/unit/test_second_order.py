@@ -27,7 +27,7 @@ def split(x, like=LIKE):
     return vectors.unravel(x, like)
 
 
-def bowl(n: int = 6, seed: int = 0, condition: float = 1000.0) -> tuple[np.ndarray, np.ndarray]:
+def paraboloid(n: int = 6, seed: int = 0, condition: float = 1000.0) -> tuple[np.ndarray, np.ndarray]:
     """A positive definite Hessian, and a minimum."""
     rng = np.random.default_rng(seed)
     q, _ = np.linalg.qr(rng.normal(size=(n, n)))
@@ -77,14 +77,14 @@ def rosenbrock(x):
 # ---------------------------------------------------------------------------------------------------- one step
 
 
-def test_one_newton_step_ends_at_the_bottom_of_a_bowl():
-    hessian, minimum = bowl()
+def test_one_newton_step_ends_at_the_bottom_of_a_paraboloid():
+    hessian, minimum = paraboloid()
     step = first_step(Newton(trust_radius=None, damping=1e-6), -hessian @ minimum, hessian)
     np.testing.assert_allclose(step, minimum, rtol=1e-9)
 
 
 def test_newton_cg_is_the_linear_solve_after_n_products():
-    hessian, minimum = bowl(condition=20)
+    hessian, minimum = paraboloid(condition=20)
     exact = NewtonCG(trust_radius=1e3, iterations=6, tolerance=0.0, damping=0.0)
     np.testing.assert_allclose(first_step(exact, -hessian @ minimum, hessian), minimum, rtol=1e-8)
     fewer = dataclasses.replace(exact, iterations=5)
@@ -92,7 +92,7 @@ def test_newton_cg_is_the_linear_solve_after_n_products():
 
 
 def test_newton_cg_ends_at_its_tolerance():
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     gradient = -hessian @ minimum
     left = []
     for tolerance in (0.5, 0.1, 1e-3):
@@ -106,7 +106,7 @@ def test_newton_cg_ends_at_its_tolerance():
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_newton_cg_asks_for_no_more_products_than_it_may(count):
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     calls = []
 
     def product(tree):
@@ -122,7 +122,7 @@ def test_newton_cg_asks_for_no_more_products_than_it_may(count):
 @pytest.mark.parametrize("optimizer", [Newton(trust_radius=0.25), NewtonCG(trust_radius=0.25)], ids=["Newton", "CG"])
 @pytest.mark.parametrize("shift", [3.0, 30.0], ids=["saddle", "hill"])
 def test_where_the_objective_bends_downwards_the_step_descends_to_the_radius(optimizer, shift):
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     hessian = hessian - shift * np.eye(6)
     gradient = hessian @ minimum
     step = first_step(optimizer, gradient, hessian)
@@ -136,7 +136,7 @@ def test_where_the_objective_bends_downwards_the_step_descends_to_the_radius(opt
 @pytest.mark.parametrize("radius", [1e-3, 0.1, 100.0])
 def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
     """Products too large by any factor, a gradient that is mostly noise: the step still ends where the loss is least along it."""
-    hessian, minimum = bowl(condition=10.0)
+    hessian, minimum = paraboloid(condition=10.0)
     like, rng = {"x": np.zeros(6)}, np.random.default_rng(3)
     gradient = hessian @ -minimum + 3 * rng.standard_normal(6)
 
@@ -161,7 +161,7 @@ def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
 
 @pytest.mark.parametrize("radius", [1e-3, 0.1, 1.0])
 def test_newtons_step_is_the_best_one_within_its_radius(radius):
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     gradient = -hessian @ minimum
     step = first_step(Newton(trust_radius=radius, damping=1e-6), gradient, hessian)
     assert np.linalg.norm(step) == pytest.approx(radius, rel=1e-6)
@@ -190,7 +190,7 @@ def test_without_curvature_the_step_is_the_gradients_and_as_long_as_the_radius(o
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 def test_no_step_where_nothing_is_known(optimizer, what):
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     gradient = -hessian @ minimum
     if what == "zero gradient":
         gradient = np.zeros(6)
@@ -203,7 +203,7 @@ def test_no_step_where_nothing_is_known(optimizer, what):
 
 
 def test_a_later_product_that_is_not_finite_ends_the_iterations():
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     optimizer, calls = NewtonCG(trust_radius=1e3, iterations=6, tolerance=0.0, damping=0.0), []
 
     def product(v):
@@ -223,7 +223,7 @@ def test_noisy_products_lead_neither_upwards_nor_astray(noise):
     """Products with noise of their own, of no symmetric matrix."""
     for seed in range(50):
         rng = np.random.default_rng(seed)
-        hessian, minimum = bowl(seed=seed)
+        hessian, minimum = paraboloid(seed=seed)
         gradient = -hessian @ minimum
 
         def product(v, rng=rng, hessian=hessian):
@@ -243,7 +243,7 @@ def test_damping_helps_against_a_noisy_hessian():
         left = []
         for seed in range(20):
             rng = np.random.default_rng(seed)
-            hessian, x = bowl(10, seed, condition=10)
+            hessian, x = paraboloid(10, seed, condition=10)
             optimizer = Newton(damping=damping)
             state = optimizer.init({"x": x})
             for _ in range(30):
@@ -269,7 +269,7 @@ SPREAD = np.array([0.01] * 4 + [5.0] * 2)
     ids=repr,
 )
 def test_steps_are_those_of_the_scaled_problem(optimizer):
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     unscaled = hessian / SPREAD[:, None] / SPREAD
     gradient = -hessian @ minimum
     expected = SPREAD * first_step(optimizer, gradient, hessian)
@@ -279,7 +279,7 @@ def test_steps_are_those_of_the_scaled_problem(optimizer):
 
 
 def test_learning_rates_do_not_matter_inside_the_trust_region():
-    hessian, minimum = bowl(condition=10)
+    hessian, minimum = paraboloid(condition=10)
     cg = NewtonCG(trust_radius=1e4, iterations=6, tolerance=0.0, damping=0.0)
     for optimizer in (Newton(trust_radius=1e4, damping=1e-12), cg):
         step = first_step(optimizer, -hessian @ minimum, hessian, {"a": 0.5, "b": 1.0})
@@ -288,7 +288,7 @@ def test_learning_rates_do_not_matter_inside_the_trust_region():
 
 @pytest.mark.parametrize("kind", [Newton, NewtonCG, LBFGS])
 def test_share_and_schedule_are_factors_of_the_step(kind):
-    gradient, (hessian, _) = np.arange(6.0), bowl()
+    gradient, (hessian, _) = np.arange(6.0), paraboloid()
     whole = first_step(kind(), gradient, hessian)
     np.testing.assert_allclose(first_step(kind(step_scale=0.25), gradient, hessian), 0.25 * whole)
     np.testing.assert_allclose(first_step(kind(schedule=Constant(0.5)), gradient, hessian), 0.5 * whole)
@@ -301,7 +301,7 @@ def test_share_and_schedule_are_factors_of_the_step(kind):
 def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
     """Of the first kind of step, on a fixed list of gradients at fixed parameters."""
     rng = np.random.default_rng(1)
-    adam, (hessian, _) = Adam(0.02, beta_1=0.8), bowl()
+    adam, (hessian, _) = Adam(0.02, beta_1=0.8), paraboloid()
     plain, passed = kind(), kind(inner_optimizer=adam, schedule=Exponential(3))
     own, state, states = passed.init(LIKE, {"b": 0.3}), adam.init(LIKE, {"b": 0.3}), plain.init(LIKE, {"b": 0.3})
     for step in range(5):
@@ -316,7 +316,7 @@ def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
     "optimizer", [Newton(inner_optimizer=Adam(0.05)), NewtonCG(inner_optimizer=Adam(0.05))], ids=["Newton", "CG"]
 )
 def test_through_adam_reaches_the_bottom(optimizer):
-    hessian, minimum = bowl(condition=100)
+    hessian, minimum = paraboloid(condition=100)
     optimizer = dataclasses.replace(optimizer, schedule=Exponential(60))
 
     def function(x):
@@ -346,7 +346,7 @@ def test_goes_down_the_valley_of_rosenbrock(optimizer, steps):
 
 
 def test_lbfgs_is_bfgs_without_the_matrix():
-    hessian, x = bowl(condition=20)
+    hessian, x = paraboloid(condition=20)
     optimizer = LBFGS(trust_radius=1e3, history=4, curvature=1e-6)
     state, pairs, before = optimizer.init({"x": x}), [], None
     for _ in range(8):
@@ -391,7 +391,7 @@ def test_lbfgs_bears_noise_in_proportion_to_the_gradient():
         return value, gradient + 0.2 * noise, hessian
 
     for seed in range(5):
-        hessian, x = bowl(10, seed, condition=100)
+        hessian, x = paraboloid(10, seed, condition=100)
         values, _ = descend(LBFGS(), function, x, 100)
         assert values[-1] < 1e-6 * values[0]
 
@@ -556,7 +556,7 @@ def test_a_long_search_survives_its_own_success():
 def test_states_and_steps_on_the_device_are_those_of_numpy():
     import mitsuba as mi
 
-    hessian, minimum = bowl()
+    hessian, minimum = paraboloid()
     device = {key: kernels.on_device(x) for key, x in LIKE.items()}
     optimizers: list[Any] = [*FIRST_STEPS, Newton(inner_optimizer=Adam()), CMAES()]
     for optimizer in optimizers:

@@ -140,16 +140,16 @@ class _Landscape:
 
 @pytest.mark.parametrize("options", [{}, {"order": "hvp"}, {"order": "hvp", "joint": False}], ids=str)
 def test_sigma_waits_for_the_descent_to_arrive(options: dict[str, Any]) -> None:
-    """At the bottom of a bowl time passes, on a slope, a plateau and a summit it stands still."""
-    bowl = _Landscape(lambda x: 1 + x * x)
-    assert 0.5 < bowl.age(0.0, **options) <= 1.0
-    assert bowl.age(3.0, **options) < 0.05
+    """At the bottom of a paraboloid time passes, on a slope, a plateau and a summit it stands still."""
+    paraboloid = _Landscape(lambda x: 1 + x * x)
+    assert 0.5 < paraboloid.age(0.0, **options) <= 1.0
+    assert paraboloid.age(3.0, **options) < 0.05
     assert _Landscape(lambda x: np.abs(x)).age(0.0, **options) > 0.7
     assert _Landscape(lambda x: np.ones_like(x)).age(0.0, **options) == 0.0
     assert _Landscape(lambda x: 9 - x * x).age(0.0, **options) == 0.0
     still = ur.SmoothedDerivatives(0.1, samples=8, schedule=Exponential(1), adaptive_annealing=True, **options)
     parameters = {"x": np.array([3.0])}
-    found, _ = still.estimate(bowl.problem, parameters, still.init(bowl.problem, parameters), Key(0))
+    found, _ = still.estimate(paraboloid.problem, parameters, still.init(paraboloid.problem, parameters), Key(0))
     assert found.sigma == {"x": 0.1}
 
 

@@ -1,7 +1,7 @@
 # Dr.Jit's stubs know less than its functions return.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
 
-"""Gradients of drawn pixels on a path tracer: the mean of two thousand mini-batches is the gradient of all pixels."""
+"""Gradients of pixel mini-batches on a path tracer: the mean of two thousand mini-batches is the gradient of all pixels."""
 
 from __future__ import annotations
 
