@@ -210,7 +210,7 @@ def test_every_variance_cut_pays() -> None:
 
 @pytest.mark.parametrize("low_discrepancy", [False, True])
 def test_curvature_of_a_paraboloid_in_many_dimensions_is_not_lost_in_its_depth(low_discrepancy: bool) -> None:
-    """Of a paraboloid nearly round, 60 dimensions from 64 pairs; the mean of a pair without the control variate is some 30 times as noisy."""
+    """Of a paraboloid nearly round, 60 dimensions from 64 pairs; the mean of a pair without control variate is 30 times as noisy."""
     n, sigma = 60, 0.5
     bend = np.linspace(0.9, 1.1, n)
     v = np.random.default_rng(0).standard_normal(n)
