@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from unrender.evaluation import metrics
     from unrender.exporting.scene_folder import export
     from unrender.io.volumes import Grid, read_grid, write_grid
+    from unrender.loops.renderer import Renderer
     from unrender.problem.coarse_to_fine import CoarseToFine
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
@@ -84,6 +85,7 @@ _HOMES = {
     "Parameter": "problem.parameter",
     "PathGradient": "estimators.path",
     "Problem": "problem.problem",
+    "Renderer": "loops.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
     "TensorBoard": "runs.tensorboard",
@@ -116,6 +118,7 @@ __all__ = [
     "Parameter",
     "PathGradient",
     "Problem",
+    "Renderer",
     "Result",
     "SmoothedDerivatives",
     "TensorBoard",

@@ -61,9 +61,7 @@ class StockGradient:
             return StockState()
         return StockState(self._path.init(problem, parameters))
 
-    def estimate(
-        self, problem: Problem, parameters: Tree, state: StockState, key: Key
-    ) -> tuple[Estimate, StockState]:
+    def estimate(self, problem: Problem, parameters: Tree, state: StockState, key: Key) -> tuple[Estimate, StockState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view."""
         renderer = problem.renderer
         if state.path is not None or not isinstance(renderer, StockRenderer):
@@ -75,7 +73,11 @@ class StockGradient:
         for index, view in enumerate(problem.views):
             seeds = key.fold(index).fold(0).uint32(), key.fold(index).fold(1).uint32()
             images[index], gradient = loop.gradient(
-                parameters, view.sensor, self.spp, seeds, lambda image, index=index: problem.loss_derivative(index, image)
+                parameters,
+                view.sensor,
+                self.spp,
+                seeds,
+                lambda image, index=index: problem.loss_derivative(index, image),
             )
             losses.append(problem.loss_value(index, images[index]))
             height, width = renderer.resolutions()[view.sensor]

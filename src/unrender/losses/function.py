@@ -98,7 +98,9 @@ class FunctionLoss:
             try:
                 value, _ = _CALLS[way](self, image, reference, True)
             except Exception as error:  # whatever a user's function raises for arrays of another framework
-                said.append(f"with {_NAMES[way]}'s tensors: {' '.join(str(error).split())[:160] or type(error).__name__}")
+                said.append(
+                    f"with {_NAMES[way]}'s tensors: {' '.join(str(error).split())[:160] or type(error).__name__}"
+                )
                 continue
             if not np.isfinite(value):
                 raise InputError(f"{self!r}: its value at an image that is nearly the reference is {value}")
@@ -118,9 +120,7 @@ def _each(of_one: Callable[[Array, Array], Array], images: Array, references: Ar
         return of_one(images, references)
     several = len(references.shape) > 3 and references.shape[0] > 1
     alone = references if len(references.shape) == 3 else references[0]
-    found = [
-        _each(of_one, images[index], references[index] if several else alone) for index in range(images.shape[0])
-    ]
+    found = [_each(of_one, images[index], references[index] if several else alone) for index in range(images.shape[0])]
     return arrays.concatenate([arrays.add_first_axis(one) for one in found])
 
 
