@@ -103,7 +103,7 @@ class LoadedScene:
             if _is_array(value):
                 self._own[key] = _reference(value)
         self._settings: dict[str, _Setting] = {}
-        self._native: dict[str, Any] = {}
+        self._held: dict[str, Any] = {}  # as the scene has them after an update; a texture keeps a copy
         _registry.add(self)
 
     def value(self, key: str) -> mi.TensorXf:
@@ -122,34 +122,37 @@ class LoadedScene:
             attached: whether they are leaves of the derivative graph.
         """
         self._restore([key for key in self._settings if key not in values])
-        changed = False
-        for key, value in values.items():
-            if key in self._settings and self._settings[key].is_of(value, attached) and self._holds(key):
-                continue
+        changed = [key for key, value in values.items() if not self._is_set(key, value, attached)]
+        # Within the backward pass of an operation of the user's graph, leaves must be all of it or all from before it: Dr.Jit (1.5)
+        # loses the gradients of a mixture.
+        for key in values if attached and changed else changed:
+            value = values[key]
             leaf = from_tensor(value, self._own[key])
             self.leaves.pop(key, None)
             if attached:
                 dr.enable_grad(leaf)
                 self.leaves[key] = leaf
             self.parameters[key] = leaf
-            self._native[key] = leaf
             self._settings[key] = _Setting(mi.TensorXf(value), attached)
-            changed = True
         if changed:
             self.parameters.update()
+            if self._shared:
+                self._held = {key: _reference(dr.detach(self.parameters[key])) for key in self._settings}
 
-    def _holds(self, key: str) -> bool:
-        """Whether the scene still holds what the parameter was set to."""
+    def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
+        """Whether the parameter was set to this, and the scene still holds it."""
+        if key not in self._settings or not self._settings[key].is_of(value, attached):
+            return False
         if not self._shared:
             return True
-        held = self.parameters[key]
-        return dr.grad_enabled(held) == self._settings[key].attached and _index(held) == _index(self._native[key])
+        return key in self._held and _index(self.parameters[key]) == _index(self._held[key])
 
     def _restore(self, keys: list[str]) -> None:
         if not keys:
             return
         for key in keys:
-            del self._settings[key], self._native[key]
+            del self._settings[key]
+            self._held.pop(key, None)
             self.leaves.pop(key, None)
             self.parameters[key] = _reference(self._own[key])
         self.parameters.update()
