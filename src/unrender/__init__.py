@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
+    from unrender.estimators.stock import StockGradient
     from unrender.evaluation import metrics
     from unrender.exporting.scene_folder import export
     from unrender.io.volumes import Grid, read_grid, write_grid
@@ -88,6 +89,7 @@ _HOMES = {
     "Renderer": "loops.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
+    "StockGradient": "estimators.stock",
     "TensorBoard": "runs.tensorboard",
     "View": "problem.view",
     "estimate": "runs.optimize",
@@ -121,6 +123,7 @@ __all__ = [
     "Renderer",
     "Result",
     "SmoothedDerivatives",
+    "StockGradient",
     "TensorBoard",
     "UnrenderError",
     "VariantError",
