@@ -37,8 +37,14 @@ class Task:
     max_depth: int
 
 
+def _now() -> float:
+    return time.process_time() / dr.thread_count()
+
+
 class Clock:
     """Seconds of the steps of a loop, and the error at some of them, which is not counted.
+
+    Seconds of processor time of this process, over the number of its threads: what others do on the machine does not count.
 
     Args:
         seconds: of the loop.
@@ -49,19 +55,19 @@ class Clock:
     def __init__(self, seconds: float, error: Callable[[Any], float], warm: int = 3):
         self.history: list[tuple[float, float]] = []
         self._seconds, self._error, self._warm = seconds, error, warm
-        self._spent, self._began, self._next, self.steps = 0.0, time.perf_counter(), 0.0, -warm
+        self._spent, self._began, self._next, self.steps = 0.0, _now(), 0.0, -warm
 
     def goes_on(self, texture: Any) -> bool:
         """At the end of each step: whether there is another."""
         dr.sync_thread()
         self.steps += 1
         if self.steps > 0:
-            self._spent += time.perf_counter() - self._began
+            self._spent += _now() - self._began
         over = self._spent >= self._seconds
         if self.steps > 0 and (over or self._spent >= self._next):
             self.history.append((self._spent, self._error(texture)))
             self._next = self._spent + self._seconds / 40
-        self._began = time.perf_counter()
+        self._began = _now()
         return not over
 
 

@@ -97,21 +97,21 @@ def leak(loop: Callable[..., None], task: Task, steps: int) -> dict[str, Any]:
 
 def run(
     loss: tuple[str, ...] = ("l2", "l1"),
-    seconds: float = 8.0,
-    tuning_seconds: float = 4.0,
+    seconds: float = 6.0,
+    tuning_seconds: float = 2.0,
     seeds: int = 3,
-    resolution: int = 128,
-    texture_resolution: int = 64,
+    resolution: int = 64,
+    texture_resolution: int = 32,
     reference_spp: int = 4096,
     spp: tuple[int, ...] = (2, 4, 16),
-    rates: tuple[float, ...] = (0.02, 0.04),
+    rates: tuple[float, ...] = (0.02, 0.05),
     leak_steps: int = 2000,
 ) -> Iterator[dict[str, Any]]:
     """All parts.
 
     Args:
         loss: the loop's
-        seconds: of a run
+        seconds: of a run: processor time over the number of threads
         tuning_seconds: of a run on the tuning seed
         seeds: runs of each loop
         spp: samples per pixel to try

