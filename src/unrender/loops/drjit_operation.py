@@ -20,13 +20,14 @@ class _Render(dr.CustomOp):
         del values
         self._backward = backward
         self._shapes = [tuple(image.shape) for image in images]
-        return images if len(images) > 1 else images[0]
+        several: Any = images
+        return several if len(images) > 1 else several[0]
 
     def backward(self) -> None:
         """See `dr.CustomOp`."""
-        found = self.grad_out()
-        given = found if isinstance(found, tuple) else (found,)
-        kind = type(given[0])
+        found: Any = self.grad_out()
+        given: Any = found if isinstance(found, tuple) else (found,)
+        kind: Any = type(given[0])
         # A derivative that is the same everywhere comes as a number.
         whole = tuple(
             x if tuple(x.shape) == shape else x + dr.zeros(kind, shape)
@@ -51,5 +52,5 @@ def apply(backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], 
         images: tensors, detached.
         values: {key: tensor}, attached or not.
     """
-    found = dr.custom(_Render, backward, images, values)
+    found: Any = dr.custom(_Render, backward, images, values)
     return found if isinstance(found, tuple) else (found,)

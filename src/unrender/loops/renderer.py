@@ -35,7 +35,7 @@ class Renderer:
 
     In Dr.Jit and PyTorch a call is differentiable, and stands where `mi.render` stood:
 
-        renderer = ur.Renderer(scene, ["wall.bsdf.reflectance.data"], image=ur.images.RecursiveControlVariate(), spp=4)
+        renderer = ur.Renderer(scene, ["red.reflectance.value"], image=ur.images.RecursiveControlVariate(), spp=4)
         for step in range(steps):
             image = renderer(parameters)
 
@@ -184,14 +184,14 @@ class Renderer:
         given = self._last[0]
         if given.framework == "drjit":
             return batch
-        found = Batch(*(arrays.numpy(part) for part in (batch.sensors, batch.pixels, batch.weights)))
+        found = Batch(arrays.numpy(batch.sensors), arrays.numpy(batch.pixels), arrays.numpy(batch.weights))
         if given.framework == "numpy":
             return found
         import torch  # pyright: ignore[reportMissingImports]
 
         like = next(value for value in given.values.values() if frameworks.is_torch(value))
-        whole = (torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (found.sensors, found.pixels))
-        return Batch(*whole, frameworks.to_torch(found.weights, like))
+        whole = [torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (found.sensors, found.pixels)]
+        return Batch(whole[0], whole[1], frameworks.to_torch(found.weights, like))
 
     def gather(self, images: Any) -> Any:
         """The pixels of the last render, (N, C), of an image (H, W, C) or, with several sensors, of a list of them; unchanged where the

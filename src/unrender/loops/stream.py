@@ -195,7 +195,8 @@ class Stream:
         return found
 
     def _batch(self, drawn: MiniBatch, like: Array) -> Batch:
-        sizes = [int(np.prod(np.shape(view.reference)[:2])) for view in self.problem.views]
+        resolutions = self.problem.renderer.resolutions()
+        sizes = [int(np.prod(resolutions[view.sensor])) for view in self.problem.views]
         total = sum(sizes)
         if drawn.sample is not None:
             return Batch(drawn.sample.views, drawn.sample.pixels, drawn.sample.weights / (3.0 * total))

@@ -54,7 +54,7 @@ class Exchange:
         if not isinstance(values, Mapping) and not (hasattr(values, "keys") and hasattr(values, "__getitem__")):
             if len(self._keys) > 1:
                 raise InputError(f"Renderer: expected {{key: array}} for {', '.join(self._keys)}, got {_kind(values)}")
-            values = {self._keys[0]: values}
+            values = dict.fromkeys(self._keys, values)
         known = list(values.keys())
         for key in self._keys:
             if key not in known:
@@ -80,7 +80,8 @@ class Exchange:
         def tensor(key: str, value: Any) -> Any:
             if dr.is_tensor_v(value):
                 return value
-            return mi.TensorXf(dr.ravel(value), self._info[key].shape)
+            flat: Any = dr.ravel(value)
+            return mi.TensorXf(flat, self._info[key].shape)
 
         return {
             key: tensor(key, value) if arrays.is_drjit(value) else self._renderer.array(self._host(key, value))

@@ -43,7 +43,7 @@ class StockSession:
             integrator=self._integrator,
             spp=spp,
             seed=mi.UInt32(seeds[0]),
-            seed_grad=mi.UInt32(seeds[1]),
+            seed_grad=mi.UInt32(seeds[1]),  # pyright: ignore[reportArgumentType]
         )
         seen = mi.TensorXf(dr.detach(image))
         dr.backward(dr.sum(image * weigh(seen), axis=None))
