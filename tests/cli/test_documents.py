@@ -73,7 +73,11 @@ GIVEN = {
         def f(points, items): return (points**2).sum(axis=1)
     """,
 }
-SLOW_EXAMPLES = {"unrender.exporting.scene_folder.export", "unrender.loops.renderer.Renderer", "unrender.smoothing.grey_box"}
+SLOW_EXAMPLES = {
+    "unrender.exporting.scene_folder.export",
+    "unrender.loops.renderer.Renderer",
+    "unrender.smoothing.grey_box",
+}
 ILLUSTRATIONS = {"unrender.core.registry": "a class is shown without its methods"}
 
 

@@ -89,7 +89,8 @@ def test_a_loaded_scene_that_others_change_meanwhile(changed: list[str]) -> None
 
 def test_a_loaded_scene_has_one_state() -> None:
     loaded = mi.load_dict(surface())
-    for options in ({"image": CV()}, {"image": CV("primary")}, {"coupled": True}):
+    refused: list[dict[str, Any]] = [{"image": CV()}, {"image": CV("primary")}, {"coupled": True}]
+    for options in refused:
         with pytest.raises(InputError, match=r"a loaded mi\.Scene has one state"):
             ur.Renderer(loaded, KEYS, **options)
     renderer = ur.Renderer(loaded, TEXTURE, spp=64)
@@ -110,8 +111,9 @@ def test_a_scene_of_another_variant_is_refused() -> None:
 
 def test_the_tutorials_loop_with_three_lines_changed() -> None:
     """Beside a scene of the user's own; the error falls, no kernel is new after the first steps."""
-    own = mi.load_dict(surface())
-    truth = mi.traverse(own)[TEXTURE].numpy()
+    own: Any = mi.load_dict(surface())
+    texture: Any = mi.traverse(own)[TEXTURE]
+    truth = texture.numpy()
     reference = mi.TensorXf(
         np.array(mi.render(own, spp=1024, integrator=mi.load_dict({"type": "path", "max_depth": 3})))
     )
@@ -203,10 +205,11 @@ def test_2000_steps_leak_nothing(framework: str) -> None:
             value.grad = None
             ((renderer(value) - torch.from_numpy(REFERENCE)) ** 2).mean().backward()
             with torch.no_grad():
-                value -= 0.01 * value.grad
+                gradient: Any = value.grad
+                value -= 0.01 * gradient
         if step in (400, 1999):
             gc.collect()
-            counts.append(len(dr.whos(as_string=True).splitlines()))
+            counts.append(len(str(dr.whos(as_string=True)).splitlines()))
             status = Path("/proc/self/status")
             memory.append(int(status.read_text().split("VmRSS:")[1].split()[0]) if status.exists() else 0)
     assert counts[1] <= counts[0] + 4

@@ -36,7 +36,7 @@ def test_its_gradient_is_that_of_mitsubas_own_functions() -> None:
         params[name] = value
     params.update()
     seeds = (key.fold(0).fold(0).uint32(), key.fold(0).fold(1).uint32())
-    image = mi.render(scene, params, spp=4, seed=mi.UInt32(seeds[0]), seed_grad=mi.UInt32(seeds[1]))
+    image = mi.render(scene, params, spp=4, seed=mi.UInt32(seeds[0]), seed_grad=seeds[1])
     loss = dr.mean(dr.square(image - asked.reference(0)), axis=None)
     dr.backward(loss)
 

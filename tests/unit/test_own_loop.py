@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,14 +107,14 @@ def test_coupled_gradients_have_less_noise_and_say_how_much() -> None:
     plain, coupled, told = [], [], []
     for seed in range(40):
         given = np.random.default_rng(1).normal(size=REFERENCE.shape)  # the same derivative at every step
-        for rows, options in ((plain, {}), (coupled, {"coupled": True})):
-            renderer = ur.Renderer(scene(), KEYS, seed=seed, **options)
+        for rows, keep in ((plain, False), (coupled, True)):
+            renderer = ur.Renderer(scene(), KEYS, seed=seed, coupled=keep)
             found: dict[str, Any] = {}
             for step in range(8):
                 renderer.render(drifted(step // 4))
                 found = renderer.backward(given)
             rows.append(flat(found))
-            if options:
+            if keep:
                 assert renderer.variance is not None
                 told.append(flat(renderer.variance))
             else:
@@ -327,6 +328,24 @@ def test_pytorch_differentiates_what_comes_before_and_after() -> None:
     assert single.dtype == torch.float32
     images = ur.Renderer(scene(sensors=2), KEYS, sensor=[0, 1])(tensors(torch))
     images[1].sum().backward()  # the other has no derivative
+
+
+def test_the_graph_before_a_render_goes_with_its_step() -> None:
+    """Neither the renderer nor its node keep it, though the renderer may be asked for its pixels still."""
+    torch = pytest.importorskip("torch")
+    renderer = ur.Renderer(scene(), KEYS, pixels=Uniform(8))
+    weight = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    colour = weight * torch.ones(3, dtype=torch.float64)
+    before = weakref.ref(colour)
+    gc.disable()
+    try:
+        renderer({"colour": colour, "map": torch.tensor(START["map"])}).sum().backward()
+        del colour
+        assert before() is None
+    finally:
+        gc.enable()
+    assert weight.grad is not None
+    assert renderer.batch.weights.shape == (8, 1)
 
 
 def test_pytorch_and_drjit_are_not_mixed() -> None:

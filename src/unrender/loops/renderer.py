@@ -272,7 +272,7 @@ class Renderer:
             done.append((stream, rendered))
             images.append(self._exchange.image(image, given))
         self._step += 1
-        self._last = given, done
+        self._last = given.detached(), done
         return given, done, tuple(images)
 
     def _backward(self, done: list[tuple[Stream, Rendered]], derivatives: Sequence[Any]) -> Tree:
@@ -291,11 +291,12 @@ class Renderer:
         from unrender.loops import torch_operation
 
         tensors = {key: value for key, value in given.values.items() if frameworks.is_torch(value)}
+        alike = {key: value.detach() for key, value in tensors.items()}
         device = images[0].device
 
         def gradients(derivatives: tuple[Any, ...]) -> list[Any]:
             found = backward(derivatives)
-            return [frameworks.to_torch(arrays.numpy(found[key]), x).to("cpu") for key, x in tensors.items()]
+            return [frameworks.to_torch(arrays.numpy(found[key]), x).to("cpu") for key, x in alike.items()]
 
         on_host = tuple(image.to("cpu") for image in images)
         return tuple(x.to(device) for x in torch_operation.apply(gradients, on_host, list(tensors.values())))

@@ -32,6 +32,14 @@ class Given:
     framework: Framework
     values: dict[str, Any]
 
+    def detached(self) -> Given:
+        """The same values, without what the loop's graph has before them."""
+
+        def detach(x: Any) -> Any:
+            return x.detach() if frameworks.is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
+
+        return Given(self.framework, {key: detach(value) for key, value in self.values.items()})
+
 
 class Exchange:
     """Converts between a loop's arrays and the renderer's.
