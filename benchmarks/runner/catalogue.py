@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 """The repository."""
 PACKAGE = ROOT / "benchmarks"
 ORDER = (
-    "speed", "rcv.fig9_reconstruction", "real_input", "rcv", "meta", "higher_order", "adaptive", "volumes",
+    "speed", "own_loop", "rcv.fig9_reconstruction", "real_input", "rcv", "meta", "higher_order", "adaptive", "volumes",
     "coarse_to_fine", "checkpoints", "watch",
 )  # fmt: skip
 """The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""

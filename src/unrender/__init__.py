@@ -41,9 +41,11 @@ if TYPE_CHECKING:
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
+    from unrender.estimators.stock import StockGradient
     from unrender.evaluation import metrics
     from unrender.exporting.scene_folder import export
     from unrender.io.volumes import Grid, read_grid, write_grid
+    from unrender.loops.renderer import Renderer
     from unrender.problem.coarse_to_fine import CoarseToFine
     from unrender.problem.parameter import Parameter
     from unrender.problem.problem import Problem
@@ -84,8 +86,10 @@ _HOMES = {
     "Parameter": "problem.parameter",
     "PathGradient": "estimators.path",
     "Problem": "problem.problem",
+    "Renderer": "loops.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
+    "StockGradient": "estimators.stock",
     "TensorBoard": "runs.tensorboard",
     "View": "problem.view",
     "estimate": "runs.optimize",
@@ -116,8 +120,10 @@ __all__ = [
     "Parameter",
     "PathGradient",
     "Problem",
+    "Renderer",
     "Result",
     "SmoothedDerivatives",
+    "StockGradient",
     "TensorBoard",
     "UnrenderError",
     "VariantError",

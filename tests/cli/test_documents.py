@@ -30,6 +30,7 @@ SLOW = {
     "README.md",
     "quickstart.md",
     "pixels.md",
+    "own-loop.md",
     "poses.md",
     "runs.md",
     "watching.md",
@@ -48,6 +49,16 @@ GIVEN = {
     """,
     "unrender.gallery.registry.problem": "from unrender.gallery import problem",
     "unrender.gallery.catalogue.problem": "from unrender.gallery import problem",
+    "unrender.loops.renderer.Renderer": """
+        import unrender as ur
+        ur.use("llvm_ad_rgb")
+        import mitsuba as mi
+        import numpy as np
+        scene = mi.cornell_box()
+        scene["sensor"]["film"].update(width=8, height=8)
+        parameters, steps, derivative = {"red.reflectance.value": [0.5, 0.4, 0.3]}, 2, np.ones((8, 8, 3))
+        renderer = ur.Renderer(scene, ["red.reflectance.value"])
+    """,
     "unrender.rendering.mitsuba.emissive": "volume = None",
     "unrender.smoothing.function": """
         import unrender as ur
@@ -62,7 +73,11 @@ GIVEN = {
         def f(points, items): return (points**2).sum(axis=1)
     """,
 }
-SLOW_EXAMPLES = {"unrender.exporting.scene_folder.export", "unrender.smoothing.grey_box"}
+SLOW_EXAMPLES = {
+    "unrender.exporting.scene_folder.export",
+    "unrender.loops.renderer.Renderer",
+    "unrender.smoothing.grey_box",
+}
 ILLUSTRATIONS = {"unrender.core.registry": "a class is shown without its methods"}
 
 

@@ -61,6 +61,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
+    "stock": lambda: ur.StockGradient(spp=2),
     "denoised": lambda: ur.PathGradient(Denoised(by="variation"), spp=4),
     "denoised control variate": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=6),
     "denoised, own paths": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=1),

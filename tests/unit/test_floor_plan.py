@@ -11,8 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "unrender"
 FLOORS = (
     *("core", "backend", "io", "statistics", "evaluation", "rendering", "losses", "schedules", "preconditioners"),
-    *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "report"),
-    *("exporting", "watch", "cli"),
+    *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "loops"),
+    *("report", "exporting", "watch", "cli"),
 )
 """From low to high: a floor imports itself and what is below it."""
 

@@ -12,6 +12,7 @@ from unrender.estimators.loss_values import LossValues
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
+from unrender.estimators.stock import StockGradient
 from unrender.images import Plain, RecursiveControlVariate
 from unrender.methods.base import method, methods, parse_schedule
 from unrender.optimizers import CMAES, LBFGS, Adam, MetaAdam, Newton, NewtonCG
@@ -88,6 +89,14 @@ def test_smoothed_takes_its_options():
         {"*": 0.2, "mug.rotation.y": 0.6}, 16, "hvp", spp=2, schedule=schedules.Exponential(25, 0.1)
     )
     assert method("smoothed").start({**settings, "optimizer": "cma-es"}) == (LossValues(4), CMAES(sigma0=0.1))
+
+
+def test_stock_takes_its_options():
+    estimator, optimizer = method("stock").start({"spp": "8", "learning_rate": 0.5, "beta_2": 0.9})
+    assert estimator == StockGradient(8)
+    assert optimizer == Adam(0.5, beta_2=0.9)
+    with pytest.raises(InputError, match="method stock: option spp: expected a whole number above 0, got '0'"):
+        method("stock").start({"spp": "0"})
 
 
 def test_none_is_none():

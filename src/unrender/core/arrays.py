@@ -39,6 +39,7 @@ __all__ = [
     "owned",
     "random_below",
     "random_integers",
+    "reshape",
     "rows",
     "scalar",
     "searchsorted",
@@ -269,3 +270,8 @@ def rows(x: Array) -> Array:
     """(..., C) to (N, C)."""
     width = x.shape[-1]
     return type(x)(x.array, (len(x.array) // width, width)) if is_drjit(x) else x.reshape(-1, width)
+
+
+def reshape(x: Array, shape: tuple[int, ...]) -> Array:
+    """The same elements in another shape."""
+    return dr.reshape(x, shape) if is_drjit(x) else x.reshape(shape)

@@ -20,6 +20,7 @@ from unrender.problem.validation import (
     Bounds,
     CheckedParameter,
     check_loss,
+    check_loss_function,
     check_max_depth,
     check_parameter,
     check_sequence,
@@ -40,10 +41,12 @@ class Problem:
     copies of the references and masks, which are constant. (`Problem.from_file` and the gallery complete `origin` before they return.)
 
     Args:
-        scene: an .xml file, a Mitsuba dictionary, a function that returns one, or a `Renderer`.
+        scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a `protocols.Renderer`. A loaded
+            scene cannot be held twice, so methods that compare two states (control variates, meta-estimation) refuse it.
         parameters: the unknowns, at least one, with different keys.
         views: the reference images, at least one.
-        loss: per pixel and channel; None is L2(). The total is the sum over views of weight * mean over pixels and
+        loss: per pixel and channel; None is L2(). Or a function of an image (H, W, 3), or of an image and its reference, to a scalar, in
+            Dr.Jit or PyTorch: see `losses.FunctionLoss`. The total is the sum over views of weight * mean over pixels and
             channels of mask * loss.
         max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light).
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
@@ -74,7 +77,7 @@ class Problem:
         scene: str | Path | dict[str, Any] | Callable[[], Any] | Renderer,
         parameters: Sequence[Parameter],
         views: Sequence[View],
-        loss: Loss | None = None,
+        loss: Loss | Callable[..., Any] | None = None,
         max_depth: int = 6,
         *,
         truth: Mapping[str, Any] | None = None,
@@ -103,6 +106,7 @@ class Problem:
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
         self.views = tuple(view for view, _ in read)
         self.notices += [notice for _, notices in read for notice in notices]
+        check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth: dict[str, np.ndarray] = {}
         for key, value in (truth or {}).items():
             self.truth[key], notice = check_truth(key, value, self.shapes())

@@ -14,7 +14,7 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import images, parameter_values, scene_files
-from unrender.losses import Loss
+from unrender.losses import FunctionLoss, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem import coarse_to_fine
 from unrender.problem.coarse_to_fine import CoarseToFine
@@ -27,6 +27,7 @@ __all__ = [
     "Bounds",
     "CheckedParameter",
     "check_loss",
+    "check_loss_function",
     "check_max_depth",
     "check_parameter",
     "check_sequence",
@@ -81,10 +82,22 @@ def check_max_depth(max_depth: Any) -> int:
 
 
 def check_loss(loss: Any) -> Loss:
-    """Raise `FieldError` for what is no loss."""
-    if isinstance(loss, type) or not isinstance(loss, _Loss):
-        raise FieldError(("loss",), f"expected one of unrender.losses, such as L2(), got {loss!r}")
-    return loss
+    """A loss, made of a function where one is given. Raises `FieldError` for what is neither."""
+    if isinstance(loss, _Loss) and not isinstance(loss, type):
+        return loss
+    try:
+        return FunctionLoss(loss)
+    except InputError as error:
+        raise FieldError(("loss",), str(error)) from error
+
+
+def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
+    """Raise `FieldError` for a function that is no loss of images such as this one (H, W, 3)."""
+    if isinstance(loss, FunctionLoss):
+        try:
+            loss.prepare(reference)
+        except InputError as error:
+            raise FieldError(("loss",), str(error)) from error
 
 
 def check_parameter(
@@ -229,10 +242,12 @@ def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> 
 
 
 def open_renderer(scene: Any, max_depth: int) -> Renderer:
-    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, or itself. Raises `FieldError`."""
+    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. Raises
+    `FieldError`."""
     if isinstance(scene, _Renderer) and not isinstance(scene, type):
         return scene
-    if not isinstance(scene, (str, Path, dict)) and not callable(scene):
+    loaded = type(scene).__module__.partition(".")[0] == "mitsuba"
+    if not isinstance(scene, (str, Path, dict)) and not callable(scene) and not loaded:
         got = type(scene).__name__
         raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
     from unrender.backend.variant import ensure

@@ -6,19 +6,32 @@ own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
-__all__ = ["ParameterInfo", "RenderSession", "Renderer", "Rendering", "SampleRequest", "Space"]
+__all__ = [
+    "LossWeights",
+    "ParameterInfo",
+    "RenderSession",
+    "Renderer",
+    "Rendering",
+    "SampleRequest",
+    "Space",
+    "StockLoop",
+    "StockRenderer",
+]
 
 Space = Literal["path", "primary"]
 """Where two states share samples: one set of paths, or one set of random numbers."""
+
+LossWeights = Callable[[Array], Array]
+"""From an image (H, W, 3) to the derivative of the loss by each of its elements."""
 
 
 @dataclass(frozen=True)
@@ -164,4 +177,31 @@ class Renderer(Protocol):
         Raises `InputError` for a parameter that is unknown, not differentiable where `derivatives` are asked for, or not perturbable;
         with `space="path"` for one whose values cannot share paths.
         """
+        ...
+
+
+class StockLoop(Protocol):
+    """One step of the loop that people have, by the functions of a renderer's own Python interface."""
+
+    def gradient(
+        self, parameters: Tree, sensor: int, spp: int, seeds: tuple[int, int], weigh: LossWeights
+    ) -> tuple[Array, Tree]:
+        """The image (H, W, 3) of a sensor, and the gradient of the loss whose derivative at that image `weigh` gives.
+
+        Args:
+            parameters: the current ones.
+            sensor: its index.
+            spp: samples per pixel of the image, and as many of the adjoint.
+            seeds: of the image and of the adjoint, in [0, 2**32).
+            weigh: the derivative of the loss at the image.
+        """
+        ...
+
+
+@runtime_checkable
+class StockRenderer(Protocol):
+    """A renderer that people write loops with; see `StockLoop`."""
+
+    def stock(self) -> StockLoop:
+        """Such a loop. Cheap when asked again."""
         ...

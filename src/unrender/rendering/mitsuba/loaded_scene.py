@@ -18,7 +18,7 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
-from unrender.rendering.mitsuba.scene_loading import SceneDescription, load_resolved
+from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
 __all__ = ["LoadedScene", "loaded_scenes"]
@@ -80,7 +80,7 @@ class _Setting:
 
 
 class LoadedScene:
-    """One load of a scene description. Owns what changes in it.
+    """One load of a scene description. Owns what changes in it; but of a scene that the user has loaded, others may change it too.
 
     Args:
         description: what to load.
@@ -94,6 +94,7 @@ class LoadedScene:
 
     def __init__(self, description: SceneDescription):
         self.scene, self.source = load_resolved(description)
+        self._shared = is_loaded(description)
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
@@ -102,6 +103,7 @@ class LoadedScene:
             if _is_array(value):
                 self._own[key] = _reference(value)
         self._settings: dict[str, _Setting] = {}
+        self._held: dict[str, Any] = {}  # as the scene has them after an update; a texture keeps a copy
         _registry.add(self)
 
     def value(self, key: str) -> mi.TensorXf:
@@ -120,10 +122,11 @@ class LoadedScene:
             attached: whether they are leaves of the derivative graph.
         """
         self._restore([key for key in self._settings if key not in values])
-        changed = False
-        for key, value in values.items():
-            if key in self._settings and self._settings[key].is_of(value, attached):
-                continue
+        changed = [key for key, value in values.items() if not self._is_set(key, value, attached)]
+        # Within the backward pass of an operation of the user's graph, leaves must be all of it or all from before it: Dr.Jit (1.5)
+        # loses the gradients of a mixture.
+        for key in values if attached and changed else changed:
+            value = values[key]
             leaf = from_tensor(value, self._own[key])
             self.leaves.pop(key, None)
             if attached:
@@ -131,15 +134,25 @@ class LoadedScene:
                 self.leaves[key] = leaf
             self.parameters[key] = leaf
             self._settings[key] = _Setting(mi.TensorXf(value), attached)
-            changed = True
         if changed:
             self.parameters.update()
+            if self._shared:
+                self._held = {key: _reference(dr.detach(self.parameters[key])) for key in self._settings}
+
+    def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
+        """Whether the parameter was set to this, and the scene still holds it."""
+        if key not in self._settings or not self._settings[key].is_of(value, attached):
+            return False
+        if not self._shared:
+            return True
+        return key in self._held and _index(self.parameters[key]) == _index(self._held[key])
 
     def _restore(self, keys: list[str]) -> None:
         if not keys:
             return
         for key in keys:
             del self._settings[key]
+            self._held.pop(key, None)
             self.leaves.pop(key, None)
             self.parameters[key] = _reference(self._own[key])
         self.parameters.update()
@@ -187,6 +200,14 @@ class LoadedScene:
 
     def _spend(self) -> None:
         self._settings = {key: replace(setting, spent=True) for key, setting in self._settings.items()}
+
+
+def _index(value: Any) -> tuple[int, ...]:
+    """The variables that an array is made of."""
+    value = dr.detach(value)
+    if dr.is_tensor_v(value):
+        return (value.array.index,)
+    return (value.index,) if dr.depth_v(value) == 1 else tuple(part.index for part in value)
 
 
 def _is_array(value: Any) -> bool:

@@ -14,6 +14,7 @@ from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
+from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import ParameterInfo, Space
 
@@ -24,7 +25,8 @@ class MitsubaRenderer:
     """A Mitsuba scene, held twice (current and previous state), with path replay gradients.
 
     Args:
-        description: an XML file, a Mitsuba dictionary, or a function that returns one.
+        description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, of which there is one state
+            only: no pairs.
         max_depth: longest path in segments, >= 1.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
@@ -43,6 +45,7 @@ class MitsubaRenderer:
         self._info |= {key: poses.info(pose) for key, pose in self._poses.items()}
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], bool], MitsubaSession] = {}
+        self._stock: StockSession | None = None
         self._checked: set[tuple[tuple[str, ...], bool, Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
@@ -82,6 +85,12 @@ class MitsubaRenderer:
             session = MitsubaSession(self.pair, rest, chosen, derivatives, self.max_depth, self._sampler)
             self._sessions[names, derivatives] = session
         return self._sessions[names, derivatives]
+
+    def stock(self) -> StockSession:
+        """See `StockRenderer.stock`."""
+        if self._stock is None:
+            self._stock = StockSession(self.pair.description, self.pair.volumetric, self.max_depth)
+        return self._stock
 
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
         if key not in self._info:

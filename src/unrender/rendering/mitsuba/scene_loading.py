@@ -14,11 +14,11 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive
 from unrender.rendering.mitsuba.grid_transforms import attached_media
 
-__all__ = ["SceneDescription", "load", "load_resolved", "media"]
+__all__ = ["SceneDescription", "is_loaded", "load", "load_resolved", "media"]
 
-SceneDescription = str | Path | dict | Callable[[], Any]
+SceneDescription = str | Path | dict | Callable[[], Any] | Any
 """An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
-meshes are made twice)."""
+meshes are made twice); or a loaded `mi.Scene`, of which there is one state only."""
 
 
 def load(description: SceneDescription) -> mi.Scene:
@@ -29,10 +29,17 @@ def load(description: SceneDescription) -> mi.Scene:
     return load_resolved(description)[0]
 
 
+def is_loaded(description: SceneDescription) -> bool:
+    """Whether it is a scene in memory, of any variant, and no description of one."""
+    return type(description).__module__.partition(".")[0] == "mitsuba" and type(description).__name__ == "Scene"
+
+
 def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]:
-    """As `load`, and what was loaded: the file's path, or the dictionary."""
+    """As `load`, and what was loaded: the file's path, or the dictionary; nothing in it for a scene that was loaded before."""
     variant.ensure()
     emissive.register()
+    if is_loaded(description):
+        return _loaded_before(description), {}
     if callable(description):
         description = description()
     try:
@@ -54,9 +61,21 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
         raise InputError(f"scene {name}: Mitsuba could not load it: {_one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
+    return _with_sensor(scene), Path(description) if isinstance(description, str) else description
+
+
+def _loaded_before(scene: Any) -> mi.Scene:
+    if not isinstance(scene, mi.Scene):
+        raise InputError(
+            f"scene: it was loaded under another variant than {mi.variant()}; call unrender.use() before loading it"
+        )
+    return _with_sensor(scene)
+
+
+def _with_sensor(scene: mi.Scene) -> mi.Scene:
     if not scene.sensors():
         raise InputError("scene: it has no sensor, and nothing can be rendered without one")
-    return scene, Path(description) if isinstance(description, str) else description
+    return scene
 
 
 def _one_line(error: Exception) -> str:

@@ -22,11 +22,17 @@ from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSu
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, parameter_traits, physical_range
-from unrender.rendering.mitsuba.scene_loading import SceneDescription, media
+from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["ScenePair"]
+__all__ = ["SINGLE", "ScenePair"]
+
+SINGLE = (
+    "scene: a loaded mi.Scene has one state, and comparing two (a control variate, meta-estimation) takes two; give what it "
+    "was loaded from, the .xml file or the dictionary, or take images.Plain()"
+)
+"""Why a scene that the user has loaded cannot be a pair."""
 
 
 class ScenePair:
@@ -36,16 +42,19 @@ class ScenePair:
         description: what to load.
 
     Attributes:
+        single: whether there is one state only, since the scene was loaded by the user.
         volumetric: whether there is a participating medium.
         resolutions: (height, width) of each sensor's film, after cropping.
     """
 
     def __init__(self, description: SceneDescription):
         self.description = description
+        self.single = is_loaded(description)
         self._current = LoadedScene(description)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
-        self._grid_transforms = extinction_transforms(self._current.source) if self.volumetric else {}
+        known = self.volumetric and not self.single
+        self._grid_transforms = extinction_transforms(self._current.source) if known else {}
         self._check_media()
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
@@ -58,6 +67,8 @@ class ScenePair:
         """The first load or, with `previous`, the second one, which is made when first asked for."""
         if not previous:
             return self._current
+        if self.single:
+            raise InputError(SINGLE)
         if self._previous is None:
             self._previous = LoadedScene(self.description)
         return self._previous
@@ -100,7 +111,9 @@ class ScenePair:
         return self._films
 
     def check_separate(self, keys: list[str]) -> None:
-        """Raise `InputError` where the two loads share the object that holds a parameter."""
+        """Raise `InputError` where there are no two loads, or where they share the object that holds a parameter."""
+        if self.single:
+            raise InputError(SINGLE)
         for key in keys:
             if self.current_parameters.properties[key][2] is self.previous_parameters.properties[key][2]:
                 raise InputError(
@@ -130,7 +143,7 @@ class ScenePair:
         }
         pointers = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr().bsdf()).numpy()  # pyright: ignore[reportAttributeAccessIssue]
         kinds = {number: kind for number, kind in kinds.items() if number in pointers}
-        if kinds:  # only then is the second load worth its while
+        if kinds and not self.single:  # only then is the second load worth its while
             previous = self.tables()["bsdf"].numpy()
             kinds |= {int(previous[number]): kind for number, kind in kinds.items()}
         table = np.zeros(max(int(pointers.max(initial=0)), *kinds, 0) + 1, np.uint32)

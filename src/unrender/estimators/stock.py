@@ -1,0 +1,93 @@
+"""The gradient of the loop that people have, to be compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+
+from unrender.core import arrays, checks, trees
+from unrender.core.random import Key
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
+from unrender.estimators.path import PathGradient, PathGradientState
+from unrender.problem.problem import Problem
+from unrender.rendering.renderer import StockRenderer
+
+__all__ = ["StockGradient", "StockState"]
+
+
+@dataclass(frozen=True)
+class StockState:
+    """State between steps.
+
+    Attributes:
+        path: of the path gradient that takes its place; None where the renderer has a stock loop.
+    """
+
+    path: PathGradientState | None = None
+
+
+@register
+@dataclass(frozen=True)
+class StockGradient:
+    """The gradient of a stock Mitsuba loop: `mi.render` of each view, the loss, `dr.backward`; image and adjoint from independent
+    samples. With `optimizers.Adam`, whose steps are those of `mi.ad.Adam`, it is the loop of Mitsuba's tutorials.
+
+    The scene's film has its own reconstruction filter here, where all else in `unrender` has a box filter. Renderers other than
+    Mitsuba's answer with `PathGradient(spp=spp, adjoint_spp=spp)`, which estimates the same from the same number of samples.
+
+    Unbiased for a loss whose derivative is linear in the image; otherwise biased by the image's noise.
+
+    Args:
+        spp: samples per pixel and view of the image, and as many of the adjoint, >= 1.
+    """
+
+    spp: int = 16
+
+    def __post_init__(self):
+        checks.integer("StockGradient", "spp", self.spp, at_least=1)
+
+    @property
+    def provides(self) -> Capabilities:
+        """A gradient."""
+        return Capabilities(Gradient)
+
+    def init(self, problem: Problem, parameters: Tree) -> StockState:
+        """See `Estimator.init`. Raises `InputError` for a parameter that Mitsuba cannot differentiate."""
+        problem.renderer.prepare(list(parameters), None)
+        if isinstance(problem.renderer, StockRenderer):
+            return StockState()
+        return StockState(self._path.init(problem, parameters))
+
+    def estimate(self, problem: Problem, parameters: Tree, state: StockState, key: Key) -> tuple[Estimate, StockState]:
+        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view."""
+        renderer = problem.renderer
+        if state.path is not None or not isinstance(renderer, StockRenderer):
+            path = state.path or self._path.init(problem, parameters)
+            found, path = self._path.estimate(problem, parameters, path, key)
+            return found, StockState(path)
+        loop = renderer.stock()
+        parts, losses, images, samples = [], [], {}, 0
+        for index, view in enumerate(problem.views):
+            seeds = key.fold(index).fold(0).uint32(), key.fold(index).fold(1).uint32()
+            images[index], gradient = loop.gradient(
+                parameters,
+                view.sensor,
+                self.spp,
+                seeds,
+                lambda image, index=index: problem.loss_derivative(index, image),
+            )
+            losses.append(problem.loss_value(index, images[index]))
+            height, width = renderer.resolutions()[view.sensor]
+            samples += 2 * self.spp * height * width
+            parts.append(gradient)
+        total = reduce(trees.add, parts)
+        arrays.evaluate(total, losses)
+        loss = sum(arrays.number(value) for value in losses)
+        return Estimate(loss, total, info={"samples": samples, "images": images}), state
+
+    @property
+    def _path(self) -> PathGradient:
+        return PathGradient(spp=self.spp, adjoint_spp=self.spp)

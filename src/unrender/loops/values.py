@@ -1,0 +1,168 @@
+"""Parameters, images and gradients between a loop's framework and the renderer's own arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from unrender.core import arrays, frameworks
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.frameworks import Framework
+from unrender.core.suggestions import did_you_mean
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import ParameterInfo, Renderer
+
+__all__ = ["Exchange", "Given"]
+
+
+@dataclass(frozen=True)
+class Given:
+    """Parameters as the loop has them.
+
+    Attributes:
+        framework: of the loop.
+        values: {key: array} of it, in the order of the renderer's keys.
+    """
+
+    framework: Framework
+    values: dict[str, Any]
+
+    def detached(self) -> Given:
+        """The same values, without what the loop's graph has before them."""
+
+        def detach(x: Any) -> Any:
+            return x.detach() if frameworks.is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
+
+        return Given(self.framework, {key: detach(value) for key, value in self.values.items()})
+
+
+class Exchange:
+    """Converts between a loop's arrays and the renderer's.
+
+    Args:
+        renderer: whose arrays.
+        keys: of the parameters, in order.
+    """
+
+    def __init__(self, renderer: Renderer, keys: tuple[str, ...]):
+        self._renderer, self._keys = renderer, keys
+        self._info: dict[str, ParameterInfo] = {key: renderer.parameters()[key] for key in keys}
+        self._on_device = arrays.is_drjit(renderer.array(np.zeros(1)))
+
+    def read(self, values: Any) -> Given:
+        """What the loop gave: a mapping with at least the keys (a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`), or where
+        there is one key the array itself; None for the scene's own values. Raises `InputError`."""
+        if values is None:
+            return Given("numpy", {key: arrays.numpy(x) for key, x in self._renderer.values(list(self._keys)).items()})
+        if not isinstance(values, Mapping) and not (hasattr(values, "keys") and hasattr(values, "__getitem__")):
+            if len(self._keys) > 1:
+                raise InputError(f"Renderer: expected {{key: array}} for {', '.join(self._keys)}, got {_kind(values)}")
+            values = dict.fromkeys(self._keys, values)
+        known = list(values.keys())
+        for key in self._keys:
+            if key not in known:
+                others = [name for name in known if name not in self._keys]
+                raise InputError(f"Renderer: no value for parameter {key}{did_you_mean(key, others)}")
+        found = {key: values[key] for key in self._keys}
+        return Given(frameworks.framework(found.values(), "Renderer"), found)
+
+    def tree(self, given: Given) -> Tree:
+        """The parameters as the renderer's arrays, detached. Raises `InputError` for a shape that none has."""
+        if given.framework == "drjit" and self._on_device:
+            from unrender.rendering.mitsuba.tensors import to_tensor
+
+            found = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in given.values.items()}
+            dr.make_opaque(found)
+            return found
+        return {key: self._renderer.array(self._host(key, value)) for key, value in given.values.items()}
+
+    def attached(self, given: Given) -> Tree:
+        """As `tree`, of Dr.Jit's arrays, still attached to the derivative graph of the loop."""
+        import mitsuba as mi
+
+        def tensor(key: str, value: Any) -> Any:
+            if dr.is_tensor_v(value):
+                return value
+            flat: Any = dr.ravel(value)
+            return mi.TensorXf(flat, self._info[key].shape)
+
+        return {
+            key: tensor(key, value) if arrays.is_drjit(value) else self._renderer.array(self._host(key, value))
+            for key, value in given.values.items()
+        }
+
+    def image(self, image: Array, given: Given) -> Any:
+        """An image of the renderer as one of the loop's: float32, or float64 where its parameters are."""
+        match given.framework:
+            case "numpy":
+                return arrays.numpy(image)
+            case "drjit":
+                self._check_device()
+                return image
+            case "torch":
+                like = next(x for x in given.values.values() if frameworks.is_torch(x))
+                return frameworks.to_torch(arrays.numpy(image), like)
+
+    def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
+        """The derivative of the loop's loss by an image of this shape, as the renderer's array. Raises `InputError`."""
+        found = frameworks.shape(derivative)
+        if found != shape:
+            raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {found}")
+        if self._on_device and arrays.is_drjit(derivative):
+            return dr.detach(derivative)
+        return self._renderer.array(frameworks.host(derivative, "Renderer: the derivative of the loss"))
+
+    def gradient(self, gradient: Tree, given: Given) -> dict[str, Any]:
+        """A gradient as arrays of the loop, each of the type of its parameter."""
+        return {key: self._like(gradient[key], value, given) for key, value in given.values.items()}
+
+    def _like(self, gradient: Array, value: Any, given: Given) -> Any:
+        match given.framework:
+            case "numpy":
+                return arrays.numpy(gradient)
+            case "torch":
+                like = value if frameworks.is_torch(value) else next(filter(frameworks.is_torch, given.values.values()))
+                return frameworks.to_torch(arrays.numpy(gradient), like)
+            case "drjit":
+                if not arrays.is_drjit(value):
+                    return gradient
+                from unrender.rendering.mitsuba.tensors import from_tensor
+
+                return from_tensor(gradient, value)
+
+    def _native(self, key: str, value: Any, to_tensor: Any) -> Array:
+        if not arrays.is_drjit(value):
+            return self._renderer.array(self._host(key, value))
+        try:
+            return to_tensor(value)
+        except TypeError as error:
+            raise InputError(f"parameter {key}: expected shape {self._info[key].shape}, got {_kind(value)}") from error
+
+    def _host(self, key: str, value: Any) -> np.ndarray:
+        return self._fit(key, frameworks.host(value, f"parameter {key}"))
+
+    def _fit(self, key: str, value: Array) -> Array:
+        """Of the parameter's shape; of another resolution where it has several."""
+        shape, expected = arrays.shape(value), self._info[key].shape
+        if shape == expected:
+            return value
+        if self._info[key].resizable and len(shape) == len(expected) and shape[-1] == expected[-1] and min(shape) > 0:
+            return value
+        if expected == () and int(np.prod(shape)) == 1:
+            return arrays.reshape(value, ())
+        raise InputError(f"parameter {key}: expected shape {expected}, got {shape}")
+
+    def _check_device(self) -> None:
+        if not self._on_device:
+            raise InputError(
+                "Renderer: this renderer computes in NumPy; give its parameters as NumPy or PyTorch arrays"
+            )
+
+
+def _kind(value: Any) -> str:
+    return type(value).__name__

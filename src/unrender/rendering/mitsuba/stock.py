@@ -1,0 +1,52 @@
+"""Images and gradients as a loop of Mitsuba's own functions has them: `mi.render` with path replay, and `dr.backward`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.scene_loading import SceneDescription
+from unrender.rendering.renderer import LossWeights
+
+__all__ = ["StockSession"]
+
+
+class StockSession:
+    """A load of the scene for `mi.render` alone: its own film, with the reconstruction filter that the scene gives it.
+
+    Args:
+        description: what to load.
+        volumetric: whether there is a participating medium, which takes `prbvolpath` in place of `prb`.
+        max_depth: longest path in segments, >= 1.
+    """
+
+    def __init__(self, description: SceneDescription, volumetric: bool, max_depth: int):
+        self._loaded = LoadedScene(description)
+        kind = "prbvolpath" if volumetric else "prb"
+        self._integrator: Any = mi.load_dict({"type": kind, "max_depth": max_depth})
+
+    def gradient(
+        self, parameters: Tree, sensor: int, spp: int, seeds: tuple[int, int], weigh: LossWeights
+    ) -> tuple[mi.TensorXf, Tree]:
+        """See `StockLoop.gradient`."""
+        scene = self._loaded
+        scene.detach()  # of leaves that were differentiated before, the derivative graph is gone
+        scene.set_parameters(parameters, attached=True)
+        image = mi.render(
+            scene.scene,
+            scene.parameters,
+            sensor=sensor,
+            integrator=self._integrator,
+            spp=spp,
+            seed=mi.UInt32(seeds[0]),
+            seed_grad=mi.UInt32(seeds[1]),  # pyright: ignore[reportArgumentType]
+        )
+        seen = mi.TensorXf(dr.detach(image))
+        dr.backward(dr.sum(image * weigh(seen), axis=None))
+        gradient = scene.gradients()
+        dr.eval(gradient, seen)
+        return seen, gradient
