@@ -54,6 +54,8 @@ class Connection(H11Protocol):
         """Start the clock. Where too many strangers are connected, the oldest one's connection ends."""
         super().connection_made(transport)
         self._start_clock()
+        if len(self.connections) <= self.strangers:
+            return
         strangers = [each for each in self.connections if isinstance(each, Connection) and each._is_stranger()]
         if len(strangers) > self.strangers:
             min(strangers, key=lambda each: each.began).transport.abort()
