@@ -178,7 +178,9 @@ def test_one_pixel_at_a_time_follows_the_table_on_the_device(stratified: bool) -
     import mitsuba as mi
 
     found = two_views([(2, 2)], 4)
-    table = InverseCdfTable.of(found, np.array([1.0, 2, 3, 4]), lambda x: mi.TensorXf(mi.Float(np.float32(x).ravel()) + 0, x.shape))
+    table = InverseCdfTable.of(
+        found, np.array([1.0, 2, 3, 4]), lambda x: mi.TensorXf(mi.Float(np.float32(x).ravel()) + 0, x.shape)
+    )
     drawn = np.concatenate([table.draw(1, Key(seed), stratified).pixels.numpy() for seed in range(300)])
     assert stats.chisquare(np.bincount(drawn, minlength=4), np.array([30, 60, 90, 120])).pvalue > 1e-3
 

@@ -1,5 +1,5 @@
 # Dr.Jit's stubs know less than its functions return.
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false, reportCallIssue=false
 
 """Cameras inside media: told by the scene or found, some inside and some outside, in media that scatter and in media that emit."""
 

@@ -127,7 +127,9 @@ def check_replay(renderer: MitsubaRenderer, request: SampleRequest, key: str, re
         adjoint = session.adjoint(current, paths.paths, renderer.array(weight[None]))[key]
         pair = images[1]
         none = renderer.array(np.zeros((1, *weight.shape)))
-        own, _ = session.adjoint_pair(current, {key: current[key] * (1 + STEP)}, pair.paths, renderer.array(weight[None]), none)
+        own, _ = session.adjoint_pair(
+            current, {key: current[key] * (1 + STEP)}, pair.paths, renderer.array(weight[None]), none
+        )
         for gradient in (adjoint, own[key]):
             found = float((numbers(gradient) * numbers(current[key])).sum())
             assert found == pytest.approx(expected, rel=rel), sensor
@@ -191,10 +193,7 @@ def test_meters_agree_with_finite_differences_of_mitsuba_s_own_renders(name: str
 
     differences = np.array(
         [
-            [
-                (rendered(+step * axis, seed) - rendered(-step * axis, seed)) / (2 * step)
-                for axis in np.eye(3)
-            ]
+            [(rendered(+step * axis, seed) - rendered(-step * axis, seed)) / (2 * step) for axis in np.eye(3)]
             for seed in range(100, 100 + runs)
         ]
     )

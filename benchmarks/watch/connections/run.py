@@ -68,7 +68,10 @@ class Blocks(ur.Callback):
         self.rounds[-1][self._mode] = milliseconds
         found = json.loads(self._clients.communicate()[0])
         self.clients[self._mode].append(found)
-        print(f"{self._mode:6} {milliseconds:.2f} ms per step, the owner waits {max(found['waits']):.3f} s at most", flush=True)
+        print(
+            f"{self._mode:6} {milliseconds:.2f} ms per step, the owner waits {max(found['waits']):.3f} s at most",
+            flush=True,
+        )
 
 
 def measure(resolution: int, spp: int, rounds: int, block: float, idle: int, busy: int) -> dict[str, Any]:
@@ -88,11 +91,15 @@ def measure(resolution: int, spp: int, rounds: int, block: float, idle: int, bus
             server.terminate()
             server.wait()
     waits = {mode: [wait for of in blocks.clients[mode] for wait in of["waits"]] for mode in MODES}
-    crowd = {name: float(np.mean([of[name] for of in blocks.clients["crowd"]])) for name in ("idle", "busy", "answered")}
+    crowd = {
+        name: float(np.mean([of[name] for of in blocks.clients["crowd"]])) for name in ("idle", "busy", "answered")
+    }
     return {
         "rounds_ms": blocks.rounds,
         "speed": summary([of["owner"] / of["crowd"] for of in blocks.rounds]),
-        "waits": {mode: {"median": float(np.median(of)), "longest": max(of), "count": len(of)} for mode, of in waits.items()},
+        "waits": {
+            mode: {"median": float(np.median(of)), "longest": max(of), "count": len(of)} for mode, of in waits.items()
+        },
         "crowd": crowd,
     }
 

@@ -45,7 +45,8 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
             medium = _surrounding(scene, sensor)
             if medium is not None and not quiet:
                 _log.warning(
-                    "sensor %s: it names no medium, but stands inside one; it is rendered as standing in it", sensor.id()
+                    "sensor %s: it names no medium, but stands inside one; it is rendered as standing in it",
+                    sensor.id(),
                 )
         found.append(medium)
     return found
@@ -59,11 +60,16 @@ def _may_be_inside(scene: Any, sensor: Any) -> bool:
     if sensor.class_name() not in _AT_A_POINT or any(shape.exterior_medium() is not None for shape in shapes):
         return True
     origin = np.array(sensor.world_transform().translation().numpy(), float).reshape(3)
-    reach = 0.0 if sensor.class_name() != "ThinLensCamera" else float(np.max(mi.traverse(sensor)["aperture_radius"]))
+    reach = 0.0 if sensor.class_name() != "ThinLensCamera" else _aperture_radius(sensor)
     return any(
         bool((np.array(box.min) - reach <= origin).all() and (origin <= np.array(box.max) + reach).all())
         for box in (shape.bbox() for shape in shapes)
     )
+
+
+def _aperture_radius(lens: Any) -> float:
+    radius: Any = mi.traverse(lens)["aperture_radius"]
+    return float(np.max(np.array(radius)))
 
 
 def _surrounding(scene: Any, sensor: Any) -> Any:
@@ -93,4 +99,5 @@ def _surrounding(scene: Any, sensor: Any) -> Any:
 def medium_id(medium: Any) -> int:
     """Its registry id, 0 for None."""
     pointer: Any = mi.MediumPtr(medium)
-    return int(dr.reinterpret_array(mi.UInt32, pointer).numpy()[0])
+    number: Any = dr.reinterpret_array(mi.UInt32, pointer)
+    return int(number.numpy()[0])

@@ -53,7 +53,9 @@ class FrozenFunction:
 
 
 class _Tracing:
-    """Whether a call has run the function to record it, or tried to. An object of its own, so that recordings hold no cycle of references."""
+    """Whether a call has run the function to record it, or tried to. An object of its own, so that recordings hold no cycle of
+    references.
+    """
 
     happened = False
 

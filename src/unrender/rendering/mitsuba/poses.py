@@ -1,6 +1,7 @@
 """Rigid poses of shapes and sensors as parameters, a pose per lane.
 
-For every shape that is no emitter and carries no sensor, and for every sensor that stands for itself, the renderer offers parameters that Mitsuba does not have:
+For every shape that is no emitter and carries no sensor, and for every sensor that no shape carries, the renderer offers parameters
+that Mitsuba does not have:
 
     <id>.translation    (3,)  in units of the world; 0 as loaded
     <id>.rotation       (3,)  rotation vector, axis times angle in radians; 0 as loaded

@@ -172,7 +172,9 @@ class ScenePair:
             scene = self.previous if previous else self.current
             attached = {key: medium_id(medium) for key, medium in attached_media(scene)}
             transforms = {attached[key]: matrix for key, matrix in self._grid_transforms.items() if key in attached}
-            self._majorants[previous] = MajorantSupergrids({medium_id(medium): medium for medium in media(scene)}, transforms)
+            self._majorants[previous] = MajorantSupergrids(
+                {medium_id(medium): medium for medium in media(scene)}, transforms
+            )
         return self._majorants[previous]
 
     def _check_media(self) -> None:
