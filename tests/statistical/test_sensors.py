@@ -170,7 +170,7 @@ def test_tangents_of_a_weighted_path_are_its_derivative() -> None:
     np.testing.assert_allclose(moment, slope**2, rtol=0.02, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", METERS)
+@pytest.mark.parametrize("name", quick(METERS, "irradiancemeter"))
 def test_meters_agree_with_finite_differences_of_mitsuba_s_own_renders(name: str) -> None:
     """Other paths, another integrator, and the scene's own weighting of its sensor."""
     renderer = MitsubaRenderer(room(name), DEPTH)
@@ -203,3 +203,29 @@ def test_meters_agree_with_finite_differences_of_mitsuba_s_own_renders(name: str
     assert np.abs(z).max() < limit, (z, ours.mean(0), differences.mean(0), error)
     planted = (3.9 * ours.mean(0) - differences.mean(0)) / error
     assert np.abs(planted).min() > limit, "too noisy to see what the weight did to the gradient"
+
+
+def test_a_shape_that_carries_a_sensor_has_no_pose_and_sensors_keep_their_order() -> None:
+    """A pose of the shape would have to move the meter's rays too; one of the other shapes leaves them where they are."""
+    renderer = MitsubaRenderer(room("irradiancemeter", "orthographic"), DEPTH)
+    known = renderer.parameters()
+    assert "ball.translation" in known
+    assert not [key for key in known if key.startswith(("irradiancemeter.", "meter.")) and "translation" in key]
+    posed, still = renderer.prepare(["ball.translation"], None, False), renderer.prepare([], None)
+    at = {"ball.translation": np.zeros((1, 3), np.float32)}
+    for sensor, spp in ((0, 1 << 14), (1, 1 << 10)):
+        a = numbers(posed.image_batch(at, SampleRequest(sensor, spp, 1))).mean()
+        b = numbers(still.image({}, SampleRequest(sensor, spp, 2)).images).mean()
+        assert a == pytest.approx(b, rel=0.05)
+
+
+def test_the_vertices_of_a_shape_that_carries_a_sensor_have_no_path_gradient() -> None:
+    """Path replay does not move the rays."""
+    description = room("irradiancemeter")
+    plate = description["irradiancemeter"]
+    plate["type"] = "cube"
+    info = MitsubaRenderer(description, DEPTH).parameters()
+    moved = {key: of for key, of in info.items() if key.startswith("irradiancemeter.vertex_positions")}
+    assert [(of.differentiable, of.reason) for of in moved.values()] == [
+        (False, "it moves a shape that carries a sensor")
+    ]
