@@ -123,7 +123,7 @@ def test_a_camera_inside_renders_the_same_told_or_found() -> None:
     np.testing.assert_allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-5 * np.abs(gradients[1]).max())
 
 
-@pytest.mark.parametrize("medium", [glow, cloud])
+@pytest.mark.parametrize("medium", quick([glow, cloud], glow))
 def test_cameras_in_different_media_share_a_launch(medium: Any) -> None:
     """Lanes of one sensor get the same random numbers as if it were alone."""
     cameras = {"inside": camera(INSIDE), "outside": camera(OUTSIDE), "found": camera([0, -0.4, -0.3])}

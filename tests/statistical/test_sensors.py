@@ -170,7 +170,8 @@ def test_tangents_of_a_weighted_path_are_its_derivative() -> None:
     np.testing.assert_allclose(moment, slope**2, rtol=0.02, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", quick(METERS, "irradiancemeter"))
+@pytest.mark.slow  # in the quick tier, the replays are compared on their own paths
+@pytest.mark.parametrize("name", METERS)
 def test_meters_agree_with_finite_differences_of_mitsuba_s_own_renders(name: str) -> None:
     """Other paths, another integrator, and the scene's own weighting of its sensor."""
     renderer = MitsubaRenderer(room(name), DEPTH)

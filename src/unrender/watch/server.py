@@ -35,7 +35,7 @@ HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
 _LONGEST_COMMAND = 1024
 _LONGEST_NUMBER = 9  # digits of a run's number in an address
-_REFUSAL_SECONDS = 1.0
+_REFUSAL_SECONDS = 2.0
 _STOPS = 8.0
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; "
