@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
+import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,7 @@ import pytest
 
 import unrender as package
 from browser import chromium
+from unrender.watch import server
 
 PATIENCE = 120.0
 SOURCE = Path(package.__file__).parents[1]
@@ -135,7 +138,6 @@ def test_a_browser_sees_a_run_move_pauses_resumes_and_stops_it(problem: Path, mi
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: no such folder"),
         (["problem.toml"], "problem.toml: a file, expected a run folder"),
         ([".", "../" + "{name}"], "given twice"),
         ([".", "--port", "70000"], "--port': Input should be less than or equal to 65535"),
@@ -150,3 +152,54 @@ def test_watch_refuses_in_one_line(unrender, problem: Path, arguments: list[str]
     assert answer.status == 2
     assert message in answer.error
     assert answer.error.count("\n") == 1
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, int]]:
+    """What a browser was handed: the argument, what the file behind it says, its mode. The server serves nothing, and lets one in."""
+    found: list[tuple[str, str, int]] = []
+
+    def browse(argument: str) -> bool:
+        path = Path(urllib.request.url2pathname(argument.removeprefix("file://")))
+        found.append((argument, path.read_text(), stat.S_IMODE(path.stat().st_mode)))
+        return True
+
+    def serve(directories: list[Path], address: Any, on: Any, on_admission: Any = None) -> None:
+        served.append((directories, address))
+        if on_admission is not None:
+            path = Path(urllib.request.url2pathname(found[-1][0].removeprefix("file://")))
+            assert path.exists()
+            on_admission()
+            assert not path.parent.exists()
+
+    served: list[Any] = []
+    monkeypatch.setattr(webbrowser, "open", browse)
+    monkeypatch.setattr(server, "serve", serve)
+    monkeypatch.setattr(os, "nice", lambda by: by)
+    return found
+
+
+def test_the_browser_s_arguments_do_not_hold_the_secret(unrender, problem: Path, opened: list[Any]):
+    """Every user of the machine can read them."""
+    answer = unrender("watch", ".")
+    assert answer.status == 0
+    url = next(line.split()[-1] for line in answer.out.splitlines() if line.startswith("watching at "))
+    (argument, text, mode), token = opened[0], url.rstrip("/").rpartition("/")[2]
+    assert argument.startswith("file:///")
+    assert token not in argument
+    assert f'content="0; url={url}"' in text
+    assert mode == 0o600
+    assert unrender("watch", ".", "--no-browser").status == 0
+    assert len(opened) == 1
+
+
+def test_a_run_that_has_not_begun_is_waited_for(unrender, problem: Path, opened: list[Any]):
+    """As in `unrender run ... --out out/room & unrender watch out/room`."""
+    (problem.parent / "roam").mkdir()
+    answer = unrender("watch", "out/room", "room", "--no-browser")
+    assert answer.status == 0
+    assert answer.out.splitlines()[:2] == [
+        "out/room: no such folder yet: waiting for a run to begin there",
+        "room: no such folder yet: waiting for a run to begin there; did you mean roam?",
+    ]
+    assert not (problem.parent / "out").exists()

@@ -171,6 +171,20 @@ def test_the_device_draws_as_numpy_does() -> None:
         assert abs(np.mean(means) - 1300) < 3.5 * error + 1e-2
 
 
+@pytest.mark.parametrize("stratified", [True, False])
+def test_one_pixel_at_a_time_follows_the_table_on_the_device(stratified: bool) -> None:
+    """The one stratum is as long as the integers are many."""
+    ur.use("llvm_ad_rgb")
+    import mitsuba as mi
+
+    found = two_views([(2, 2)], 4)
+    table = InverseCdfTable.of(
+        found, np.array([1.0, 2, 3, 4]), lambda x: mi.TensorXf(mi.Float(np.float32(x).ravel()) + 0, x.shape)
+    )
+    drawn = np.concatenate([table.draw(1, Key(seed), stratified).pixels.numpy() for seed in range(300)])
+    assert stats.chisquare(np.bincount(drawn, minlength=4), np.array([30, 60, 90, 120])).pvalue > 1e-3
+
+
 # ---------------------------------------------------------------- references
 
 
@@ -299,6 +313,76 @@ def test_maps_are_made_anew_every_so_often() -> None:
         found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
         samples.append(found.info["samples"])
     assert samples == [20 + 64, 20, 20, 20, 20 + 64, 20, 20, 20, 20 + 64]
+
+
+@pytest.mark.parametrize("statistics", ["shared", "independent"])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_a_step_ages_the_map_once_however_many_batches_it_draws(statistics: Any, coupled: bool) -> None:
+    """And shows it one gradient: the second of a step would come from other pixels and fewer samples."""
+    asked = problem(noise=0.9)
+    seen: list[int] = []
+
+    @dataclasses.dataclass(frozen=True)
+    class Watched(ur.pixels.Adaptive):
+        def observe(self, problem: Any, state: Any, gradient: Any) -> Any:
+            seen.append(state.age)
+            return super().observe(problem, state, gradient)
+
+    pixels = Watched(10, refresh=4, samples=32, denoiser="none")
+    estimator = ur.MetaEstimator(coupled=coupled, statistics=statistics, pixels=pixels)
+    state = estimator.init(asked, asked.initial())
+    ages, refreshes = [], []
+    at = asked.initial()
+    for step in range(9):
+        at = {key: value + 0.01 for key, value in at.items()}
+        _, state = estimator.estimate(asked, at, state, Key(0, step))
+        ages.append(state.pixels.age)
+        refreshes.append(state.pixels.refreshes)
+    assert ages == [1, 2, 3, 4, 1, 2, 3, 4, 1]
+    assert refreshes == [1] * 4 + [2] * 4 + [3]
+    assert seen == ages
+
+
+def test_batches_of_one_step_have_other_pixels_and_the_same_probabilities() -> None:
+    asked = problem(noise=0.9)
+    for name, scheme in SCHEMES.items():
+        pixels = scheme(64, **({} if name == "uniform" else {"samples": 64, "denoiser": "none"}))
+        first, state = pixels.draw(asked, asked.initial(), pixels.init(asked, asked.initial()), Key(0))
+        again = pixels.redraw(asked, state, Key(1))
+        assert not np.array_equal(first.sample.pixels, again.sample.pixels)
+        weight_of = dict(zip(first.sample.pixels.tolist(), first.sample.weights[:, 0].tolist(), strict=True))
+        shared = [i for i, pixel in enumerate(again.sample.pixels.tolist()) if pixel in weight_of]
+        assert len(shared) > 10
+        for i in shared:
+            assert again.sample.weights[i, 0] == weight_of[int(again.sample.pixels[i])]
+        assert again.samples == 0
+
+
+def test_a_sampler_of_somebody_else_that_cannot_draw_again_still_works() -> None:
+    asked = problem(noise=0.9)
+
+    class Plainer:
+        def __init__(self) -> None:
+            self.inner = ur.pixels.Uniform(8)
+
+        def init(self, problem: Any, parameters: Any) -> Any:
+            return self.inner.init(problem, parameters)
+
+        def draw(self, problem: Any, parameters: Any, state: Any, key: Key) -> Any:
+            return self.inner.draw(problem, parameters, state, key)
+
+        def observe(self, problem: Any, state: Any, gradient: Any) -> Any:
+            return state
+
+    found = []
+    for pixels in (Plainer(), ur.pixels.Uniform(8)):
+        estimator = ur.MetaEstimator(pixels=pixels)
+        state = estimator.init(asked, asked.initial())
+        for step in range(3):
+            estimate, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
+        found.append(estimate.gradient)
+    for key in found[0]:
+        np.testing.assert_array_equal(found[0][key], found[1][key])
 
 
 def test_probabilities_that_cannot_be_estimated_are_equal() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ import typer
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.watch import server
+from unrender.watch.redirect import Redirect
 
 __all__ = ["watch"]
 
@@ -20,7 +22,9 @@ _NICE = 10
 
 
 def watch(
-    directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Run folders, under way or finished.")],
+    directories: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Run folders: of runs under way, finished, or yet to begin.")
+    ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of 127.0.0.1; 0 takes a free one.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open nothing.")] = False,
 ) -> None:
@@ -29,18 +33,37 @@ def watch(
     It is served to this machine alone, under an address that holds a secret. Ctrl-C ends the page, not the runs.
     """
     for directory in directories:
-        if not directory.is_dir():
-            siblings = [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []
-            what = "a file, expected a run folder" if directory.exists() else "no such folder"
-            raise InputError(f"{directory}: {what}{did_you_mean(directory.name, siblings)}")
+        if directory.exists() and not directory.is_dir():
+            raise InputError(f"{directory}: a file, expected a run folder")
     if len({directory.resolve() for directory in directories}) < len(directories):
         raise InputError("watch: a run folder is given twice")
+    for directory in directories:
+        if not directory.is_dir():
+            typer.echo(f"{directory}: no such folder yet: waiting for a run to begin there{_similar(directory)}")
     with server.listen(port) as opened:
         address = server.Address(opened.getsockname()[1])
         typer.echo(f"watching at {address.url}\nCtrl-C ends this page; the runs go on")
-        if not no_browser:
-            webbrowser.open(address.url)  # the socket listens already, and a browser waits
-        with contextlib.suppress(OSError):
-            os.nice(_NICE)  # what is watched goes first; only now, since the browser would inherit it
-        with contextlib.suppress(KeyboardInterrupt):
-            server.serve([directory.absolute() for directory in directories], address, opened)
+        with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
+            found = None if no_browser else _open(address, stack)  # the socket listens already, and a browser waits
+            with contextlib.suppress(OSError):
+                os.nice(_NICE)  # what is watched goes first; only now, since the browser would inherit it
+            server.serve([directory.absolute() for directory in directories], address, opened, found)
+
+
+def _similar(directory: Path) -> str:
+    """A hint at a run folder beside it whose name is nearly the same."""
+    siblings: list[str] = []
+    with contextlib.suppress(OSError):
+        siblings = [path.name for path in directory.parent.iterdir() if path.is_dir()]
+    return did_you_mean(directory.name, siblings)
+
+
+def _open(address: server.Address, stack: contextlib.ExitStack) -> Callable[[], object] | None:
+    """Open the page in a browser; returns what to call once the browser is there."""
+    try:
+        redirect = stack.enter_context(Redirect(address.url))
+    except OSError as error:
+        typer.echo(f"no browser was opened: {error.strerror or error}; open the address by hand", err=True)
+        return None
+    webbrowser.open(redirect.path.as_uri())
+    return redirect.remove

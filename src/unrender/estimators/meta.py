@@ -18,7 +18,7 @@ from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixe
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
-from unrender.pixels.base import PixelSampler
+from unrender.pixels.base import PixelSampler, RepeatableSampler
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import SQUARES, Upsampler, upsampled
 from unrender.rendering.renderer import Space
@@ -117,7 +117,8 @@ class MetaEstimator:
         coupled: take the coupled form.
         spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
         image: estimates the image that the loss sees, in the coupled form; the independent form uses plain images.
-        pixels: the pixels of a step; F and ΔF of the independent form draw their own. Mini-batches go with plain images.
+        pixels: the pixels of a step; F and ΔF of the independent form draw their own, with the same probabilities. Mini-batches go
+            with plain images.
         space: "path", "primary", or "auto": path space where all parameters share paths.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
@@ -206,7 +207,8 @@ class MetaEstimator:
         observed, samples = None, step.samples
         if self.statistics == "independent":
             again = replace(state, pixels=pixels)
-            *observed, more, pixels = take(problem, parameters, again, pair_request, fresh, key.fold(_OBSERVED))
+            further = key.fold(_OBSERVED)
+            *observed, more, pixels = take(problem, parameters, again, pair_request, fresh, further, first=False)
             samples += more.samples
         rule = meta.update_coupled if self.coupled else meta.update
         found = {
@@ -247,25 +249,42 @@ class MetaEstimator:
         return "path" if all(known[key].shares_paths for key in parameters) else "primary"
 
     def _independent(
-        self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: MetaState,
+        pair_request: PairRequest,
+        fresh: bool,
+        key: Key,
+        first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state."""
+        """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`: as for
+        `_gather`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
-        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL))
+        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL), first=first)
         F = problem.precondition(step.gradient)
         if fresh:  # no change to be estimated
             return F, trees.zeros_like(F), step, pixels
         again = replace(state, pixels=pixels)
-        pair, pixels = self._gather(problem, parameters, again, difference_spp, key.fold(_DIFFERENCE), pair_request)
+        further = key.fold(_DIFFERENCE)
+        pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
         difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
         return F, difference, replace(step, samples=step.samples + pair.samples), pixels
 
     def _coupled(
-        self, problem: Problem, parameters: Tree, state: MetaState, pair_request: PairRequest, fresh: bool, key: Key
+        self,
+        problem: Problem,
+        parameters: Tree,
+        state: MetaState,
+        pair_request: PairRequest,
+        fresh: bool,
+        key: Key,
+        first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state."""
+        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: as for `_gather`."""
         del fresh
-        step, pixels = self._gather(problem, parameters, state, self.spp or _COUPLED_SPP, key, pair_request)
+        spp = self.spp or _COUPLED_SPP
+        step, pixels = self._gather(problem, parameters, state, spp, key, pair_request, first=first)
         return problem.precondition(step.gradient), problem.precondition(step.previous), step, pixels
 
     def _gather(
@@ -276,7 +295,14 @@ class MetaEstimator:
         spp: int,
         key: Key,
         pair_request: PairRequest | None = None,
+        first: bool = True,
     ) -> tuple[GradientSample, Any]:
-        batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
+        """A gradient of pixels of its own, and the pixel sampler's next state. Where it is not the `first` of a step, that state stays: the
+        step has been counted, and its gradient observed."""
+        draw_key = key.fold(PIXELS)
+        if first or not isinstance(self.pixels, RepeatableSampler):
+            batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
+        else:
+            batch, pixels = self.pixels.redraw(problem, state.pixels, draw_key), state.pixels
         step = gather(problem, parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
-        return step, self.pixels.observe(problem, pixels, step.gradient)
+        return step, self.pixels.observe(problem, pixels, step.gradient) if first else pixels

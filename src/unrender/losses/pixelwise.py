@@ -11,20 +11,33 @@ from unrender.core.registry import register
 __all__ = ["L1", "L2", "Huber", "RelativeL2"]
 
 
-@register(position=1)
-@dataclass(frozen=True)
-class L1:
-    """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
-
-    @property
-    def linear(self) -> bool:
-        """False."""
-        return False
+class _Pixelwise:
+    """Of every loss here."""
 
     @property
     def pixelwise(self) -> bool:
         """True."""
         return True
+
+
+class _WithLinearDerivative(_Pixelwise):
+    @property
+    def linear(self) -> bool:
+        """True."""
+        return True
+
+
+class _WithNonlinearDerivative(_Pixelwise):
+    @property
+    def linear(self) -> bool:
+        """False."""
+        return False
+
+
+@register(position=1)
+@dataclass(frozen=True)
+class L1(_WithNonlinearDerivative):
+    """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
 
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""
@@ -37,18 +50,8 @@ class L1:
 
 @register(position=2)
 @dataclass(frozen=True)
-class L2:
+class L2(_WithLinearDerivative):
     """(I − R)²."""
-
-    @property
-    def linear(self) -> bool:
-        """True."""
-        return True
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
 
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""
@@ -62,7 +65,7 @@ class L2:
 
 @register(position=3)
 @dataclass(frozen=True)
-class RelativeL2:
+class RelativeL2(_WithLinearDerivative):
     """(I − R)² / (R² + ε): dark pixels count as much as bright ones.
 
     The denominator holds the reference alone, never the noisy image, so the derivative stays linear. With image and adjoint from
@@ -78,16 +81,6 @@ class RelativeL2:
     def __post_init__(self):
         checks.number("RelativeL2", "epsilon", self.epsilon, above=0.0)
 
-    @property
-    def linear(self) -> bool:
-        """True."""
-        return True
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
-
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""
         difference = image - reference
@@ -100,7 +93,7 @@ class RelativeL2:
 
 @register(position=4)
 @dataclass(frozen=True)
-class Huber:
+class Huber(_WithNonlinearDerivative):
     """(I − R)²/2 within δ of the reference, δ (|I − R| − δ/2) beyond: the derivative is I − R clamped to [−δ, δ].
 
     Args:
@@ -111,16 +104,6 @@ class Huber:
 
     def __post_init__(self):
         checks.number("Huber", "delta", self.delta, above=0.0)
-
-    @property
-    def linear(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
 
     def value(self, image: Array, reference: Array) -> Array:
         """See `Loss.value`."""

@@ -80,6 +80,10 @@ class Adaptive:
         """See `PixelSampler.draw`."""
         return self._sampler.draw(problem, parameters, state, key)
 
+    def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
+        """See `RepeatableSampler.redraw`."""
+        return self._sampler.redraw(problem, state, key)
+
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Update the mean square of the gradient's elements, where variances are `relative`."""
         return self._sampler.observe(problem, state, gradient) if self.relative else state

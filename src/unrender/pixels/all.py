@@ -39,6 +39,11 @@ class All:
         del problem, parameters, key
         return MiniBatch(None), state
 
+    def redraw(self, problem: Problem, state: AllState, key: Key) -> MiniBatch:
+        """See `RepeatableSampler.redraw`."""
+        del problem, state, key
+        return MiniBatch(None)
+
     def observe(self, problem: Problem, state: AllState, gradient: Tree) -> AllState:
         """Unchanged: the gradient is not used."""
         del problem, gradient

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from unrender.core.trees import Tree
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["MiniBatch", "PixelSampler", "check_loss"]
+__all__ = ["MiniBatch", "PixelSampler", "RepeatableSampler", "check_loss"]
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,18 @@ class PixelSampler(Protocol):
 
     def observe(self, problem: Problem, state: Any, gradient: Tree) -> Any:
         """The state after a step with this gradient, before preconditioning."""
+        ...
+
+
+@runtime_checkable
+class RepeatableSampler(PixelSampler, Protocol):
+    """A pixel sampler that can draw several mini-batches of one step: for estimators that render more than one.
+
+    Without `redraw` each further mini-batch counts as a step of the sampler: an importance map ages the faster.
+    """
+
+    def redraw(self, problem: Problem, state: Any, key: Key) -> MiniBatch:
+        """Another mini-batch of the step that `draw` returned `state` for, with the same probabilities; the state stays as it is."""
         ...
 
 

@@ -158,9 +158,14 @@ class GuidedSampler:
         traced = 0
         if not state.maps or state.age >= self.options.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
+        batch = replace(self.redraw(problem, state, key), samples=traced)
+        return batch, replace(state, age=state.age + 1)
+
+    def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
+        """See `RepeatableSampler.redraw`."""
         sample = state.table.draw(self.options.count, key.fold(1), self.options.stratified)
         maps = self._tiles(problem).split(state.shares.astype(np.float32))
-        return MiniBatch(sample, traced, dict(enumerate(maps))), replace(state, age=state.age + 1)
+        return MiniBatch(sample, probability=dict(enumerate(maps)))
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Update the running mean square of the gradient, every few steps, since preconditioning costs time.

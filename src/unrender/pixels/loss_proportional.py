@@ -53,6 +53,10 @@ class LossProportional:
         """See `PixelSampler.draw`."""
         return self._sampler.draw(problem, parameters, state, key)
 
+    def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
+        """See `RepeatableSampler.redraw`."""
+        return self._sampler.redraw(problem, state, key)
+
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Unchanged: the gradient is not used."""
         del problem, gradient

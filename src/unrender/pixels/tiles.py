@@ -196,6 +196,8 @@ def _independent(like: Array, count: int, key: Key) -> Array:
 
 
 def _stratified(like: Array, count: int, key: Key) -> Array:
+    if count == 1:  # one stratum, which is the whole interval: one integer more than 32 bits can count
+        return _independent(like, 1, key)
     stride = _RANGE // count
     jitter = arrays.random_integers(like, key.fold(0).uint32(), count, stride)
     return arrays.arange(like, count) * stride + jitter + arrays.integer(key.fold(1).uint32(), like)

@@ -53,8 +53,13 @@ class Uniform:
 
     def draw(self, problem: Problem, parameters: Tree, state: UniformState, key: Key) -> tuple[MiniBatch, UniformState]:
         """See `PixelSampler.draw`."""
-        del problem, parameters
-        return MiniBatch(state.table.draw(self.count, key, self.stratified)), state
+        del parameters
+        return self.redraw(problem, state, key), state
+
+    def redraw(self, problem: Problem, state: UniformState, key: Key) -> MiniBatch:
+        """See `RepeatableSampler.redraw`."""
+        del problem
+        return MiniBatch(state.table.draw(self.count, key, self.stratified))
 
     def observe(self, problem: Problem, state: UniformState, gradient: Tree) -> UniformState:
         """Unchanged: the gradient is not used."""

@@ -54,7 +54,6 @@ class Upsampler:
     step: int
     parameters: Tree
     shares: dict[str, float] = field(default_factory=dict)
-    _made: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
     def __post_init__(self):
         self._shapes = self.problem.shapes(self.step)
@@ -67,18 +66,12 @@ class Upsampler:
         return {key: self.array(key, value, power, factor) for key, value in tree.items()}
 
     def array(self, key: str, value: Array, power: float = 0.0, factor: float = 1.0) -> Array:
-        """Likewise of one parameter. Equal objects stay equal where nothing but the resolution changes: estimators compare them."""
-        plain = power == 0.0 and factor == 1.0
+        """Likewise of one parameter."""
         if key not in self.shares:
             return value if factor == 1.0 else value * arrays.scalar(factor, value)
-        if plain and id(value) in self._made:
-            return self._made[id(value)][1]
         way = self.problem.coarse_to_fine[key]
         fine = way.refined(arrays.numpy(value), self._shapes[key]) * (self.shares[key] ** power * factor)
-        made = arrays.like(fine, value)
-        if plain:
-            self._made[id(value)] = value, made
-        return made
+        return arrays.like(fine, value)
 
 
 @runtime_checkable

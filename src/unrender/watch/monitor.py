@@ -1,4 +1,4 @@
-"""One run folder as it is now: running, paused, finished, not there yet, or gone."""
+"""One run folder as it is now: not there yet, running, paused, finished, or gone."""
 
 from __future__ import annotations
 
@@ -65,6 +65,7 @@ class RunMonitor:
         self._last_stamps: tuple = ()
         self._last = Snapshot(path, WAITING)
         self._histories: dict[Path, HistoryReader] = {}
+        self._existed = False
         self.revision = 0
 
     def snapshot(self) -> Snapshot:
@@ -92,7 +93,8 @@ class RunMonitor:
 
     def _read(self) -> Snapshot:
         if not self.path.is_dir():
-            return Snapshot(self.path, VANISHED)
+            return Snapshot(self.path, VANISHED if self._existed else WAITING)
+        self._existed = True
         problems: list[str] = []
         status = self._try(problems, self._status)
         if status is not None and (status.status in (RUNNING, PAUSED) or not bounded_files.exists(self.path / RECORD)):

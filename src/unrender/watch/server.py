@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import math
@@ -9,7 +10,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.runs.folder.schema import COMMANDS, CONTROL
-from unrender.watch import dashboard
+from unrender.watch import connections, dashboard
 from unrender.watch.monitor import RunMonitor
 
 __all__ = ["HOST", "Address", "application", "listen", "serve"]
@@ -33,6 +34,8 @@ __all__ = ["HOST", "Address", "application", "listen", "serve"]
 HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
 _LONGEST_COMMAND = 1024
+_LONGEST_NUMBER = 9  # digits of a run's number in an address
+_REFUSAL_SECONDS = 2.0
 _STOPS = 8.0
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; "
@@ -73,53 +76,90 @@ def listen(port: int) -> socket.socket:
     try:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         found.bind((HOST, port))
-        found.listen(64)
+        found.listen(connections.BACKLOG)
     except (OSError, OverflowError) as error:
         found.close()
         raise InputError(f"--port {port}: {getattr(error, 'strerror', None) or error}") from error
     return found
 
 
-def serve(directories: Sequence[Path], address: Address, on: socket.socket) -> None:
-    """Serve the page of these run folders until Ctrl-C."""
-    config = uvicorn.Config(
-        application(directories, address),
+def serve(
+    directories: Sequence[Path], address: Address, on: socket.socket, on_admission: Callable[[], object] | None = None
+) -> None:
+    """Serve the page of these run folders until Ctrl-C.
+
+    Args:
+        directories: run folders.
+        address: where the page is.
+        on: a socket of `listen`.
+        on_admission: called once, at the first request that shows the token.
+    """
+    connections.enough_files()
+    uvicorn.Server(_config(application(directories, address, _REFUSAL_SECONDS, on_admission))).run(sockets=[on])
+
+
+def _config(page: ASGIApp) -> uvicorn.Config:
+    return uvicorn.Config(
+        page,
+        loop="asyncio",
+        http=connections.Connection,
+        backlog=connections.BACKLOG,
         log_level="error",
         access_log=False,  # which would write the secret down
         lifespan="off",
         ws="none",
         server_header=False,
-        limit_concurrency=64,
         timeout_graceful_shutdown=1,
     )
-    uvicorn.Server(config).run(sockets=[on])
 
 
-def application(directories: Sequence[Path], address: Address) -> ASGIApp:
-    """The page as an ASGI application; whatever does not carry the token is answered with 403."""
+def application(
+    directories: Sequence[Path],
+    address: Address,
+    refusal_seconds: float = 0.0,
+    on_admission: Callable[[], object] | None = None,
+) -> ASGIApp:
+    """The page as an ASGI application; whatever does not carry the token is answered with 403.
+
+    Args:
+        directories: run folders.
+        address: where the page is.
+        refusal_seconds: that a 403 lets wait for it, so that asking again and again takes no time from the runs.
+        on_admission: as for `serve`.
+    """
     page = _Page(directories)
     routes = [
         Route("/", page.full),
         Route("/update", page.update),
         Route("/picture/{name}", page.picture),
-        Route("/control/{run:int}", page.control, methods=["POST"]),
+        Route("/control/{run}", page.control, methods=["POST"]),
         Route("/{name}", _asset),
     ]
-    return _AccessControl(Starlette(routes=[Mount(f"/{address.token}", routes=routes)]), address)
+    mounted = Starlette(routes=[Mount(f"/{address.token}", routes=routes)])
+    return _AccessControl(mounted, address, refusal_seconds, on_admission)
 
 
 class _AccessControl:
     """Lets in what names this machine as its host, carries the token, and comes from no other page."""
 
-    def __init__(self, app: ASGIApp, address: Address):
+    def __init__(
+        self, app: ASGIApp, address: Address, refusal_seconds: float, on_admission: Callable[[], object] | None
+    ):
         self._app = app
         self._token = address.token.encode()
         self._port = address.port
+        self._refusal_seconds = refusal_seconds
+        self._on_admission = on_admission
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
         answer = self._refusal(scope)
+        if answer is None:
+            self._admit(scope)
+        else:
+            answer.headers["connection"] = "close"
+            await asyncio.sleep(self._refusal_seconds)
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -129,6 +169,12 @@ class _AccessControl:
             await send(message)
 
         await (answer or self._app)(scope, receive, send_with_headers)
+
+    def _admit(self, scope: Scope) -> None:
+        connections.admit(scope)
+        if self._on_admission is not None:
+            self._on_admission()
+            self._on_admission = None
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = dict(scope["headers"])
@@ -188,9 +234,11 @@ class _Page:
 
     async def control(self, request: Request) -> Response:
         """Write a command into the run's folder."""
-        number = request.path_params["run"]
-        if not 0 <= number < len(self._monitors):
+        digits = request.path_params["run"]
+        known = len(digits) <= _LONGEST_NUMBER and digits.isascii() and digits.isdigit()
+        if not known or int(digits) >= len(self._monitors):
             raise HTTPException(404)
+        number = int(digits)
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected JSON")
         body = b""

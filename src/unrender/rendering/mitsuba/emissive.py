@@ -60,7 +60,10 @@ def _plugin(variant: str) -> type:
 
         def parameters_changed(self, keys: Any) -> None:
             del keys
-            self.majorant = dr.opaque(mi.Float, self.sigma_t.max())
+            self.majorant = dr.opaque(mi.Float, dr.detach(self.sigma_t.max()))
+
+        def to_string(self) -> str:
+            return f"EmissiveMedium[\n  sigma_t = {self.sigma_t},\n  emission = {self.emission}\n]"
 
         def get_majorant(self, mei: Any, active: Any = True) -> Any:
             return mi.Color3f(self.majorant)

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "rays", "rays_of_many"]
+__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "per_sample", "rays", "rays_of_many"]
 
 
 @dataclass
@@ -98,8 +98,7 @@ def rays_of_many(
     """
     lanes = count * spp
     sampler.seed(seed, lanes)
-    index = dr.arange(mi.UInt32, lanes) // spp
-    pixel, which = dr.gather(mi.UInt32, pixels, index), dr.gather(mi.UInt32, which, index)
+    pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, which))
     width, height = dr.gather(mi.UInt32, settings.widths, which), dr.gather(mi.UInt32, settings.heights, which)
     # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.
     y = pixel // dr.maximum(width, 1)
@@ -117,6 +116,11 @@ def rays_of_many(
     )
     ray.scale_differential(spp**-0.5)
     return ray, weight
+
+
+def per_sample(of_pixel: Any, spp: int, count: int) -> Any:
+    """`mi.UInt32` of each pixel, repeated for each of its samples: count to count * spp lanes."""
+    return dr.gather(mi.UInt32, of_pixel, dr.arange(mi.UInt32, count * spp) // spp)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ _log = logging.getLogger("unrender")
 class FrozenFunction:
     """A function that Dr.Jit records at its first call and replays at later ones. Where it cannot be recorded, it is traced each time.
 
+    A replay that fails raises its error: out of memory, say, is no reason to trace at every call from then on.
+
     Mitsuba objects outside the scenes that it is handed, even unused ones, can keep Dr.Jit from recording.
 
     Args:
@@ -27,21 +29,45 @@ class FrozenFunction:
 
     def __init__(self, function: Callable[..., Any], recordable: bool = True):
         self._function = function
-        self._frozen: Callable[..., Any] | None = dr.freeze(function) if recordable else None
+        self._tracing = _Tracing()
+        self._frozen: Callable[..., Any] | None = _recorder(function, self._tracing) if recordable else None
+        self._recorded = False
 
     def __call__(self, prepare: Callable[[], None], *arguments: Any) -> Any:
         """What the function returns. `prepare` is called before each attempt, to undo what a failed one has left."""
         prepare()
         if self._frozen is None:
             return self._function(*arguments)
+        self._tracing.happened = False
         try:
-            return _without_garbage_collection(self._frozen, *arguments)
+            result = _without_garbage_collection(self._frozen, *arguments)
         except Exception as error:
+            if self._recorded and not self._tracing.happened:
+                raise
             prepare()
             result = self._function(*arguments)  # its own error is the one that counts
             self._frozen = None
             _warn(str(error).partition("\n")[0])
-            return result
+        self._recorded = True
+        return result
+
+
+class _Tracing:
+    """Whether a call has run the function to record it, or tried to. An object of its own, so that recordings hold no cycle of
+    references.
+    """
+
+    happened = False
+
+
+def _recorder(function: Callable[..., Any], tracing: _Tracing) -> Callable[..., Any]:
+    """The function, frozen. A replay does not run it, and so leaves `tracing` as it is."""
+
+    def traced(*arguments: Any) -> Any:
+        tracing.happened = True
+        return function(*arguments)
+
+    return dr.freeze(traced)
 
 
 def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -> Any:

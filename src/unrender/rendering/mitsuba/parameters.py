@@ -71,11 +71,14 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
         return ParameterTraits(False, None, "", medium=volume, phase=phase)
     if any(isinstance(n, mi.Sensor) for n in chain):
         return ParameterTraits(True, None, "it moves the sensor")
-    if any(isinstance(n, mi.Shape) for n in chain):
+    shapes = [n for n in chain if isinstance(n, mi.Shape)]
+    if shapes:
         if leaf.startswith(("vertex_color", "face_color")) or (leaf.startswith(("vertex_", "face_")) and leaf not in (
             "vertex_positions", "vertex_normals", "vertex_texcoords"
         )):  # fmt: skip
             return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
+        if shapes[-1].is_sensor():
+            return ParameterTraits(True, None, "it moves a shape that carries a sensor", replayable=False)
         return ParameterTraits(True, None, "it moves a shape")
     return ParameterTraits(True, None, "it is neither a material's nor an emitter's")
 

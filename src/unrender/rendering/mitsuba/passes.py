@@ -24,6 +24,7 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 __all__ = [
     "AdjointPairPass",
     "AdjointPass",
+    "CameraPaths",
     "ImagePairPass",
     "ImagePass",
     "Kernel",
@@ -66,8 +67,8 @@ class Pass(ABC):
         """What is handed to the kernel as the scene."""
         return pair.loaded(self.previous).scene
 
-    def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int) -> Tables:
-        """The tables that the kernel looks up."""
+    def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
+        """The tables that the kernel looks up; `sensor`: None where each pixel has its own."""
         tables = self._surface_tables(pair, delta)
         if pair.volumetric:
             tables = {**tables, **pair.media(self.previous, sensor), **pair.majorants(self.previous, self.pair)}
@@ -86,24 +87,66 @@ class Pass(ABC):
             numbers = sampler.clone()
             with dr.suspend_grad():
                 ray, ray_weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
-
-                def sample(mode, replay=()):
-                    return _sample(kernel, mode, scene, tables, numbers, ray, replay, self.pair)
-
-                return self.trace(sample, ray_weight, size, *own)
+                if sensors is not None and "camera" in tables:
+                    of_lane = film.per_sample(sensors[1], size.spp, size.pixels)
+                    tables = {**tables, "camera": dr.gather(mi.UInt32, tables["camera"], of_lane)}
+                paths = CameraPaths(kernel, scene, tables, numbers, ray, ray_weight, self.pair)
+                return self.trace(paths, size, *own)
 
         return launch
 
     @abstractmethod
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """Trace the camera rays.
 
         Args:
-            sample: of the mode and what is replayed, `_sample` of these rays.
-            ray_weight: the sensor's weight per lane.
+            paths: those that begin on the rays.
             size: what the kernel is compiled for.
             own: the pass's own arrays.
         """
+
+
+class CameraPaths:
+    """The paths that begin on a sensor's rays. What they carry is weighted by the sensor here, and nowhere else: the kernel knows nothing
+    of a ray's weight, which need not be 1 (an irradiancemeter's is π). No dataclass: Dr.Jit would take it for state of its loops.
+
+    Args:
+        kernel: what traces them.
+        scene, tables, sampler, ray, pair: of `PathKernel.sample`.
+        weight: the sensor's, per ray and channel.
+    """
+
+    def __init__(
+        self, kernel: Kernel, scene: mi.Scene, tables: Tables, sampler: Any, ray: Any, weight: mi.Spectrum, pair: bool
+    ):
+        self._kernel, self._scene, self._tables, self._sampler = kernel, scene, tables, sampler
+        self._ray, self._weight, self._pair = ray, weight, pair
+
+    def radiance(self) -> tuple[Any, Any]:
+        """The weighted radiance per lane of the current and, for a pair, of the previous state, else None."""
+        L, Lₚ = self._sample(dr.ADMode.Primal)
+        return L * self._weight, None if Lₚ is None else Lₚ * self._weight
+
+    def backward(self, *states: tuple[Any, Any]) -> None:
+        """Replay the paths backward.
+
+        Args:
+            states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, of the current
+                and, for a pair, of the previous state.
+        """
+        self._sample(dr.ADMode.Backward, tuple(ReplayState(δ * self._weight, self._replayed(L)) for δ, L in states))
+
+    def forward(self, radiance: Any) -> Any:
+        """The derivative of the weighted radiance along the tangents, per lane; `radiance` is that of the primal pass."""
+        δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),))
+        return δ * self._weight
+
+    def _replayed(self, radiance: Any) -> Any:
+        """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay."""
+        return dr.select(self._weight != 0, radiance / self._weight, 0)
+
+    def _sample(self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = ()) -> tuple[Any, Any]:
+        return self._kernel.sample(mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair)
 
 
 @dataclass(frozen=True)
@@ -115,10 +158,9 @@ class ImagePass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """The radiance of each lane."""
-        L, _ = sample(dr.ADMode.Primal)
-        return L * ray_weight
+        return paths.radiance()[0]
 
 
 @dataclass(frozen=True)
@@ -130,10 +172,9 @@ class ImagePairPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {**pair.tables(), "delta": delta}
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """The radiance of each lane, of the current and of the previous state."""
-        L, Lₚ = sample(dr.ADMode.Primal)
-        return L * ray_weight, Lₚ * ray_weight
+        return paths.radiance()
 
 
 @dataclass(frozen=True)
@@ -142,11 +183,10 @@ class AdjointPass(Pass):
 
     previous: bool = False
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> None:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
         """`own`: the radiance that the primal pass returned, and the film's weights."""
         radiance, weights = own
-        δL = film.film_adjoint(weights, size.spp, size.pixels) * ray_weight
-        sample(dr.ADMode.Backward, ((δL, radiance),))
+        paths.backward((film.film_adjoint(weights, size.spp, size.pixels), radiance))
 
 
 @dataclass(frozen=True)
@@ -158,12 +198,11 @@ class AdjointPairPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {**pair.tables(), "delta": delta}
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> None:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
         """`own`: as for `AdjointPass`, of the current and then of the previous state."""
         radiance, weights, radianceₚ, weightsₚ = own
-        δL = film.film_adjoint(weights, size.spp, size.pixels) * ray_weight
-        δLₚ = film.film_adjoint(weightsₚ, size.spp, size.pixels) * ray_weight
-        sample(dr.ADMode.Backward, ((δL, radiance), (δLₚ, radianceₚ)))
+        δL, δLₚ = (film.film_adjoint(of_state, size.spp, size.pixels) for of_state in (weights, weightsₚ))
+        paths.backward((δL, radiance), (δLₚ, radianceₚ))
 
 
 @dataclass(frozen=True)
@@ -172,11 +211,10 @@ class TangentPass(Pass):
 
     needs_tangents: ClassVar[bool] = True
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """`own`: the radiance that the primal pass returned."""
         (radiance,) = own
-        δ, _ = sample(dr.ADMode.Forward, ((None, radiance),))
-        return dr.square(δ * ray_weight)
+        return dr.square(paths.forward(radiance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,12 +256,12 @@ class PosesPass(Pass):
                 ray, ray_weight = film.rays(camera, repeating, seed, size.spp, pixels, size.pixels, self.copies)
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
-                L, _ = _sample(kernel, dr.ADMode.Primal, assembly.static, None, repeating, ray, geometry=assembly)
+                L, _ = kernel.sample(dr.ADMode.Primal, assembly.static, {}, repeating, ray, geometry=assembly)
                 return L * ray_weight
 
         return launch
 
-    def trace(self, sample: Callable[..., Any], ray_weight: mi.Spectrum, size: LaunchSize, *own: Any) -> Any:
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """Never called: `function` traces all copies."""
         raise NotImplementedError
 
@@ -240,9 +278,3 @@ def _camera_rays(
         return film.rays(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
     films, which = sensors
     return film.rays_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
-
-
-def _sample(kernel, mode, scene, tables, sampler, ray, replay=(), pair=False, geometry=None) -> tuple[Any, Any]:
-    """Call the kernel; `replay`: (loss derivative, radiance of the primal pass) per lane, of the current and of the previous state."""
-    states = tuple(ReplayState(*of_state) for of_state in replay)
-    return kernel.sample(mode, scene, tables or {}, sampler, ray, states, pair, geometry)

@@ -1,6 +1,7 @@
 """Rigid poses of shapes and sensors as parameters, a pose per lane.
 
-For every shape that is no emitter and for every sensor, the renderer offers parameters that Mitsuba does not have:
+For every shape that is no emitter and carries no sensor, and for every sensor that no shape carries, the renderer offers parameters
+that Mitsuba does not have:
 
     <id>.translation    (3,)  in units of the world; 0 as loaded
     <id>.rotation       (3,)  rotation vector, axis times angle in radians; 0 as loaded
@@ -60,8 +61,8 @@ class PoseKey:
 
 def keys(scene: Any) -> dict[str, PoseKey]:
     """The pose parameters that a scene has, by key."""
-    shapes = [shape.id() for shape in scene.shapes() if not shape.is_emitter()]
-    sensors = [sensor.id() for sensor in scene.sensors()]
+    shapes = [shape.id() for shape in scene.shapes() if not (shape.is_emitter() or shape.is_sensor())]
+    sensors = [sensor.id() for sensor in scene.sensors() if sensor.get_shape() is None]
     found: dict[str, PoseKey] = {}
     for target in shapes + sensors:
         if _NAMELESS.fullmatch(target) or (shapes + sensors).count(target) > 1:
@@ -143,7 +144,11 @@ class PosedScene:
         posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
         rest = [shape for shape in shapes if shape.id() not in posed]
         rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-        self.static = _scene([*rest, *scene.sensors()])
+        carried = {sensor.id(): sensor.get_shape() for sensor in scene.sensors()}
+        carriers = [shape.id() for shape in carried.values() if shape is not None]
+        # In the order of the scene's sensors, since a request names one by its index: a shape brings the one that it carries.
+        sensors = [sensor if carried[sensor.id()] is None else carried[sensor.id()] for sensor in scene.sensors()]
+        self.static = _scene([*(item for item in rest if item.id() not in carriers), *sensors])
         self.parts = {name: _scene([shape]) for name, shape in posed.items()}
         self._centres = _centres(scene, targets)
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film
+from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
@@ -59,7 +60,8 @@ class ScenePair:
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
-        self._media: dict[tuple[bool, int], dict[str, mi.UInt32]] = {}
+        self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
+        self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
         self._films: film.Films | None = None
 
@@ -100,14 +102,9 @@ class ScenePair:
             self._previous.clear_gradients()
 
     def films(self) -> film.Films:
-        """Of all sensors. Raises `InputError` where they stand in different media."""
+        """Of all sensors."""
         if self._films is None:
-            sensors = self.current.sensors()
-            if len({_id(sensor.get_medium()) for sensor in sensors}) > 1:
-                raise InputError(
-                    "pixels: the sensors stand in different media, so their pixels cannot be drawn together"
-                )
-            self._films = film.Films.of(sensors)
+            self._films = film.Films.of(self.current.sensors())
         return self._films
 
     def check_separate(self, keys: list[str]) -> None:
@@ -151,17 +148,20 @@ class ScenePair:
             table[number] = kind
         return mi.UInt32(table)
 
-    def media(self, previous: bool, sensor: int) -> dict[str, mi.UInt32]:
-        """Tables of one of the two scenes {"camera" | "emits": UInt32}: the registry id of the medium that a sensor says it stands in, 0
-        for none; by registry ids, 1 for media that emit."""
+    def media(self, previous: bool, sensor: int | None) -> dict[str, mi.UInt32]:
+        """Tables of one of the two scenes {"camera" | "emits": UInt32}: the registry id of the medium that a sensor stands in, 0 for none,
+        or of each sensor; by registry ids, 1 for media that emit."""
         if (previous, sensor) not in self._media:
             scene = self.previous if previous else self.current
-            camera = scene.sensors()[sensor].get_medium()
-            found = {_id(medium): emissive.emits(medium) for medium in media(scene)}
+            if previous not in self._cameras:
+                self._cameras[previous] = [medium_id(medium) for medium in camera_media(scene, quiet=previous)]
+            cameras = self._cameras[previous]
+            camera = mi.UInt32(cameras) if sensor is None else dr.opaque(mi.UInt32, cameras[sensor])
+            found = {medium_id(medium): emissive.emits(medium) for medium in media(scene)}
             emits = np.zeros(max(found, default=0) + 1, np.uint32)
             for number, shines in found.items():
                 emits[number] = shines
-            tables = {"camera": dr.opaque(mi.UInt32, _id(camera)), "emits": mi.UInt32(emits)}
+            tables = {"camera": camera, "emits": mi.UInt32(emits)}
             self._media[previous, sensor] = tables
         return self._media[previous, sensor]
 
@@ -183,9 +183,11 @@ class ScenePair:
     def _grids(self, previous: bool) -> MajorantSupergrids:
         if previous not in self._majorants or not self._majorants[previous].fits():
             scene = self.previous if previous else self.current
-            attached = {key: _id(medium) for key, medium in attached_media(scene)}
+            attached = {key: medium_id(medium) for key, medium in attached_media(scene)}
             transforms = {attached[key]: matrix for key, matrix in self._grid_transforms.items() if key in attached}
-            self._majorants[previous] = MajorantSupergrids({_id(medium): medium for medium in media(scene)}, transforms)
+            self._majorants[previous] = MajorantSupergrids(
+                {medium_id(medium): medium for medium in media(scene)}, transforms
+            )
         return self._majorants[previous]
 
     def _check_media(self) -> None:
@@ -258,13 +260,8 @@ class ScenePair:
         return key.endswith("data") and len(shape) == axes
 
 
-def _id(medium: mi.Medium | None) -> int:
-    """Its registry id, 0 for None."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium)).numpy()[0])  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def _media_ids(scene: mi.Scene) -> mi.UInt32:
-    return mi.UInt32([0, *(_id(medium) for medium in media(scene))])
+    return mi.UInt32([0, *(medium_id(medium) for medium in media(scene))])
 
 
 def _table(current: Any, previous: Any) -> mi.UInt32:

@@ -248,7 +248,7 @@ class MitsubaSession:
             self._functions[key] = FrozenFunction(traced, self._recordable)
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
-        tables = task.tables(pair, self._delta_table, request.sensor)
+        tables = task.tables(pair, self._delta_table, None if several else request.sensor)
         seed = mi.UInt32(request.seed)
         before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
         return self._functions[key](before, task.scene(pair), scenes, tables, seed, request.pixels, sensors, *own)

@@ -206,9 +206,12 @@ class VolumePair:
 
     def _sample_emitter(
         self, context: VolumeContext, path: VolumePathState, vertex: Vertex, sampler: Any, noise: Any
-    ) -> tuple[list[Spectrum], ConnectionSample]:
-        """Ld of each state, by next-event estimation, and a point of the connection."""
+    ) -> tuple[list[Spectrum], ConnectionSample | None]:
+        """Ld of each state, by next-event estimation, and a point of the connection, where derivatives of media are looked for."""
         si = vertex.si
+        if not context.scene.emitters():  # nothing to connect to; paths have the same random numbers all the same
+            sampler.next_2d()
+            return [mi.Spectrum(0) for _ in range(context.state_count)], None
         smooth = mi.has_flag(vertex.bsdfs[0].flags(), mi.BSDFFlags.Smooth)
         at_medium = vertex.scatters & path.medium.use_emitter_sampling()
         at_surface = vertex.meets & vertex.may_scatter & smooth
@@ -222,7 +225,7 @@ class VolumePair:
                 context, si.to_local(ds.d), ds.d, at_surface & found.active, at_medium & found.active
             )
             β = [throughput * passed for throughput, passed in zip(path.β, T, strict=True)]
-            return found.contributions(β, values, pdf), sample
+            return found.contributions(β, values, pdf), sample if self.differentiate_media else None
 
     def _sample_direction(self, context: VolumeContext, vertex: Vertex, sampler: Any) -> SampledDirection:
         meets, scatters = vertex.meets, vertex.scatters
@@ -246,7 +249,7 @@ class VolumePair:
         context: VolumeContext,
         path: VolumePathState,
         flight: Flight,
-        connection: ConnectionSample,
+        connection: ConnectionSample | None,
         contributions: tuple[Sequence[Spectrum], ...],
     ) -> None:
         """Back-propagate the derivative of this segment and vertex, or carry tangents forward through them.
@@ -258,9 +261,10 @@ class VolumePair:
         with dr.resume_grad():
             Lo = [e + d + L * relative(value) for e, d, L, value in zip(Le, Ld, path.L, values, strict=True)]
             if self.differentiate_media:
+                Lo = [m + rest for m, rest in zip(flight.derivatives, Lo, strict=True)]
+            if connection is not None:
                 depths = [connection.optical_depth(medium) for medium in context.states.media(connection.medium)]
-                by_medium = [f - dr.detach(d) * τ for f, d, τ in zip(flight.derivatives, Ld, depths, strict=True)]
-                Lo = [m + rest for m, rest in zip(by_medium, Lo, strict=True)]
+                Lo = [rest - dr.detach(d) * τ for rest, d, τ in zip(Lo, Ld, depths, strict=True)]
             if context.forward:
                 path.δL += dr.forward_to(Lo[0])
             else:

@@ -1,0 +1,103 @@
+"""Which medium each sensor of a scene stands in, also where the scene's description does not say it.
+
+Mitsuba takes a sensor without a `medium` to stand in none: a camera in the middle of a cloud then sees nothing of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.rendering.mitsuba.scene_loading import media
+
+__all__ = ["camera_media", "medium_id"]
+
+_log = logging.getLogger("unrender")
+
+_RAYS = 8
+"""Camera rays along each axis of the film."""
+
+_SURFACES = 64
+"""That a ray may pass before it meets the boundary of a medium."""
+
+_AT_A_POINT = ("PerspectiveCamera", "ThinLensCamera", "RadianceMeter")
+
+
+def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
+    """The medium of each sensor, or None.
+
+    A sensor's own `medium` counts. Where it has none, its rays are followed to the first boundary of a medium: what lies on their side
+    of it, for most of them, is the sensor's. Logs a warning where that is a medium.
+
+    Args:
+        scene: `mitsuba.Scene`.
+        quiet: log nothing.
+    """
+    found = []
+    for sensor in scene.sensors():
+        medium = sensor.get_medium()
+        if medium is None and _may_be_inside(scene, sensor):
+            medium = _surrounding(scene, sensor)
+            if medium is not None and not quiet:
+                _log.warning(
+                    "sensor %s: it names no medium, but stands inside one; it is rendered as standing in it",
+                    sensor.id(),
+                )
+        found.append(medium)
+    return found
+
+
+def _may_be_inside(scene: Any, sensor: Any) -> bool:
+    """False only where no shape with a medium can be around the sensor, which costs no kernel to find out."""
+    shapes = [shape for shape in scene.shapes() if shape.is_medium_transition()]
+    if not shapes:
+        return False
+    if sensor.class_name() not in _AT_A_POINT or any(shape.exterior_medium() is not None for shape in shapes):
+        return True
+    origin = np.array(sensor.world_transform().translation().numpy(), float).reshape(3)
+    reach = 0.0 if sensor.class_name() != "ThinLensCamera" else _aperture_radius(sensor)
+    return any(
+        bool((np.array(box.min) - reach <= origin).all() and (origin <= np.array(box.max) + reach).all())
+        for box in (shape.bbox() for shape in shapes)
+    )
+
+
+def _aperture_radius(lens: Any) -> float:
+    radius: Any = mi.traverse(lens)["aperture_radius"]
+    return float(np.max(np.array(radius)))
+
+
+def _surrounding(scene: Any, sensor: Any) -> Any:
+    """The medium that most of the sensor's rays which meet a boundary come from, or None."""
+    x, y = (np.mgrid[:_RAYS, :_RAYS].reshape(2, -1) + 0.5) / _RAYS
+    position: Any = mi.Point2f(mi.Float(x), mi.Float(y))
+    aperture: Any = mi.Point2f(mi.Float(y), mi.Float(x))
+    ray: Any = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), 0.5, position, aperture)[0]
+    active = mi.Bool(np.full(_RAYS**2, True))
+    votes: Counter[int] = Counter()
+    for _ in range(_SURFACES):
+        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        meets = active & si.is_valid() & si.is_medium_transition()
+        before = dr.reinterpret_array(mi.UInt32, si.target_medium(-ray.d))
+        active &= si.is_valid() & ~meets
+        ray = si.spawn_ray(ray.d)
+        dr.eval(meets, before, active, ray)
+        votes.update(np.array(before)[np.array(meets)].tolist())
+        if not dr.any(active):
+            break
+    if not votes:
+        return None
+    number = votes.most_common(1)[0][0]
+    return next((medium for medium in media(scene) if medium_id(medium) == number), None)
+
+
+def medium_id(medium: Any) -> int:
+    """Its registry id, 0 for None."""
+    pointer: Any = mi.MediumPtr(medium)
+    number: Any = dr.reinterpret_array(mi.UInt32, pointer)
+    return int(number.numpy()[0])

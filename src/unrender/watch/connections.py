@@ -1,0 +1,94 @@
+"""Connections of the live page: how long each may take to ask, and how many may be open that have not shown the token.
+
+Whoever has an account on this machine can connect to 127.0.0.1. Connections that ask nothing, ask slowly, or ask without the token
+must not keep the owner's browser out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+__all__ = ["BACKLOG", "Connection", "admit", "enough_files"]
+
+BACKLOG = 1024
+"""Connections that may wait to be accepted; accepting them all at once must not use up the process's files."""
+
+_STRANGERS = 768
+"""Open connections whose last request did not show the token, at most: another one ends the oldest of them."""
+
+_FILES = 4096
+"""Open files that the server asks the system for."""
+
+_ADMITTED = "unrender.admitted"
+
+
+def admit(scope: Any) -> None:
+    """Mark the request of an ASGI scope as one that showed the token."""
+    scope.setdefault("state", {})[_ADMITTED] = True
+
+
+class Connection(H11Protocol):
+    """One connection, which must bring each whole request, body included, within `seconds_to_ask`."""
+
+    seconds_to_ask = 10.0
+    strangers = _STRANGERS
+
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
+        self.began = time.monotonic()
+        self._deadline: asyncio.TimerHandle | None = None
+
+    @property
+    def admitted(self) -> bool:
+        """Whether the last request showed the token."""
+        return bool(self.scope) and _ADMITTED in self.scope.get("state", {})
+
+    def _is_stranger(self) -> bool:
+        return not self.admitted and not self.transport.is_closing()
+
+    def connection_made(self, transport: Any) -> None:
+        """Start the clock. Where too many strangers are connected, the oldest one's connection ends."""
+        super().connection_made(transport)
+        self._start_clock()
+        if len(self.connections) <= self.strangers:
+            return
+        strangers = [each for each in self.connections if isinstance(each, Connection) and each._is_stranger()]
+        if len(strangers) > self.strangers:
+            min(strangers, key=lambda each: each.began).transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """The clock runs from a request's first byte to its last; answering may take longer."""
+        if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
+            self._start_clock()
+        super().data_received(data)
+        if self.cycle is not None and not self.cycle.more_body and not self.cycle.response_complete:
+            self._stop_clock()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop the clock."""
+        self._stop_clock()
+        super().connection_lost(exc)
+
+    def _start_clock(self) -> None:
+        self._deadline = self.loop.call_later(self.seconds_to_ask, self.transport.abort)
+
+    def _stop_clock(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+
+def enough_files() -> None:
+    """Raise this process's limit of open files, where the system has such a limit and lets it be raised."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

@@ -1,0 +1,166 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportReturnType=false, reportCallIssue=false
+
+"""Cameras inside media: told by the scene or found, some inside and some outside, in media that scatter and in media that emit."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from tiers import quick
+from unrender.rendering.mitsuba.camera_media import camera_media
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+SIZE = 6
+INSIDE, OUTSIDE = [0.1, -0.5, 0.2], [0, -5, 2.2]
+
+
+def grid(values: np.ndarray) -> dict[str, Any]:
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    return {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(np.float32(values)),
+        "raw": True,
+        "to_world": place,
+    }
+
+
+def glow() -> dict[str, Any]:
+    rng = np.random.default_rng(3)
+    return {
+        "type": "emissive",
+        "sigma_t": grid(rng.uniform(0.2, 2, (4, 4, 4, 1))),
+        "emission": grid(rng.uniform(0.2, 0.9, (4, 4, 4, 3))),
+    }
+
+
+def cloud() -> dict[str, Any]:
+    return {"type": "heterogeneous", "sigma_t": grid(np.full((4, 4, 4, 1), 0.8)), "albedo": 0.8}
+
+
+def camera(origin: list[float], kind: str = "perspective", **more: Any) -> dict[str, Any]:
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at(origin, [0, 1, 0], [0, 0, 1])
+    return {"type": kind, "to_world": to_world, "film": film, **more}
+
+
+def scene(medium: dict[str, Any], cameras: dict[str, dict[str, Any]], told: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A cube of the medium with a stone in it, under a sky where the medium does not shine itself."""
+    ref = {"type": "ref", "id": "air"}
+    found: dict[str, Any] = {
+        "type": "scene",
+        "air": {**medium, "id": "air"},
+        "body": {"type": "cube", "bsdf": {"type": "null"}, "interior": ref},
+        "stone": {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.2, "bsdf": {"type": "diffuse"}},
+    }
+    if medium["type"] != "emissive":
+        found["sky"] = {"type": "constant"}
+    return {**found, **{name: {**of, **({"medium": ref} if name in told else {})} for name, of in cameras.items()}}
+
+
+def inside_of(description: dict[str, Any]) -> list[bool]:
+    return [medium is not None for medium in camera_media(mi.load_dict(description))]
+
+
+def test_a_camera_that_names_no_medium_is_found_to_stand_in_one(caplog: pytest.LogCaptureFixture) -> None:
+    """A pinhole, a lens and parallel rays inside; one outside, one that looks away, and one beside a second cube that has no medium."""
+    cameras = {
+        "pinhole": camera(INSIDE),
+        "lens": camera(INSIDE, "thinlens", aperture_radius=0.05, focus_distance=1.0),
+        "parallel": camera([0.1, -0.9, 0.2], "orthographic"),
+        "meter": {"type": "radiancemeter", "origin": INSIDE, "direction": [0, 1, 0], "film": camera(INSIDE)["film"]},
+        "outside": camera(OUTSIDE),
+        "away": {**camera(OUTSIDE), "to_world": mi.ScalarTransform4f().look_at(OUTSIDE, [0, -9, 2], [0, 0, 1])},
+        "above": camera([0, 0, 5]),
+    }
+    cameras["meter"]["film"] = {**cameras["meter"]["film"], "width": 1, "height": 1}
+    description = scene(cloud(), cameras)
+    with caplog.at_level(logging.WARNING, "unrender"):
+        assert inside_of(description) == [True, True, True, True, False, False, False]
+    said = [record.getMessage() for record in caplog.records]
+    assert [line.split(":")[0] for line in said] == ["sensor pinhole", "sensor lens", "sensor parallel", "sensor meter"]
+
+
+def test_what_a_camera_says_itself_counts(caplog: pytest.LogCaptureFixture) -> None:
+    description = scene(cloud(), {"inside": camera(INSIDE), "outside": camera(OUTSIDE)}, told=("inside", "outside"))
+    with caplog.at_level(logging.WARNING, "unrender"):
+        assert inside_of(description) == [True, True]
+    assert not caplog.records
+
+
+def test_a_camera_behind_the_walls_of_a_room_in_a_medium_is_found() -> None:
+    """Its rays pass what bounds no medium."""
+    description = scene(cloud(), {"inside": camera(INSIDE)})
+    for axis in range(3):
+        for side in (-0.8, 0.8):
+            at = np.eye(3)[axis] * side
+            up = np.roll(np.eye(3)[axis], 1)
+            wall = mi.ScalarTransform4f().look_at(at.tolist(), [0, 0, 0], up.tolist()).scale(0.8)
+            description[f"wall_{axis}_{side < 0}"] = {"type": "rectangle", "to_world": wall}
+    assert inside_of(description) == [True]
+
+
+def test_a_camera_inside_renders_the_same_told_or_found() -> None:
+    """To the bit, image and gradient; it was black for a medium that emits."""
+    images, gradients = [], []
+    key = "air.emission.data"
+    for told in ((), ("camera",)):
+        renderer = MitsubaRenderer(scene(glow(), {"camera": camera(INSIDE)}, told), 2)
+        session = renderer.prepare([key], None)
+        rendering = session.image(renderer.values([key]), SampleRequest(0, 16, 1))
+        weight = renderer.array(np.ones((1, SIZE, SIZE, 3)))
+        gradients.append(np.array(session.adjoint(renderer.values([key]), rendering.paths, weight)[key]))
+        images.append(np.array(rendering.images))
+    assert images[0].mean() > 0.1
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-5 * np.abs(gradients[1]).max())
+
+
+@pytest.mark.parametrize("medium", quick([glow, cloud], glow))
+def test_cameras_in_different_media_share_a_launch(medium: Any) -> None:
+    """Lanes of one sensor get the same random numbers as if it were alone."""
+    cameras = {"inside": camera(INSIDE), "outside": camera(OUTSIDE), "found": camera([0, -0.4, -0.3])}
+    renderer = MitsubaRenderer(scene(medium(), cameras, ("inside",)), 3)
+    session, count = renderer.prepare([], None), SIZE * SIZE
+    pixels = mi.UInt32(np.arange(count, dtype=np.uint32))
+    shown = []
+    for sensor in range(3):
+        of_pixel = mi.UInt32(np.full(count, sensor, np.uint32))
+        together = session.image({}, SampleRequest(0, 4, 5, 1, pixels, of_pixel)).images
+        alone = session.image({}, SampleRequest(sensor, 4, 5, 1, pixels)).images
+        # Rounding of the ray turns a few collisions.
+        assert np.isclose(np.array(together), np.array(alone), rtol=1e-4).mean() > 0.85
+        shown.append(np.array(alone).mean())
+    assert min(shown) > 0.05
+    assert len(set(shown)) == 3
+    mixed = mi.UInt32(np.arange(count, dtype=np.uint32) % 3)
+    image = np.array(session.image({}, SampleRequest(0, 256, 6, 1, pixels, mixed)).images)[0]
+    for sensor in range(3):
+        alone = np.array(session.image({}, SampleRequest(sensor, 256, 7, 1, pixels)).images)[0]
+        chosen = np.arange(count) % 3 == sensor
+        assert image[chosen].mean() == pytest.approx(alone[chosen].mean(), rel=0.1)
+
+
+@pytest.mark.parametrize("part", quick(["emission", "sigma_t"], "sigma_t"))
+def test_adaptive_pixels_inside_a_medium_that_emits(part: str) -> None:
+    """Without any other emitter, and with cameras inside and outside; forward mode failed on the extinction."""
+    cameras = {"inside": camera(INSIDE), "outside": camera(OUTSIDE)}
+    key = f"air.{part}.data"
+    reference = np.full((SIZE, SIZE, 3), 0.3, np.float32)
+    views = [ur.View(reference, sensor=sensor) for sensor in (0, 1)]
+    found = ur.Problem(lambda: scene(glow(), cameras), [ur.Parameter(key, 0.5)], views, max_depth=2)
+    estimator = ur.PathGradient(pixels=ur.pixels.Adaptive(64, denoiser="none"), spp=2)
+    result = ur.optimize(found, estimator, ur.optimizers.Adam(), steps=2)
+    assert np.isfinite([row["loss"] for row in result.history]).all()
+    assert not np.allclose(np.array(result.parameters[key]), 0.5)
+
+
+def test_a_medium_that_emits_tells_what_it_is() -> None:
+    assert str(mi.load_dict(glow())).startswith("EmissiveMedium[")

@@ -1,0 +1,96 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+
+"""Recorded functions: when they give up recording, and when an error is just an error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from unrender.rendering.mitsuba import frozen
+from unrender.rendering.mitsuba.frozen import FrozenFunction
+
+
+@pytest.fixture
+def warned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    found: list[str] = []
+    monkeypatch.setattr(frozen, "_warn", found.append)
+    return found
+
+
+def nothing() -> None:
+    return None
+
+
+def test_what_cannot_be_recorded_is_traced_at_every_call(warned: list[str]) -> None:
+    """It reads an array's value, which no recording can."""
+    calls: list[int] = []
+
+    def function(x: Any) -> Any:
+        calls.append(1)
+        return x * float(dr.sum(x)[0])
+
+    once = FrozenFunction(function)
+    prepared: list[int] = []
+    for n in (1, 2, 3):
+        x = mi.Float([1.0, 2.0, float(n)])
+        dr.eval(x)
+        assert dr.allclose(once(lambda: prepared.append(1), x), x * float(3 + n))
+    assert len(warned) == 1
+    assert len(calls) == 4  # the attempt, and three calls
+    assert len(prepared) == 4
+
+
+def test_the_error_of_a_replay_is_raised_and_the_recording_stays(
+    warned: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+
+    def function(x: Any) -> Any:
+        calls.append(1)
+        return x + 1
+
+    once = FrozenFunction(function)
+    x = mi.Float([1.0, 2.0, 3.0])
+    dr.eval(x)
+    assert dr.allclose(once(nothing, x), [2, 3, 4])
+    replay = once._frozen
+
+    def out_of_memory(*arguments: Any) -> Any:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(once, "_frozen", out_of_memory)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        once(nothing, x)
+    monkeypatch.setattr(once, "_frozen", replay)
+    assert dr.allclose(once(nothing, x * 2), [3, 5, 7])
+    assert len(calls) == 1
+    assert not warned
+
+
+def test_another_layout_of_the_arguments_is_recorded_anew_or_traced(warned: list[str]) -> None:
+    """A recording that fails later than the first call is given up as well: the next calls are traced."""
+
+    def function(x: Any) -> Any:
+        return x * float(dr.sum(x)[0]) if isinstance(x, mi.Float) else x + 1
+
+    once = FrozenFunction(function)
+    integers, numbers = mi.UInt32([1, 2, 3]), mi.Float([1.0, 2.0, 3.0])
+    dr.eval(integers, numbers)
+    assert dr.all(once(nothing, integers) == [2, 3, 4])
+    assert not warned
+    assert dr.allclose(once(nothing, numbers), numbers * 6)
+    assert len(warned) == 1
+    assert dr.all(once(nothing, integers) == [2, 3, 4])
+
+
+def test_the_function_s_own_error_is_the_one_that_counts(warned: list[str]) -> None:
+    def function(x: Any) -> Any:
+        raise ValueError("of the function")
+
+    with pytest.raises(ValueError, match="of the function"):
+        FrozenFunction(function)(nothing, mi.Float([1.0, 2.0]))
