@@ -142,7 +142,13 @@ def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > largest:
-        size = f"{largest >> 20} MiB" if largest >= 1 << 20 else f"{largest} bytes"
+        size = (
+            f"{largest >> 20} MiB"
+            if largest >= 1 << 20
+            else f"{largest >> 10} KiB"
+            if largest >= 1 << 10
+            else f"{largest} bytes"
+        )
         raise InputError(f"{path}: larger than {size}, which no such file is")
     return data
 
