@@ -5,7 +5,7 @@ The resolver begins with the current directory, and `mitsuba.load_file` puts the
 would run the code that lies beside it. A name that no folder has is looked up from the current directory once more, and a type such
 as `../x` or `/tmp/x` leads out of the folder `plugins` altogether.
 
-So Mitsuba's own folder comes first for the whole process (`prefer_own`), scenes are made where there is no other (`only_own`), and the
+So Mitsuba's own folder comes first for the whole process (`prefer_own`), scenes are made where there is no other (`only`), and the
 names of types are checked before Mitsuba sees them (`check_type`).
 """
 
@@ -18,10 +18,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from unrender.core.errors import InputError
 
-__all__ = ["check_type", "only_own", "own_folder", "prefer_own", "search_paths"]
+__all__ = ["check_type", "only", "own_folder", "prefer_own", "search_paths"]
 
 _FOLDER = "plugins"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,100}")
@@ -39,30 +40,25 @@ def own_folder() -> Path:
 
 def search_paths() -> list[Path]:
     """The folders where Mitsuba's file resolver looks for files, first to last."""
-    import mitsuba as mi
-
-    return [Path(str(place)) for place in mi.file_resolver()]
+    return [Path(str(place)) for place in _mitsuba().file_resolver()]
 
 
 def prefer_own() -> None:
     """Have Mitsuba look into its own folder first, for the whole process. Again does nothing."""
-    import mitsuba as mi
-
-    resolver = mi.file_resolver()
+    resolver = _mitsuba().file_resolver()
     if len(resolver) == 0 or Path(str(resolver[0])) != own_folder():
         resolver.prepend(str(own_folder()))
 
 
 @contextmanager
-def only_own() -> Iterator[None]:
-    """Have Mitsuba look into its own folder alone meanwhile. Relative names of files then count from the current directory."""
-    import mitsuba as mi
-
+def only(folder: Path) -> Iterator[None]:
+    """Have Mitsuba look into one folder alone meanwhile. Relative names that it does not have count from the current directory."""
+    mi = _mitsuba()
     before = mi.file_resolver()
-    only = mi.FileResolver(before)
-    only.clear()
-    only.append(str(own_folder()))
-    mi.set_file_resolver(only)
+    resolver = mi.FileResolver(before)
+    resolver.clear()
+    resolver.append(str(folder))
+    mi.set_file_resolver(resolver)
     try:
         yield
     finally:
@@ -79,3 +75,9 @@ def check_type(name: str) -> None:
     file = Path(_FOLDER, name + _ENDING)
     if not (own_folder() / file).exists() and os.path.lexists(file):
         raise InputError(f"type {name}: {file} here is not Mitsuba's, and is not loaded")
+
+
+def _mitsuba() -> Any:
+    import mitsuba
+
+    return mitsuba

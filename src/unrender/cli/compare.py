@@ -18,6 +18,7 @@ from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import Plan, execute, introduce
 from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
+from unrender.core.text import visible
 from unrender.evaluation.metrics import has_flip
 from unrender.methods import Method, method
 from unrender.report import formatting
@@ -187,8 +188,8 @@ def _print_comparison(console: Console, comparison: Comparison) -> None:
 
 
 def _plain(text: str) -> str:
-    """Text of a run folder, without marks for rich."""
-    return escape(text)
+    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
+    return escape(visible(text))
 
 
 def _table(*headings: str) -> Table:

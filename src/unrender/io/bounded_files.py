@@ -22,6 +22,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import printable
+from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
 __all__ = [
@@ -58,6 +59,7 @@ MOST_VALUES = 200_000
 """Values of JSON text: reading a million names takes seconds."""
 
 _MEMBERS = 10_000
+_BYTES_PER_BYTE = 100  # unpacked for one in the file: zeros give a thousand
 _LARGEST_DIRECTORY = 1 << 20  # of an archive, in bytes: its members' names among them
 _UNREADABLE = (
     OSError,
@@ -263,16 +265,18 @@ def read_arrays(
         raise InputError(f"{path}: the file is missing")
     name = ""
     try:
-        reads: Any = None
-        with open_regular(path, folder) as file, zipfile.ZipFile(reads := _BoundedReads(file, path)) as archive:
-            reads.most = None
+        with open_regular(path, folder) as file, _open_archive(file, path) as archive:
             members = archive.infolist()
             if len(members) > _MEMBERS:
                 raise InputError(f"{path}: {len(members)} arrays, expected at most {_MEMBERS}")
             if one and len(members) != 1:
                 raise InputError(f"{path}: expected an archive of one array, got {len(members)}")
-            if sum(member.file_size for member in members) > most_bytes:
+            unpacked, packed = sum(member.file_size for member in members), os.fstat(file.fileno()).st_size
+            if unpacked > most_bytes:
                 raise InputError(f"{path}: its arrays are larger than {most_bytes} bytes together")
+            if unpacked > max(files.COMPRESSED_BYTES, _BYTES_PER_BYTE * packed):
+                what = f"its arrays have {unpacked} bytes in {packed}"
+                raise InputError(f"{path}: {what}; if that is right, save them without compression")
             _check_members(members, path)
             found: dict[str, np.ndarray] = {}
             for member in members:
@@ -329,8 +333,24 @@ class _BoundedReads:
             raise InputError(f"{self.where}: names more than {_MEMBERS} arrays")
         return data
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.file, name)
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """As a file's."""
+        return self.file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """As a file's."""
+        return self.file.tell()
+
+    def seekable(self) -> bool:
+        """As a file's."""
+        return True
+
+
+def _open_archive(file: IO[bytes], path: Path) -> zipfile.ZipFile:
+    reads: Any = _BoundedReads(file, path)
+    archive = zipfile.ZipFile(reads)
+    reads.most = None
+    return archive
 
 
 def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:

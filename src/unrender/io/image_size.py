@@ -162,7 +162,7 @@ def _ppm(data: bytes, _: IO[bytes]) -> Sizes:
 
 
 def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
-    width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
+    width, height, *_rest, bits = struct.unpack_from("<iiHH", data, 18)
     return [(width, abs(height), max(bits // 8, 1))]
 
 
@@ -191,7 +191,7 @@ def _png(data: bytes, _: IO[bytes]) -> Sizes:
     """Indexed colours count as four channels, which they become."""
     if data[12:16] != b"IHDR":
         raise ValueError("no IHDR")
-    width, height, _, kind = struct.unpack_from(">IIBB", data, 16)
+    width, height, *_rest, kind = struct.unpack_from(">IIBB", data, 16)
     return [(width, height, {0: 1, 2: 3, 4: 2}.get(kind, 4))]
 
 

@@ -17,6 +17,7 @@ __all__ = ["MalformedHeader", "Shape", "read_npy"]
 Shape = tuple[int, ...]
 
 _AXES = 32
+_BLOCK = 1 << 20
 _MAGIC = b"\x93NUMPY"
 _LONGEST_HEADER = 1 << 12  # far more than the name of a type and a shape take
 _INTEGER = rb"-?\d{1,40}L?"
@@ -40,10 +41,15 @@ def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], No
         raise InputError(f"{where}: declares the shape {printable(str(shape))}, {declared} bytes; {there} follow")
     if check is not None:
         check(shape)
-    data = file.read(declared)
-    if len(data) != declared or file.read(1):
+    data = bytearray(declared)
+    for start in range(0, declared, _BLOCK):  # an archive's member would be held twice
+        block = file.read(min(_BLOCK, declared - start))
+        data[start : start + len(block)] = block
+        if len(block) < min(_BLOCK, declared - start):
+            raise InputError(f"{where}: the array is cut short")
+    if file.read(1):
         raise InputError(f"{where}: the array is cut short")
-    return np.frombuffer(data, kind).reshape(shape, order="F" if columns_first else "C").copy()
+    return np.frombuffer(data, kind).reshape(shape, order="F" if columns_first else "C")
 
 
 def _read_header(file: IO[bytes], where: str) -> tuple[np.dtype, bool, Shape]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import Any
 
@@ -17,10 +18,14 @@ else:  # pragma: no cover
 Place = tuple[str | int, ...]
 """A field's keys and indices from the top of the file."""
 
-LARGEST = 1 << 19
+LARGEST = 3 << 17
 """Of a TOML file, in bytes: `tomllib` takes half a second for so many."""
 _MOST_DOTS = 200, 1 << 15
 """In a line and in all: `tomllib` takes quadratic time for a key of many parts."""
+
+
+_SYNTAX = re.compile(r"""["'#\[\]{}]""")
+_KEY = re.compile(r"""(?:[^"'=#]|"(?:[^"\\]|\\.)*"|'[^']*')*=""")
 
 
 def check(text: str, where: str) -> None:
@@ -90,22 +95,27 @@ def _lines(text: str) -> dict[Place, int]:
 
 
 def _statement(rows: list[str], start: int) -> tuple[dict[str, Any] | None, int]:
-    """The statement that begins at row `start`, parsed by itself, and the row after it. It ends where its brackets and strings do."""
+    """The header or key of the statement that begins at row `start`, parsed by itself, and the row after the statement.
+
+    A statement ends where its brackets and strings do.
+    """
     depth, quote, end = 0, "", start
     while end < len(rows):
         depth, quote = _open_after(rows[end], depth, quote)
         end += 1
         if depth <= 0 and not quote:
             break
+    row = rows[start]
+    match = None if row.lstrip().startswith("[") else _KEY.match(row)
     try:
-        return tomllib.loads("\n".join(rows[start:end])), end
+        return tomllib.loads(row if match is None else f"{match[0]}0"), end
     except (tomllib.TOMLDecodeError, RecursionError):
         return None, len(rows)
 
 
 def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
     """How many brackets are open after a row, and by what the string ends that is, "" for none."""
-    at = 0
+    at = 0 if quote or _SYNTAX.search(row) else len(row)
     while at < len(row):
         letter = row[at]
         if quote and letter == "\\" and quote[0] == '"':
@@ -129,7 +139,7 @@ def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
 
 
 def _path(statement: dict[str, Any]) -> Place:
-    """The key of a statement: down while there is one key only, which may lead on into an inline table, at no harm."""
+    """The key of a statement whose value is a number."""
     path: list[str | int] = []
     value: Any = statement
     while True:

@@ -114,7 +114,8 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
     elif ending == ".npy":
         np.save(buffer, array, allow_pickle=False)
     else:
-        np.savez_compressed(buffer, allow_pickle=False, grid=array)
+        save = np.savez_compressed if array.nbytes < files.COMPRESSED_BYTES // 2 else np.savez
+        save(buffer, allow_pickle=False, grid=array)
     return files.write(file, buffer.getvalue())
 
 

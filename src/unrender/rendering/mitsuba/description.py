@@ -53,7 +53,7 @@ class Parsed:
         """
         for node in self.state.nodes:
             self._check_files(node.props)
-        with plugins.only_own(), _printable_log():
+        with plugins.only(plugins.own_folder()), _printable_log():
             found = mi.parser.instantiate(self.config, self.state)
         return found[0] if isinstance(found, list) else found
 
@@ -92,7 +92,7 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
     else:
         search = []
         given = _Dictionary(search, others).checked(description)
-        with plugins.only_own(), _printable_log():
+        with plugins.only(plugins.own_folder()), _printable_log():
             state = mi.parser.parse_dict(config, given)
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
@@ -104,16 +104,9 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
 def _parse_xml(config: Any, path: Path) -> tuple[Any, list[Path]]:
     """The parser's state, and where files are that the scene names."""
     expected = scene_files.read(path).xml
-    resolver, before = mi.FileResolver(), mi.file_resolver()
-    resolver.clear()
-    resolver.append(str(path.absolute().parent))
-    mi.set_file_resolver(resolver)
-    try:
-        with _printable_log():
-            state = mi.parser.parse_file(config, str(path.absolute()))
+    with plugins.only(path.absolute().parent), _printable_log():
+        state = mi.parser.parse_file(config, str(path.absolute()))
         search = plugins.search_paths()
-    finally:
-        mi.set_file_resolver(before)
     read = [Path(str(file)).resolve() for file in state.files]
     if sorted(read) != sorted(file.resolve() for file in expected):
         raise InputError(f"scene {path}: its includes cannot be followed")
@@ -184,7 +177,7 @@ class _Dictionary:
 @contextmanager
 def _printable_log() -> Iterator[None]:
     """Let Mitsuba's messages reach the terminal in printable text alone: they quote names from files."""
-    logger = mi.logger()
+    logger: Any = getattr(mi, "logger")()  # noqa: B009 (its type is unknown)
     if logger is None:  # in a thread that is not Mitsuba's
         yield
         return
