@@ -17,7 +17,19 @@ import numpy as np
 import unrender as ur
 from unrender.io import images, volumes
 
-__all__ = ["INPUTS", "SCENE", "Hostile", "ply", "png", "problem", "scene", "serialized", "write_scene"]
+__all__ = [
+    "INPUTS",
+    "SCENE",
+    "Hostile",
+    "names_archive",
+    "ply",
+    "png",
+    "problem",
+    "scene",
+    "serialized",
+    "warm_up",
+    "write_scene",
+]
 
 Hostile = Callable[[Path], Callable[[], Any]]
 """Writes files into a folder, and returns the call that takes them in."""
@@ -50,6 +62,12 @@ def problem(folder: Path, given: Any = None, key: str = KEY, **options: Any) -> 
     """Opens the folder's scene as a problem."""
     given = folder / "scene.xml" if given is None else given
     return lambda: ur.Problem(given, [ur.Parameter(key)], [ur.View(folder / "photo.npy")], **options)
+
+
+def warm_up(place: Path) -> None:
+    """What is done once in a process is no input's doing."""
+    write_scene(place, scene())
+    problem(place)()
 
 
 def _xml(head: str = "", bsdf: str = GREY, body: str = "") -> Hostile:
@@ -101,7 +119,10 @@ def _grid(data: bytes) -> Hostile:
 
 
 def ply(
-    faces: Any = ((3, 0, 1, 2),), vertices: int = 3, form: str = "binary_little_endian", counts: tuple[int, int] | None = None
+    faces: Any = ((3, 0, 1, 2),),
+    vertices: int = 3,
+    form: str = "binary_little_endian",
+    counts: tuple[int, int] | None = None,
 ) -> bytes:
     """A PLY file of a triangle, or what its header says."""
     declared = counts or (vertices, len(faces))
@@ -118,7 +139,9 @@ def ply(
     return header.encode() + body + b"".join(struct.pack(f"{order}B3i", *face) for face in faces)
 
 
-def serialized(vertices: int = 3, faces: Any = ((0, 1, 2),), counts: tuple[int, int] | None = None, fill: float = 1.0) -> bytes:
+def serialized(
+    vertices: int = 3, faces: Any = ((0, 1, 2),), counts: tuple[int, int] | None = None, fill: float = 1.0
+) -> bytes:
     """A file of Mitsuba's serialized format, version 4."""
     declared = counts or (vertices, len(faces))
     points = np.full((vertices, 3), fill, "<f4") * np.arange(vertices)[:, None]
@@ -171,12 +194,15 @@ def tga(width: int, height: int, kind: int = 2, data: bytes = b"") -> bytes:
     return head + data + bytes(8) + b"TRUEVISION-XFILE.\0"
 
 
-def _names(count: int) -> bytes:
+def names_archive(count: int) -> bytes:
     """An archive with so many members of no bytes, written by hand: `zipfile` would take minutes."""
     local, central = bytearray(), bytearray()
     for number in range(count):
         name = b"%x.npy" % number
-        central += struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, len(name), 0, 0, 0, 0, 0, len(local)) + name
+        central += (
+            struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, len(name), 0, 0, 0, 0, 0, len(local))
+            + name
+        )
         if number == 0:
             local += struct.pack("<4s5H3L2H", b"PK\3\4", 20, 0, 0, 0, 0, 0, 0, 0, len(name), 0) + name
     short = min(count, 0xFFFF)
@@ -285,13 +311,18 @@ def _dictionary(**entries: Any) -> Hostile:
     return write
 
 
-
-
 def _doubling(levels: int) -> str:
     """Parameters, each twice the one before."""
     lines = ['<default name="p0" value="0123456789"/>']
     lines += [f'<default name="p{n}" value="$p{n - 1}$p{n - 1}"/>' for n in range(1, levels)]
     return "".join(lines)
+
+
+def _twice(levels: int) -> str:
+    """Materials of two halves, which are both the material before."""
+    half = '<float name="weight" value="0.5"/><ref id="b{n}" name="x"/><ref id="b{n}" name="y"/>'
+    lines = [f'<bsdf type="blendbsdf" id="b{n}">{half.format(n=n - 1)}</bsdf>' for n in range(1, levels)]
+    return f'<bsdf type="diffuse" id="b0"/>{"".join(lines)}<shape type="sphere"><ref id="b{levels - 1}"/></shape>'
 
 
 def _long(**fields: Any) -> Hostile:
@@ -300,9 +331,9 @@ def _long(**fields: Any) -> Hostile:
     def write(folder: Path) -> Callable[[], Any]:
         write_scene(folder, scene())
         head = {"scene": '"scene.xml"', "max_depth": "2"} | fields.get("head", {})
-        key = fields.get("key", f'"{KEY}"')
+        key, view = fields.get("key", f'"{KEY}"'), fields.get("view", '"photo.npy"')
         text = "\n".join(f"{name} = {value}" for name, value in head.items())
-        text += f'\n[[parameters]]\nkey = {key}\n{fields.get("parameter", "")}\n[[views]]\nreference = {fields.get("view", chr(34) + "photo.npy" + chr(34))}\n'
+        text += f"\n[[parameters]]\nkey = {key}\n{fields.get('parameter', '')}\n[[views]]\nreference = {view}\n"
         (folder / "problem.toml").write_text(text)
         return lambda: ur.Problem.from_file(folder / "problem.toml")
 
@@ -385,6 +416,10 @@ def _picture_dictionary(folder: Path) -> dict[str, Any]:
     return {"type": "envmap", "filename": folder / "a.hdr"}
 
 
+_PLY_TWICE = ply().replace(b"element face", b"element vertex 1\nproperty float x\nelement face")
+_BMP = b"BM" + struct.pack("<IIIIiiHHIIiiII", 64, 0, 54, 40, 60_000, -60_000, 1, 24, *[0] * 6)
+_TWO_SIZES = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n-Y 00000000060000 +X 60000\n-Y 4 +X 4\n" + bytes(64)
+_MATERIAL = '<bsdf type="conductor"><string name="material" value="../../x"/></bsdf>'
 _FACE = ((3, 0, 1, 70_000_000),)
 
 INPUTS: dict[str, Hostile] = {
@@ -419,7 +454,7 @@ INPUTS: dict[str, Hostile] = {
     "a PLY of billions of faces": _shape("ply", "a.ply", ply(counts=(3, 4_294_967_297))),
     "a PLY of quads": _shape("ply", "a.ply", ply(((4, 0, 1, 2),))),
     "a PLY of faces alone": _shape("ply", "a.ply", ply(vertices=0)),
-    "a PLY with vertices twice": _shape("ply", "a.ply", ply().replace(b"element face", b"element vertex 1\nproperty float x\nelement face")),
+    "a PLY with vertices twice": _shape("ply", "a.ply", _PLY_TWICE),
     "a PLY without end": _shape("ply", "a.ply", b"ply\nformat ascii 1.0\n" + b"comment a\n" * 100_000),
     "a PLY with ESC in a name": _shape("ply", "a.ply", ply().replace(b"float x", b"float \x1b]0;x\x07").replace(b"float y", b"float x")),
     "splats of double precision": _shape("ellipsoids", "a.ply", _splats(_DOUBLES, bytes(13 * 8))),
@@ -439,19 +474,19 @@ INPUTS: dict[str, Hostile] = {
     "a PNG named .hdr": _picture("a.hdr", png(60_000, 60_000)),
     "a PNG named .pfm": _picture("a.pfm", png(60_000, 60_000)),
     "a PNG of zeros": _picture("a.png", png(9000, 9000, bytes(9000 * 27_001))),
-    "a BMP named .png": _picture("a.png", b"BM" + struct.pack("<IIIIiiHHIIiiII", 64, 0, 54, 40, 60_000, -60_000, 1, 24, *[0] * 6)),
-    "an HDR with two resolutions": _picture("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n-Y 00000000060000 +X 60000\n-Y 4 +X 4\n" + bytes(64)),
+    "a BMP named .png": _picture("a.png", _BMP),
+    "an HDR with two resolutions": _picture("a.hdr", _TWO_SIZES),
     "a TGA of negative width": _picture("a.tga", tga(65_535, 1)),
     "a TGA whose runs go on": _picture("a.tga", tga(2, 2, 10, b"\xff\1\2\3")),
     "an EXR before its origin": _picture("a.exr", exr((-5, 0, 2, 3))),
-    "an EXR far from its origin": _picture("a.exr", exr((70_000, 70_000, 70_007, 70_003))),
+    "an EXR far from its origin": _picture("a.exr", exr((0, 1 << 29, 7, (1 << 29) + 3))),
     "a dictionary's sky of 60000 x 60000": _dictionary(sky=_picture_dictionary),
     "forty textures of 75 million values": _many_textures,
     # grids and arrays
     "a grid of a trillion voxels": _grid(vol(10_000, 10_000, 10_000)),
     "a grid of negative size": _grid(vol(-1, 1, 1)),
     "a grid that is cut short": _grid(vol(4, 4, 4, data=bytes(16))),
-    "an archive of 400000 names": _archive(lambda: _names(400_000)),
+    "an archive of 400000 names": _archive(lambda: names_archive(400_000)),
     "an archive of four gigabytes of zeros": _bomb_npz,
     # scenes
     "an include by the beginning of a name": _files(
@@ -473,8 +508,9 @@ INPUTS: dict[str, Hostile] = {
         scene(head='<include filename="a.xml"/>'), a_xml='<scene version="3.0.0">' + 1001 * '<include filename="b.xml"/>' + "</scene>",
         b_xml='<scene version="3.0.0"/>',
     ),
+    "materials that hold the one before twice": _xml(body=_twice(40)),
     "a spectrum that is no text": _xml(bsdf='<spectrum name="reflectance" filename="/bin/sh"/>'),
-    "a material that leads elsewhere": _xml(body='<shape type="sphere"><bsdf type="conductor"><string name="material" value="../../x"/></bsdf></shape>'),
+    "a material that leads elsewhere": _xml(body=f'<shape type="sphere">{_MATERIAL}</shape>'),
     "a compressed scene": _gzip,
     "a type that leads elsewhere": _xml(body='<shape type="../../tmp/x"/>'),
     "a type at an absolute place": _xml(body='<shape type="/tmp/x"/>'),
@@ -492,5 +528,3 @@ INPUTS: dict[str, Hostile] = {
     "a list of a hundred thousand lines": _text('scene = "x.xml"\nextra = [\n' + "1,\n" * 100_000 + "]\n"),
     "a hundred megabytes of problem file": _text(b"#" * 100_000_000),
 }  # fmt: skip
-
-

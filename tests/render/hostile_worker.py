@@ -95,8 +95,11 @@ def _tell(module: str, table: str, folder: Path) -> None:
     variant.use(variant.LLVM)
     report = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what the package prints is no report
-    inputs = getattr(importlib.import_module(module), table)
-    _warm_up(folder)
+    home = importlib.import_module(module)
+    inputs = getattr(home, table)
+    warm = folder / f"{os.getpid()}-warm"
+    warm.mkdir()
+    home.warm_up(warm)
     limit = _status("VmSize") + _MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     for number, line in enumerate(sys.stdin):
@@ -116,15 +119,6 @@ def _tell(module: str, table: str, folder: Path) -> None:
         found = Outcome(name, said, kind, _seconds() - started, time.monotonic() - clock, _status("VmHWM") - before)
         report.write(json.dumps(found.__dict__) + "\n")
         report.flush()
-
-
-def _warm_up(folder: Path) -> None:
-    """What is done once in a process is no input's doing."""
-    inputs = importlib.import_module("hostile_inputs")
-    place = folder / f"{os.getpid()}-warm"
-    place.mkdir()
-    inputs.write_scene(place, inputs.scene())
-    inputs.problem(place)()
 
 
 def _seconds() -> float:

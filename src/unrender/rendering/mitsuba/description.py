@@ -25,6 +25,7 @@ from unrender.io import scene_assets, scene_files, spectrum_files
 __all__ = ["Parsed", "load", "parse"]
 
 _DEEPEST = 128
+_MOST_PATHS = 1 << 20
 _FILE = "filename"
 _RESOURCES = "resources"
 _COLOURS = ("rgb", "spectrum")
@@ -96,8 +97,10 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
             state = mi.parser.parse_dict(config, given)
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
+    _check_types({node.props.plugin_name() for node in state.nodes}, isinstance(description, Path))
     for node in state.nodes:
-        _settle(node.props, [*search, *others], isinstance(description, Path))
+        _settle(node.props, [*search, *others])
+    _check_paths(state.nodes)
     return Parsed(config, state)
 
 
@@ -113,15 +116,39 @@ def _parse_xml(config: Any, path: Path) -> tuple[Any, list[Path]]:
     return state, search
 
 
-def _settle(props: Any, search: Sequence[Path], is_file: bool) -> None:
-    """Check the type of an object, and make the name of its file absolute where there is one."""
-    name = props.plugin_name()
-    if name not in _NO_PLUGINS:
+def _check_types(names: set[str], is_file: bool) -> None:
+    for name in sorted(names - set(_NO_PLUGINS)):
         plugins.check_type(name)
-    if is_file and name == _POINTERS:
-        raise InputError(f"type {name}: takes addresses in memory, which no file can know")
+    if is_file and _POINTERS in names:
+        raise InputError(f"type {_POINTERS}: takes addresses in memory, which no file can know")
+
+
+def _settle(props: Any, search: Sequence[Path]) -> None:
+    """Make the name of an object's file absolute where there is one."""
     if _is_text(props, _FILE) and (found := scene_files.resolve(props[_FILE], search)) is not None:
         props[_FILE] = str(found.resolve())
+
+
+def _check_paths(nodes: Any) -> None:
+    """Raise `InputError` where there are too many ways from the scene to its objects.
+
+    Objects that hold one another by reference twice each double them, and who walks through a scene goes all ways. There are no circles.
+    """
+    resolved = mi.Properties.Type.ResolvedReference
+    ways: dict[int, int] = {}
+    pending = [0]
+    while pending:
+        index = pending[-1]
+        props = nodes[index].props
+        held = [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118
+        if missing := [child for child in held if child not in ways]:
+            pending += missing
+            continue
+        ways[pending.pop()] = 1 + sum(ways[child] for child in held)
+    if ways[0] > _MOST_PATHS:
+        raise InputError(
+            f"its objects hold one another in {shorten(str(ways[0]), 40)} ways, expected at most {_MOST_PATHS}"
+        )
 
 
 def _is_text(props: Any, name: str) -> bool:
