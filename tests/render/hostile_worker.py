@@ -84,6 +84,7 @@ def _one_process(module: str, table: str, names: list[str], folder: Path, limit:
         *lines, data = data.split(b"\n")
         outcomes += [Outcome(**json.loads(line)) for line in lines]
         last = time.monotonic()
+    process.stdout.close()
     status = process.wait()
     return outcomes, end or ("died" if status else "")
 
