@@ -120,7 +120,6 @@ def use(variant: str = "auto") -> str:
             mi.set_variant(chosen)
         except ImportError as error:
             raise VariantError(f"Mitsuba cannot use {chosen}: {_one_line(error)}") from error
-    plugins.prefer_own()
     return chosen
 
 
@@ -233,7 +232,7 @@ def _trial_problem(variant: str) -> str | None:
 
 
 def _mitsuba() -> Any:
-    """Mitsuba, imported with the right LLVM at hand."""
+    """Mitsuba, imported with the right LLVM at hand, and with its own plugins before all others."""
     prepare()
     try:
         import mitsuba
@@ -243,6 +242,7 @@ def _mitsuba() -> Any:
         # Where a library is missing, Dr.Jit's own import trips over a name while it handles that.
         cause = error.__context__ if isinstance(error, NameError) and error.__context__ else error
         raise VariantError(f"Mitsuba cannot be imported: {_one_line(cause)}") from error
+    plugins.prefer_own()
     return mitsuba
 
 
