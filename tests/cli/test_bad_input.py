@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import mitsuba as mi
@@ -65,12 +66,35 @@ MISTAKES = [
 ]
 
 
+_LONG = "A" * 5000
+MISTAKES += [  # names that no file can have
+    (["run", _LONG], "File name too long"),
+    (["run", f"{_LONG}.toml"], "File name too long"),
+    (["run", "problem.toml", "--out", _LONG], "File name too long"),
+    (["run", "problem.toml", "--method", _LONG], "unknown method AAAA"),
+    (["run", "problem.toml", "--set", f"{_LONG}=1"], "has no option AAAA"),
+    (["run", "indirect-room", "-p", f"{_LONG}=1"], "no option AAAA"),
+    (["compare", _LONG], "File name too long"),
+    (["compare", ".", _LONG], "File name too long"),
+    (["report", _LONG], "File name too long"),
+    (["resume", _LONG], "File name too long"),
+    (["export", _LONG], "File name too long"),
+    (["watch", _LONG], "File name too long"),
+    (["gallery", _LONG], "AAAA"),
+    (["methods", _LONG], "AAAA"),
+    (["run", "\x1b]0;owned\x07\x9b2J.toml"], "\\x1b]0;owned\\x07\\x9b2J.toml: no such file"),
+    (["methods", "\x1b[2J"], "unknown method \\x1b[2J"),
+]
+
+
 def check(answer, message: str, status: int = 2) -> None:
     assert answer.status == status
     assert message in answer.error
     assert answer.error.startswith("unrender: ")
     assert answer.error.count("\n") == 1
     assert "Traceback" not in answer.out + answer.error
+    assert len(answer.error) < 1100
+    assert answer.error[:-1].isprintable()
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
@@ -91,6 +115,14 @@ def _wrong_size(folder: Path) -> None:
     mi.Bitmap(np.zeros((6, 4, 3), np.float32)).write(str(folder / "photo.exr"))
 
 
+def _pipe(name: str):
+    def spoil(folder: Path) -> None:
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+
+    return spoil
+
+
 def _edit(name: str, old: str, new: str):
     def spoil(folder: Path) -> None:
         text = (folder / name).read_text()
@@ -108,6 +140,17 @@ SPOILT = [
     (lambda folder: (folder / "wall.xml").unlink(), "problem.toml:1: scene: wall.xml: no such file"),
     (_edit("wall.xml", "</film>", ""), "problem.toml:1: scene: wall.xml:7: not XML: mismatched tag"),
     (_edit("wall.xml", "diffuse", "difuse"), "problem.toml:1: scene: wall.xml: Mitsuba could not load it"),
+    (_pipe("photo.exr"), "problem.toml:8: views[0].reference: photo.exr: not a file"),
+    (_pipe("wall.xml"), "problem.toml:1: scene: wall.xml: not a file"),
+    (_pipe("problem.toml"), "problem.toml: not a regular file"),
+    (
+        _edit("problem.toml", "max_depth = 2", "max_depth = 4294967296"),
+        "problem.toml:3: max_depth: expected at most 1048576",
+    ),
+    (_edit("problem.toml", "max_depth = 2", f'name = "{_LONG}"'), "problem.toml:3: name: expected a string of at most"),
+    (_edit("problem.toml", "photo.exr", _LONG + ".exr"), "File name too long"),
+    (_edit("problem.toml", "photo.exr", "\\u001b]0;owned\\u0007.exr"), "\\x1b]0;owned\\x07.exr: no such file"),
+    (_edit("wall.xml", "diffuse", "\u202ediffuse"), "expected the name of a plugin"),
     (_edit("problem.toml", "reflectance", "reflectence"), "did you mean wall.bsdf.reflectance.value?"),
     (
         _edit("problem.toml", "truth =", "bounds = [1.0, 0.0]\ntruth ="),
@@ -139,3 +182,21 @@ def test_a_machine_that_cannot_is_status_3(unrender, problem: Path, monkeypatch:
 
     monkeypatch.setattr(variant, "use", fail)
     check(unrender("run", "problem.toml"), "no LLVM library was found; install: this", status=3)
+
+
+def test_names_of_a_scene_do_not_command_the_terminal(unrender, problem: Path, mitsuba_variant: str):
+    """XML knows no ESC, but the controls of one character (C1) and those of direction."""
+    wall = problem.parent / "wall.xml"
+    wall.write_text(wall.read_text().replace('id="wall"', 'id="wall&#x9b;2J&#x202e;"'))
+    problem.write_text(problem.read_text().replace('"wall.bsdf', '"wall\\u009b2J\\u202E.bsdf'))
+    problem.write_text('name = "\\u001b]0;owned\\u0007"\n' + problem.read_text())
+    options = ("--set", "spp=1", "--steps", "2", "--final-spp", "1", "--variant", mitsuba_variant)
+    answer = unrender("run", "problem.toml", "--method", "plain", *options, "--out", "out")
+    assert answer.status == 0, answer.error
+    said = answer.out + answer.error
+    assert "\\x9b2J\\u202e.bsdf" in said
+    assert "\\x1b]0;owned" in said
+    assert all(letter.isprintable() or letter in "\n\t" for letter in said)
+    page = (problem.parent / "out" / "report.html").read_text()
+    assert "owned" in page
+    assert all(letter.isprintable() or letter in "\n\t" for letter in page)

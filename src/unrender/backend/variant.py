@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unrender.backend import install_hints, llvm
+from unrender.backend import install_hints, llvm, plugins
 from unrender.core.errors import VariantError
 from unrender.core.suggestions import did_you_mean
 
@@ -44,9 +44,10 @@ _INITIALISATION = 0.5
 """Seconds that Dr.Jit takes at most to find that a library will not do."""
 
 _GPU_TRIAL = """
-import sys
+import os, sys
 sys.path[:] = {path!r}
 import drjit as dr, mitsuba as mi
+mi.file_resolver().prepend(os.path.dirname(mi.__file__))  # see plugins.py
 mi.set_variant({variant!r})
 scene = mi.load_dict({{"type": "scene", "wall": {{"type": "rectangle"}}}})
 rays = mi.Ray3f(mi.Point3f(dr.linspace(mi.Float, -0.5, 0.5, 8), 0, 2), mi.Vector3f(0, 0, -1))
@@ -231,7 +232,7 @@ def _trial_problem(variant: str) -> str | None:
 
 
 def _mitsuba() -> Any:
-    """Mitsuba, imported with the right LLVM at hand."""
+    """Mitsuba, imported with the right LLVM at hand, and with its own plugins before all others."""
     prepare()
     try:
         import mitsuba
@@ -241,6 +242,7 @@ def _mitsuba() -> Any:
         # Where a library is missing, Dr.Jit's own import trips over a name while it handles that.
         cause = error.__context__ if isinstance(error, NameError) and error.__context__ else error
         raise VariantError(f"Mitsuba cannot be imported: {_one_line(cause)}") from error
+    plugins.prefer_own()
     return mitsuba
 
 

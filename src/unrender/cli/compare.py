@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -17,7 +16,9 @@ from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import Plan, execute, introduce
+from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
+from unrender.core.text import visible
 from unrender.evaluation.metrics import has_flip
 from unrender.methods import Method, method
 from unrender.report import formatting
@@ -187,8 +188,8 @@ def _print_comparison(console: Console, comparison: Comparison) -> None:
 
 
 def _plain(text: str) -> str:
-    """Text of a run folder, without marks for rich and without what a terminal would obey."""
-    return escape("".join(letter if letter.isprintable() else "\ufffd" for letter in text))
+    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
+    return escape(visible(text))
 
 
 def _table(*headings: str) -> Table:

@@ -11,11 +11,11 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from unrender.backend import llvm, variant
+from unrender.cli.terminal import Console
 from unrender.core.errors import VariantError
 
 __all__ = ["TOLERANCE", "doctor", "gradient_error"]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from unrender.cli.progress import Progress
+from unrender.cli.terminal import Console
 from unrender.methods import Method
 from unrender.problem.problem import Problem
 from unrender.runs.live import Live

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Variant
+from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
 
 __all__ = ["export"]

@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from PIL import Image
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -17,6 +16,7 @@ from unrender import gallery as problems
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import introduce
+from unrender.cli.terminal import Console
 from unrender.evaluation.metrics import exposure, srgb
 from unrender.io.files import write
 from unrender.problem.problem import Problem

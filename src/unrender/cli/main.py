@@ -15,6 +15,7 @@ import typer
 from unrender.backend import variant
 from unrender.cli.doctor import doctor
 from unrender.core.errors import UnrenderError, VariantError
+from unrender.core.text import one_line
 
 __all__ = ["main"]
 
@@ -52,10 +53,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read our output has gone; Python would complain once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # a name that is too long, a folder that may not be entered, a full disk
+        where = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{where}{error.strerror or error}", INPUT)
 
 
 def _complain(message: str, status: int) -> int:
-    print(f"unrender: {' '.join(message.split())}", file=sys.stderr)
+    print(f"unrender: {one_line(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from unrender.cli.terminal import Console
 from unrender.methods import Method, method
 from unrender.methods import methods as registered
 

@@ -6,10 +6,10 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
+from unrender.cli.terminal import Console
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Threads
 from unrender.cli.execute import introduce
 from unrender.cli.progress import Progress
 from unrender.cli.run import conclude
+from unrender.cli.terminal import Console
 from unrender.runs import reopen
 from unrender.runs.live import Live
 from unrender.runs.resume import load_run, resume_run

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
 from unrender.cli.execute import Plan, execute, introduce, summarise
+from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
 from unrender.methods import method
 from unrender.problem.problem import Problem

@@ -1,10 +1,18 @@
 """The errors a caller may catch. Each carries one line that says what is wrong and what would be right."""
 
+from unrender.core.text import one_line
+
 __all__ = ["InputError", "UnrenderError", "VariantError"]
 
 
 class UnrenderError(Exception):
-    """Base of every error that `unrender` raises on purpose."""
+    """Base of every error that `unrender` raises on purpose.
+
+    Its text is one printable line of bounded length, whatever names went into it: control characters are written as escapes.
+    """
+
+    def __init__(self, *arguments: object):
+        super().__init__(*(one_line(part) if isinstance(part, str) else part for part in arguments))
 
 
 class InputError(UnrenderError, ValueError):

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Iterable
 
 __all__ = ["did_you_mean"]
+
+_MOST, _LONGEST = 1000, 200
+"""Names that are compared and their characters: comparing takes time, and names may come from a file that anybody made."""
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
@@ -15,10 +19,12 @@ def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
 
     Args:
         name: as it was given.
-        known: the names there are.
+        known: the names there are. The first thousand are compared, those of at most 200 characters.
         likeness: the least similarity (`difflib`), from 0 for any name to 1 for an equal one.
     """
-    names = list(known)
+    if len(name) > _LONGEST:
+        return ""
+    names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]
     near = same[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""

@@ -16,8 +16,8 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 
-from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.description import parse
 
 __all__ = ["Place", "SceneGraph"]
 
@@ -57,15 +57,12 @@ class SceneGraph:
     """
 
     def __init__(self, description: Path | Mapping[str, Any]):
-        config = mi.parser.ParserConfig(ensure())
-        config.merge_equivalent = config.merge_meshes = config.parallel = False
         try:
-            self._state = _parse(config, description)
-            lively = _parse(config, description)  # which is used up
-            for index, node in enumerate(lively.nodes):
+            self._state = parse(description).state
+            lively = parse(description)  # which is used up
+            for index, node in enumerate(lively.state.nodes):
                 node.props.set_id(f"n{index}")
-            scene: Any = mi.parser.instantiate(config, lively)
-            self._scene: Any = scene[0] if isinstance(scene, list) else scene
+            self._scene: Any = lively.instantiate()
         except Exception as error:
             raise InputError(f"scene: its description cannot be read: {' '.join(str(error).split())[:400]}") from error
         self.nodes: Any = self._state.nodes
@@ -187,20 +184,3 @@ class SceneGraph:
                 names[index] = f"shared-{index}"
             taken[names.get(index, "")] += 1
         return names
-
-
-def _parse(config: Any, description: Path | Mapping[str, Any]) -> Any:
-    """The parser's state, names of files absolute: those of an XML are relative to it."""
-    if isinstance(description, Path):
-        state = mi.parser.parse_file(config, str(description))
-    else:
-        state = mi.parser.parse_dict(config, dict(description))
-    mi.parser.transform_upgrade(config, state)
-    mi.parser.transform_resolve(config, state)
-    folder = description.parent if isinstance(description, Path) else Path()
-    for node in state.nodes:
-        if "filename" in node.props and node.props.type("filename") == _Kind.String:
-            path = folder / node.props["filename"]
-            if path.exists():
-                node.props["filename"] = str(path.resolve())
-    return state

@@ -21,6 +21,7 @@ from unrender.exporting.setters import store
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.runs import reopen
@@ -241,8 +242,7 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         a line for each parameter that has another name now.
     """
     try:
-        with variant.two_threads():
-            found = mi.traverse(mi.load_file(str(path), parallel=False, optimize=False))
+        found = mi.traverse(load(path))
     except Exception as error:
         raise InputError(
             f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.description import load
 
 __all__ = ["centred", "option", "standing"]
 
@@ -48,7 +49,9 @@ def _placed(path: str, bsdf: dict[str, Any], scale: float, origin: np.ndarray) -
 
 def _extent(path: str) -> tuple[np.ndarray, np.ndarray]:
     try:
-        box = mi.load_dict({"type": _kind(path), "filename": path}).bbox()
+        box = load({"type": _kind(path), "filename": path}).bbox()
+    except InputError as error:
+        raise InputError(f"mesh {error}") from error
     except Exception as error:
         reason = " ".join(str(error).split())[:300]
         raise InputError(f"mesh {path}: Mitsuba could not read it: {reason}") from error

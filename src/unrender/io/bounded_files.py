@@ -9,25 +9,28 @@ that begins with the path.
 from __future__ import annotations
 
 import json
-import math
 import os
-import re
 import stat
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.io import files
+from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
 __all__ = [
     "LARGEST_ARRAY",
     "LARGEST_JSON",
     "LARGEST_TEXT",
     "exists",
+    "kind",
     "open_regular",
     "parse_json",
     "parse_object",
@@ -52,11 +55,12 @@ LARGEST_GIVEN = 1 << 32
 """Of arrays that a user gives as the input of a problem, in bytes."""
 DEEPEST = 32
 """Nesting of JSON."""
-
-Shape = tuple[int, ...]
+MOST_VALUES = 200_000
+"""Values of JSON text: reading a million names takes seconds."""
 
 _MEMBERS = 10_000
-_AXES = 32
+_BYTES_PER_BYTE = 100  # unpacked for one in the file: zeros give a thousand
+_LARGEST_DIRECTORY = 1 << 20  # of an archive, in bytes: its members' names among them
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -72,18 +76,26 @@ _COMPRESSIONS = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
 )  # what NumPy writes; others may take more memory than they say
-_MAGIC = b"\x93NUMPY"
-_LONGEST_HEADER = 1 << 12  # far more than the name of a type and a shape take
-_INTEGER = rb"-?\d{1,40}L?"
-_HEADER = re.compile(
-    rb"\s*\{\s*'descr':\s*(?:'([^'\[\]]{1,16})'|\[[^\[\]]{0,1000}\]),\s*'fortran_order':\s*(True|False),"
-    rb"\s*'shape':\s*\((\s*(?:" + _INTEGER + rb"(?:\s*,\s*" + _INTEGER + rb")*\s*,?)?\s*)\),?\s*\}\s*"
-)
 
 
 def exists(path: Path) -> bool:
     """Whether there is anything of this name, be it a link that leads nowhere."""
     return os.path.lexists(path)
+
+
+def kind(path: Path) -> str:
+    """What is at `path`, links followed: "file", "folder", "other" (a pipe, a socket, a device), or "" for nothing.
+
+    Raises:
+        InputError: the name is too long, or a folder on the way cannot be entered.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # the last for a name with a zero byte
+        return ""
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return "file" if stat.S_ISREG(mode) else "folder" if stat.S_ISDIR(mode) else "other"
 
 
 # ---------------------------------------------------------------------- bytes and text
@@ -103,17 +115,25 @@ def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(folder.resolve(strict=True)):
             raise InputError(f"{path}: leads out of the folder, expected a file within it")
+        if not stat.S_ISREG(mode := real.stat().st_mode):  # before it is opened: a device may act on that
+            raise InputError(f"{path}: {_not_regular(mode)}")
         # Without waiting for a pipe's other end, and without following a link that took the file's place meanwhile.
         descriptor = os.open(real, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
-    except (OSError, RuntimeError) as error:  # a loop of links is a RuntimeError before Python 3.13
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links is a RuntimeError before Python 3.13
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        raise InputError(f"{path}: {'a folder, expected a file' if stat.S_ISDIR(mode) else 'not a regular file'}")
+        raise InputError(f"{path}: {_not_regular(mode)}")
     return os.fdopen(descriptor, "rb")
+
+
+def _not_regular(mode: int) -> str:
+    return "a folder, expected a file" if stat.S_ISDIR(mode) else "not a regular file"
 
 
 def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
@@ -124,7 +144,13 @@ def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > largest:
-        size = f"{largest >> 20} MiB" if largest >= 1 << 20 else f"{largest} bytes"
+        size = (
+            f"{largest >> 20} MiB"
+            if largest >= 1 << 20
+            else f"{largest >> 10} KiB"
+            if largest >= 1 << 10
+            else f"{largest} bytes"
+        )
         raise InputError(f"{path}: larger than {size}, which no such file is")
     return data
 
@@ -137,17 +163,17 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, folder: Path | None = Non
         raise InputError(f"{path}: not UTF-8 text ({error.reason} at byte {error.start})") from error
 
 
-def printable(value: Any) -> str:
-    """Untrusted text on one line: 60 characters at most, what does not print escaped."""
-    text = value if isinstance(value, str) and value.isprintable() else "nothing" if value is None else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 # ---------------------------------------------------------------------- JSON
 
 
 def parse_json(source: str | bytes, where: str) -> Any:
-    """The value of JSON text. Raises `InputError` for malformed text, too deep nesting, or a name given twice in one object."""
+    """The value of JSON text.
+
+    Raises `InputError` for malformed text, too deep nesting, more than `MOST_VALUES` values, or a name given twice in one object.
+    """
+    commas = source.count(b",") if isinstance(source, bytes) else source.count(",")
+    if commas > MOST_VALUES:
+        raise InputError(f"{where}: more than {MOST_VALUES} values, which no such file holds")
     try:
         return json.loads(source, object_pairs_hook=_without_duplicates)
     except json.JSONDecodeError as error:
@@ -176,8 +202,11 @@ def read_object(path: Path, folder: Path) -> dict[str, Any]:
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} is given twice")
+        seen: set[str] = set()
+        for name, _ in pairs:
+            if name in seen:
+                raise ValueError(f"{printable(name)!r} is given twice")
+            seen.add(name)
     return found
 
 
@@ -236,14 +265,18 @@ def read_arrays(
         raise InputError(f"{path}: the file is missing")
     name = ""
     try:
-        with open_regular(path, folder) as file, zipfile.ZipFile(file) as archive:
+        with open_regular(path, folder) as file, _open_archive(file, path) as archive:
             members = archive.infolist()
             if len(members) > _MEMBERS:
                 raise InputError(f"{path}: {len(members)} arrays, expected at most {_MEMBERS}")
             if one and len(members) != 1:
                 raise InputError(f"{path}: expected an archive of one array, got {len(members)}")
-            if sum(member.file_size for member in members) > most_bytes:
+            unpacked, packed = sum(member.file_size for member in members), os.fstat(file.fileno()).st_size
+            if unpacked > most_bytes:
                 raise InputError(f"{path}: its arrays are larger than {most_bytes} bytes together")
+            if unpacked > max(files.COMPRESSED_BYTES, _BYTES_PER_BYTE * packed):
+                what = f"its arrays have {unpacked} bytes in {packed}"
+                raise InputError(f"{path}: {what}; if that is right, save them without compression")
             _check_members(members, path)
             found: dict[str, np.ndarray] = {}
             for member in members:
@@ -251,7 +284,7 @@ def read_arrays(
                 name = printable(key)
                 with archive.open(member) as packed:
                     where = f"{path}: {name}"
-                    found[key] = _read_array(packed, member.file_size, where, check, largest or most_bytes)
+                    found[key] = read_npy(packed, member.file_size, where, check, largest or most_bytes)
             return found
     except InputError:
         raise
@@ -269,63 +302,55 @@ def read_array(path: Path, most_bytes: int = LARGEST_GIVEN, check: Callable[[Sha
             size = os.fstat(file.fileno()).st_size
             if size > most_bytes:
                 raise InputError(f"{path}: larger than {most_bytes} bytes")
-            return _read_array(file, size, str(path), check, most_bytes)
+            return read_npy(file, size, str(path), check, most_bytes)
     except InputError:
         raise
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: not a readable NumPy array ({_reason(error)})") from error
 
 
-class _MalformedHeader(ValueError):
-    """An array whose header does not describe plain numbers."""
-
-
 def _reason(error: Exception) -> str:
-    return "its header is malformed" if isinstance(error, _MalformedHeader) else type(error).__name__
+    return "its header is malformed" if isinstance(error, MalformedHeader) else type(error).__name__
 
 
-def _read_array(
-    file: IO[bytes], size: int, where: str, check: Callable[[Shape], None] | None, largest: int
-) -> np.ndarray:
-    """One array in NumPy's format, of `size` bytes with its header. Raises `InputError` or `_MalformedHeader`."""
-    kind, columns_first, shape = _read_header(file, where)
-    if any(side < 0 for side in shape) or len(shape) > _AXES:
-        raise InputError(f"{where}: an array cannot have the shape {printable(str(shape))}")
-    declared, there = math.prod(shape) * kind.itemsize, size - file.tell()
-    if declared > largest or declared != there:
-        raise InputError(f"{where}: declares the shape {printable(str(shape))}, {declared} bytes; {there} follow")
-    if check is not None:
-        check(shape)
-    data = file.read(declared)
-    if len(data) != declared or file.read(1):
-        raise InputError(f"{where}: the array is cut short")
-    return np.frombuffer(data, kind).reshape(shape, order="F" if columns_first else "C").copy()
+@dataclass
+class _BoundedReads:
+    """A file of which at most so many bytes are read at once; None for any number.
 
-
-def _read_header(file: IO[bytes], where: str) -> tuple[np.dtype, bool, Shape]:
-    """Type, whether columns come first, and shape; the type is one of real numbers.
-
-    By a pattern, not by NumPy's own reader: that takes a header for Python, and a hostile one for long.
+    `zipfile` reads the whole directory of an archive before it tells how many members there are.
     """
-    start = file.read(8)
-    if start[:6] != _MAGIC or len(start) < 8:
-        raise _MalformedHeader
-    if start[6:] not in (b"\1\0", b"\2\0"):
-        raise InputError(f"{where}: not an .npy array of version 1 or 2")
-    length = int.from_bytes(file.read(2 if start[6] == 1 else 4), "little")
-    match = _HEADER.fullmatch(file.read(length)) if length <= _LONGEST_HEADER else None
-    if match is None:
-        raise _MalformedHeader
-    if match[1] is None:
-        raise InputError(f"{where}: expected real numbers, got records")
-    try:
-        kind = np.dtype(match[1].decode("ascii"))
-    except (TypeError, ValueError, SyntaxError) as error:
-        raise _MalformedHeader from error
-    if kind.kind not in "fiub" or kind.hasobject:
-        raise InputError(f"{where}: expected real numbers, got {printable(str(kind))}")
-    shape = tuple(int(part) for part in match[3].replace(b"L", b"").split(b",") if part.strip())
-    return kind, match[2] == b"True", shape
+
+    file: IO[bytes]
+    where: Path
+    most: int | None = _LARGEST_DIRECTORY
+
+    def read(self, size: int = -1) -> bytes:
+        """As a file's."""
+        if self.most is None or 0 <= size <= self.most:
+            return self.file.read(size)
+        data = self.file.read(self.most + 1)
+        if len(data) > self.most:
+            raise InputError(f"{self.where}: names more than {_MEMBERS} arrays")
+        return data
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """As a file's."""
+        return self.file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """As a file's."""
+        return self.file.tell()
+
+    def seekable(self) -> bool:
+        """As a file's."""
+        return True
+
+
+def _open_archive(file: IO[bytes], path: Path) -> zipfile.ZipFile:
+    reads: Any = _BoundedReads(file, path)
+    archive = zipfile.ZipFile(reads)
+    reads.most = None
+    return archive
 
 
 def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:

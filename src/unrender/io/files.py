@@ -11,7 +11,11 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["sync_folder", "write", "write_arrays"]
+__all__ = ["COMPRESSED_BYTES", "sync_folder", "write", "write_arrays"]
+
+COMPRESSED_BYTES = 1 << 26
+"""Arrays of more bytes together are stored as they are: readers refuse a small file that unpacks to a large one."""
+_HEADERS = 1 << 20
 
 
 def write(path: Path, data: bytes, durable: bool = False) -> Path:
@@ -50,8 +54,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compress: bool = True) -> Path:
-    """Write an .npz archive of float32 arrays. Raises `InputError` as `write`."""
+    """Write an .npz archive of float32 arrays. Raises `InputError` as `write`.
+
+    With `compress`, archives of at most `COMPRESSED_BYTES` are compressed.
+    """
     buffer = io.BytesIO()
-    save = np.savez_compressed if compress else np.savez
-    save(buffer, allow_pickle=False, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
+    values = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+    small = sum(value.nbytes for value in values.values()) < COMPRESSED_BYTES - _HEADERS
+    save = np.savez_compressed if compress and small else np.savez
+    save(buffer, allow_pickle=False, **values)
     return write(path, buffer.getvalue())

@@ -1,6 +1,7 @@
 """How large a picture file says it is, from its header alone: before a decoder takes memory for it.
 
-A file of some hundred bytes can declare a hundred thousand pixels a side.
+A file of some hundred bytes can declare a hundred thousand pixels a side. Mitsuba tells the kinds of files apart by their first bytes,
+whatever their names end in, and so does this module.
 """
 
 from __future__ import annotations
@@ -10,44 +11,83 @@ import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 from PIL import Image, UnidentifiedImageError
 
 from unrender.core.errors import InputError
+from unrender.io import bounded_files
 
-__all__ = ["MOST_VALUES", "Sizes", "check"]
+__all__ = ["LONGEST_SIDE", "MOST_VALUES", "Sizes", "check"]
 
 MOST_VALUES = 1 << 28
 """Pixels times channels of the largest picture that is decoded: one gigabyte in single precision."""
 
+LONGEST_SIDE = 1 << 17
+"""In pixels: decoders keep tables of rows."""
+
 _HEADER = 1 << 20
-_EXR_MAGIC, _EXR_PARTS = b"\x76\x2f\x31\x01", 0x1000
+_EXR_PARTS = 0x1000
 _MOST_ATTRIBUTES = 4096
+_MOST_SCANS = 100
+_FARTHEST = 1 << 30
 
 
-def check(path: Path) -> None:
-    """Raise `InputError` where a picture declares more than `MOST_VALUES`, or its header cannot be read."""
-    reader = _READERS.get(path.suffix.lower(), _by_pillow)
+def check(path: Path) -> int:
+    """How many values a picture holds, pixels times channels, all parts of a file together.
+
+    Raises `InputError`, which does not name the file, where it is no picture, declares more than `MOST_VALUES` or more than so few bytes
+    hold, or where its header cannot be read.
+    """
     try:
-        sizes = reader(path)
-    except InputError:
-        raise
+        with bounded_files.open_regular(path) as file:
+            data = file.read(_HEADER)
+            size = file.seek(0, 2)
+            file.seek(0)
+            sizes = _reader(data, file)(data, file)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{path}: ")) from error
+    except Image.DecompressionBombError as error:
+        raise InputError(f"cannot be read as a picture: {error}") from error
     except (struct.error, ValueError, IndexError, OSError, UnidentifiedImageError, SyntaxError) as error:
         raise InputError(f"cannot be read as a picture: its header is malformed ({type(error).__name__})") from error
     for width, height, channels in sizes:
-        if width < 1 or height < 1 or width * height * max(channels, 1) > MOST_VALUES:
-            what = f"{width}x{height} pixels of {channels} channels"
-            raise InputError(f"declares {what}, expected at least one and at most {MOST_VALUES} values in all")
+        values, what = width * height * max(channels, 1), f"{width}x{height} pixels of {channels} channels"
+        if width < 1 or height < 1 or values > MOST_VALUES or max(width, height) > LONGEST_SIDE:
+            limits = f"at most {MOST_VALUES} values in all and {LONGEST_SIDE} pixels a side"
+            raise InputError(f"declares {what}, expected at least one and {limits}")
+        if values > _plausible(size):
+            raise InputError(f"declares {what} in {size} bytes; if that is right, save it without compression")
+    return sum(width * height * max(channels, 1) for width, height, channels in sizes)
+
+
+def _plausible(size: int) -> int:
+    """The most values in a file of so many bytes.
+
+    What is constant compresses to a thousandth, so that a file that comes by mail can fill the memory. A photograph has some 30 values a
+    byte at most, a mask 500.
+    """
+    return max(1 << 25, min(512 * size, 1 << 26), 32 * size)
 
 
 Sizes = list[tuple[int, int, int]]
+_Reader = Callable[[bytes, IO[bytes]], Sizes]
 
 
-def _exr(path: Path) -> Sizes:
+def _reader(data: bytes, file: IO[bytes]) -> _Reader:
+    """By the first bytes (a TGA file's last ones), in Mitsuba's order."""
+    for magic, reader in _READERS:
+        if data.startswith(magic):
+            return reader
+    if file.seek(0, 2) >= 18:
+        file.seek(-18, 2)
+        if file.read() == b"TRUEVISION-XFILE.\0":
+            return _tga
+    raise ValueError("no picture that Mitsuba knows")
+
+
+def _exr(data: bytes, _: IO[bytes]) -> Sizes:
     """Of each part: the data window's width and height, and the channels."""
-    data = _start(path)
-    if data[:4] != _EXR_MAGIC:
-        raise InputError("cannot be read as a picture: not an OpenEXR file")
     many = struct.unpack_from("<I", data, 4)[0] & _EXR_PARTS
     at, found = 8, []
     while data[at] or not found:
@@ -65,7 +105,13 @@ def _exr_part(data: bytes, at: int) -> tuple[tuple[int, int, int], int]:
             if window is None or not channels:
                 raise ValueError("no data window or no channels")
             low_x, low_y, high_x, high_y = window
-            return (high_x - low_x + 1, high_y - low_y + 1, channels), at + 1
+            width, height = high_x - low_x + 1, high_y - low_y + 1
+            if width > 0 and height > 0 and not 0 <= low_x + low_y * width < _FARTHEST:
+                # Mitsuba computes this offset in 32 bits without a sign, and then writes elsewhere.
+                raise InputError(
+                    f"its data window begins at ({low_x}, {low_y}), which Mitsuba cannot read: expected (0, 0)"
+                )
+            return (width, height, channels), at + 1
         name, at = _word(data, at)
         _, at = _word(data, at)
         (length,) = struct.unpack_from("<i", data, at)
@@ -92,34 +138,86 @@ def _word(data: bytes, at: int) -> tuple[bytes, int]:
     return data[at:end], end + 1
 
 
-def _hdr(path: Path) -> Sizes:
-    match = re.search(rb"\n\s*\n[-+][XY] +(\d{1,9}) +[-+][XY] +(\d{1,9})", _start(path))
-    if match is None:
+def _hdr(data: bytes, _: IO[bytes]) -> Sizes:
+    """From the first line with a resolution, in the one form that Mitsuba reads."""
+    line = re.search(rb"^.*(?:-Y|\+X).*$", data.replace(b"\r", b""), re.MULTILINE)
+    match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0])
+    if not match:
         raise ValueError("no resolution")
     return [(int(match[2]), int(match[1]), 3)]
 
 
-def _pfm(path: Path) -> Sizes:
-    match = re.match(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s", _start(path))
+def _pfm(data: bytes, _: IO[bytes]) -> Sizes:
+    match = re.match(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s", data)
     if match is None:
         raise ValueError("no resolution")
     return [(int(match[2]), int(match[3]), 3 if match[1] == b"F" else 1)]
 
 
-def _by_pillow(path: Path) -> Sizes:
+def _ppm(data: bytes, _: IO[bytes]) -> Sizes:
+    match = re.match(rb"P6\s+(\d{1,9})\s+(\d{1,9})\s+(\d{1,5})\s", data)
+    if match is None:
+        raise ValueError("no resolution")
+    return [(int(match[1]), int(match[2]), 3)]
+
+
+def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
+    width, height, *_rest, bits = struct.unpack_from("<iiHH", data, 18)
+    return [(width, abs(height), max(bits // 8, 1))]
+
+
+def _tga(data: bytes, file: IO[bytes]) -> Sizes:
+    skipped, _, kind = struct.unpack_from("<3B", data)
+    width, height, bits = struct.unpack_from("<hhB", data, 12)  # with a sign, as Mitsuba reads them
+    depth = max(bits // 8, 1)
+    if kind & 8 and min(width, height) > 0 and width * height * depth <= MOST_VALUES:
+        file.seek(18 + skipped)
+        _check_runs(file.read(), width * height, depth)
+    return [(width, height, depth)]
+
+
+def _check_runs(packets: bytes, pixels: int, depth: int) -> None:
+    """Raise `ValueError` or `IndexError` unless run-length encoded pixels end where the picture does: Mitsuba would write on behind it."""
+    at = 0
+    while pixels > 0:
+        count = (packets[at] & 0x7F) + 1
+        at += 1 + (depth if packets[at] & 0x80 else count * depth)
+        pixels -= count
+    if pixels or at > len(packets):
+        raise ValueError("runs that do not fill the picture")
+
+
+def _png(data: bytes, _: IO[bytes]) -> Sizes:
+    """Indexed colours count as four channels, which they become."""
+    if data[12:16] != b"IHDR":
+        raise ValueError("no IHDR")
+    width, height, *_rest, kind = struct.unpack_from(">IIBB", data, 16)
+    return [(width, height, {0: 1, 2: 3, 4: 2}.get(kind, 4))]
+
+
+def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
+    file.seek(0)
+    # Each scan of a progressive file goes over the whole picture, and may take a few bytes.
+    if sum(block.count(b"\xff\xda") for block in iter(lambda: file.read(_HEADER), b"")) > _MOST_SCANS:
+        raise InputError(f"cannot be read as a picture: more than {_MOST_SCANS} scans")
+    file.seek(0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes, which are judged here
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            with Image.open(path) as image:
+            with Image.open(file, formats=["JPEG"]) as image:
                 return [(*image.size, len(image.getbands()))]
         finally:
             Image.MAX_IMAGE_PIXELS = limit
 
 
-def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_HEADER)
-
-
-_READERS: dict[str, Callable[[Path], Sizes]] = {".exr": _exr, ".hdr": _hdr, ".rgbe": _hdr, ".pfm": _pfm}
+_READERS: list[tuple[bytes, _Reader]] = [
+    (b"BM", _bmp),
+    (b"#?", _hdr),
+    (b"PF", _pfm),
+    (b"Pf", _pfm),
+    (b"P6", _ppm),
+    (b"\xff\xd8", _jpeg),
+    (b"\x89PNG\r\n\x1a\n", _png),
+    (b"\x76\x2f\x31\x01", _exr),
+]

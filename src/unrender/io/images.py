@@ -44,10 +44,8 @@ def read(source: Any, linearise: bool = True) -> Picture:
     """
     if isinstance(source, (str, Path)):
         path = Path(source)
-        if not path.exists():
-            raise InputError(f"{path}: no such file")
-        if not path.is_file():
-            raise InputError(f"{path}: not a file")
+        if (found := bounded_files.kind(path)) != "file":
+            raise InputError(f"{path}: {'not a file' if found else 'no such file'}")
         if path.suffix.lower() not in READABLE:
             raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
         try:

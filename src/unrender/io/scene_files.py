@@ -1,39 +1,76 @@
 """Which files a Mitsuba scene is made of, and whether its XML keeps to its own folder.
 
 Mitsuba reads what an XML file includes, from anywhere. A scene that came from elsewhere should not be able to have other files of this
-machine parsed, so includes are followed here first and must stay inside the scene's folder. Textures and meshes may lie anywhere: what is
-read as a picture or a mesh shows in no message.
+machine parsed, so includes are followed here first, as Mitsuba will follow them, and must stay inside the scene's folder. Textures and
+meshes may lie anywhere: what is read as a picture or a mesh shows in no message.
 """
 
 from __future__ import annotations
 
-import re
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files
+from unrender.core.text import shorten
+from unrender.io import bounded_files, spectrum_files
 
-__all__ = ["of"]
+__all__ = ["SceneFiles", "of", "read", "resolve"]
 
 _DEEPEST = 128
-_DEEPEST_INCLUDE = 16
+_DEEPEST_INCLUDE = 14
 _MOST_INCLUDES = 1000
-_LONGEST = 1 << 28
-_VARIABLE = re.compile(r"\$(\w+)")
+_MOST_ELEMENTS = 1 << 20
+_LARGEST = 1 << 26
+_LONGEST_VALUE = 1 << 12
+"""Characters of an attribute in which parameters are substituted."""
+_MOST_PARAMETERS = 1000
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files of a scene.
+
+    Attributes:
+        xml: the scene itself and what it includes, in the order in which they are begun; a file that is included twice is there twice.
+        named: textures, meshes and other files that they name and that exist.
+    """
+
+    xml: list[Path]
+    named: list[Path]
 
 
 def of(scene: Path) -> list[Path]:
     """The XML file itself, those that it includes, and the textures, meshes and other files that they name and that exist; each once.
 
     Raises:
-        InputError: the XML cannot be read, declares entities, is nested too deeply, or includes a file outside the scene's folder.
+        InputError: see `read`.
     """
-    reader = _Reader(scene.resolve().parent)
-    reader.read(scene, scene.name)
-    return list(dict.fromkeys([*reader.xml, *reader.named]))
+    found = read(scene)
+    return list(dict.fromkeys([*found.xml, *found.named]))
+
+
+def read(scene: Path) -> SceneFiles:
+    """Follow a scene's XML.
+
+    Raises:
+        InputError: the XML cannot be read, declares entities, is nested too deeply, has too many elements, includes a file outside the
+            scene's folder, names a parameter that it does not define, or a spectrum's file is malformed.
+    """
+    path = scene.absolute()
+    reader = _Reader(path.parent.resolve())
+    reader.read(path, scene.name, [path.parent], 0)
+    return SceneFiles(reader.xml, reader.named)
+
+
+def resolve(name: str, search: Sequence[Path]) -> Path | None:
+    """The first file of that name in the folders of `search`, as Mitsuba looks for it; None for none. An absolute name is itself."""
+    path = Path(name)
+    places = [path] if path.is_absolute() else [place / path for place in search]
+    return next((place for place in places if os.path.exists(place)), None)
 
 
 @dataclass
@@ -41,62 +78,142 @@ class _Reader:
     root: Path
     xml: list[Path] = field(default_factory=list)
     named: list[Path] = field(default_factory=list)
-    defaults: dict[str, str] = field(default_factory=dict)
-    _depth: int = 0
+    parameters: list[tuple[str, str]] = field(default_factory=list)  # ("$name", value), longest names first
+    _elements: int = 0
+    _bytes: int = 0
 
-    def read(self, path: Path, shown: str) -> None:
-        """Take in one XML file and what it includes."""
+    def read(self, path: Path, shown: str, search: list[Path], depth: int) -> None:
+        """Take in one XML file and what it includes.
+
+        Args:
+            path: the file.
+            shown: what messages call it.
+            search: where Mitsuba will look for what it names; its `path` elements are added.
+            depth: of the include.
+        """
         if len(self.xml) >= _MOST_INCLUDES:
             raise InputError(f"scene {shown}: more than {_MOST_INCLUDES} includes")
-        if self._depth > _DEEPEST_INCLUDE:
+        if depth > _DEEPEST_INCLUDE:
             raise InputError(f"scene {shown}: included more than {_DEEPEST_INCLUDE} deep, or by itself")
         self.xml.append(path)
+        file = _File(self, path.parent, shown, search, depth)
         parser = expat.ParserCreate()
-        depth = 0
-
-        def start(tag: str, attributes: dict[str, str]) -> None:
-            nonlocal depth
-            depth += 1
-            if depth > _DEEPEST:
-                raise InputError(f"scene {shown}: nested more than {_DEEPEST} deep")
-            self._element(tag, attributes, shown)
-
-        def end(_: str) -> None:
-            nonlocal depth
-            depth -= 1
-
-        def declared(*_: Any) -> None:
-            raise InputError(f"scene {shown}: it declares a document type or entities, which no scene needs")
-
-        parser.StartElementHandler, parser.EndElementHandler = start, end
-        parser.StartDoctypeDeclHandler = declared
+        parser.StartElementHandler, parser.EndElementHandler = file.start, file.end
+        parser.StartDoctypeDeclHandler = file.declared
+        data = bounded_files.read_bytes(path, _LARGEST, self.root if depth else None)
+        self._bytes += len(data)
+        if self._bytes > _LARGEST:
+            raise InputError(f"scene {shown}: more than {_LARGEST >> 20} MiB of XML with what it includes")
         try:
-            parser.Parse(bounded_files.read_bytes(path, _LONGEST), True)
+            parser.Parse(data, True)
         except expat.ExpatError as error:
             raise InputError(f"scene {shown}:{error.lineno}: not XML: {expat.ErrorString(error.code)}") from error
 
-    def _element(self, tag: str, attributes: dict[str, str], shown: str) -> None:
-        if tag == "default" and {"name", "value"} <= set(attributes):
-            self.defaults.setdefault(attributes["name"], self._filled(attributes["value"]))
+    def count(self, shown: str) -> None:
+        """Count one element."""
+        self._elements += 1
+        if self._elements > _MOST_ELEMENTS:
+            raise InputError(f"scene {shown}: more than {_MOST_ELEMENTS} elements")
+
+    def define(self, name: str, value: str, shown: str) -> None:
+        """Give a parameter its value, unless it has one. Names are tried from the longest to the shortest, as Mitsuba does."""
+        key = f"${name}"
+        if any(key == known for known, _ in self.parameters):
+            return
+        if len(self.parameters) >= _MOST_PARAMETERS:
+            raise InputError(f"scene {shown}: more than {_MOST_PARAMETERS} parameters")
+        place = next((n for n, (known, _) in enumerate(self.parameters) if len(key) > len(known)), len(self.parameters))
+        self.parameters.insert(place, (key, value))
+
+    def substituted(self, text: str, shown: str) -> str:
+        """The text with the values of parameters in place of `$name`; `\\$` is a dollar sign.
+
+        A name is found wherever the text begins with it: `$ab` is the value of `a` followed by "b" where there is no parameter `ab`.
+        """
+        if "$" not in text:
+            return text
+        for key, value in self.parameters:
+            at = 0
+            while (at := text.find(key, at)) >= 0:
+                if len(text) + len(value) > _LONGEST_VALUE:
+                    raise InputError(f"scene {shown}: an attribute of more than {_LONGEST_VALUE} characters with '$'")
+                if at and text[at - 1] == "\\":
+                    at += len(key)
+                else:
+                    text = text[:at] + value + text[at + len(key) :]
+                    at += len(value)
+        at = 0
+        while (at := text.find("$", at)) >= 0:
+            if not at or text[at - 1] != "\\":
+                raise InputError(f"scene {shown}: undefined parameter {shorten(text[at:], 60)}")
+            at += 1
+        return text.replace("\\$", "$")
+
+
+@dataclass
+class _File:
+    """One XML file while it is read: the handlers of its elements."""
+
+    reader: _Reader
+    folder: Path
+    shown: str
+    search: list[Path]
+    depth: int
+    _nested: int = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Take in the start of an element."""
+        self._nested += 1
+        if self._nested > _DEEPEST:
+            raise InputError(f"scene {self.shown}: nested more than {_DEEPEST} deep")
+        self.reader.count(self.shown)
+        given = {name: self.reader.substituted(value, self.shown) for name, value in attributes.items()}
+        if tag == "default" and {"name", "value"} <= set(given):
+            self.reader.define(given["name"], given["value"], self.shown)
         elif tag == "include":
-            self._include(self._filled(attributes.get("filename", "")), shown)
-        elif tag == "string" and attributes.get("name") == "filename":
-            found = self.root / self._filled(attributes.get("value", ""))
-            if found.is_file():
-                self.named.append(found)
+            self._include(given.get("filename", ""))
+        elif tag == "path":
+            self._search(given.get("value", ""))
+        elif tag == "string" and given.get("name") == "filename":
+            self._name(given.get("value", ""))
+        elif tag == "spectrum" and "filename" in given:
+            self._spectrum(given["filename"])
 
-    def _include(self, name: str, shown: str) -> None:
-        place = self.root / name
-        if not place.resolve().is_relative_to(self.root):
-            raise InputError(f"scene {shown}: it includes {name[:200]}, which is outside the scene's folder")
-        if not place.is_file():
+    def end(self, _: str) -> None:
+        """Take in the end of an element."""
+        self._nested -= 1
+
+    def declared(self, *_: Any) -> None:
+        """Refuse a document type."""
+        raise InputError(f"scene {self.shown}: it declares a document type or entities, which no scene needs")
+
+    def _include(self, name: str) -> None:
+        inside = [self.folder, *self.search]
+        place = resolve(name, inside)
+        root, words = self.reader.root, shorten(name, 200)
+        if not (self.folder / name if place is None else place).resolve().is_relative_to(root):
+            raise InputError(f"scene {self.shown}: it includes {words}, which is outside the scene's folder")
+        if place is None or not place.is_file():
             raise InputError(
-                f"scene {shown}: it includes {name[:200]}, and there is no such file in the scene's folder"
+                f"scene {self.shown}: it includes {words}, and there is no such file in the scene's folder"
             )
-        self._depth += 1
-        self.read(place, name)
-        self._depth -= 1
+        self.reader.read(place, name, inside, self.depth + 1)
 
-    def _filled(self, text: str) -> str:
-        """The text with $name replaced by the defaults that were declared before."""
-        return _VARIABLE.sub(lambda match: self.defaults.get(match[1], match[0]), text)
+    def _search(self, name: str) -> None:
+        place = resolve(name, [self.folder, *self.search])
+        if place is None or not place.is_dir():
+            raise InputError(f"scene {self.shown}: its path {shorten(name, 200)} is no folder")
+        self.search.insert(0, place)
+
+    def _name(self, name: str) -> None:
+        found = resolve(name, self.search)
+        if found is not None and found.is_file():
+            self.reader.named.append(found)
+
+    def _spectrum(self, name: str) -> None:
+        """Unlike other files, Mitsuba reads these as it parses."""
+        found = resolve(name, [*self.search, Path()])
+        if found is None:
+            raise InputError(f"scene {self.shown}: spectrum {shorten(name, 200)}: no such file")
+        spectrum_files.check(found)
+        self.reader.named.append(found)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import Any
 
 from unrender.core.errors import InputError
 
-__all__ = ["Place", "find", "parse"]
+__all__ = ["LARGEST", "Place", "check", "find", "parse"]
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -17,11 +18,31 @@ else:  # pragma: no cover
 Place = tuple[str | int, ...]
 """A field's keys and indices from the top of the file."""
 
-_LONGEST_STATEMENT = 2000
+LARGEST = 3 << 17
+"""Of a TOML file, in bytes: `tomllib` takes half a second for so many."""
+_MOST_DOTS = 200, 1 << 15
+"""In a line and in all: `tomllib` takes quadratic time for a key of many parts."""
+
+
+_SYNTAX = re.compile(r"""["'#\[\]{}]""")
+_KEY = re.compile(r"""(?:[^"'=#]|"(?:[^"\\]|\\.)*"|'[^']*')*=""")
+
+
+def check(text: str, where: str) -> None:
+    """Raise `InputError` for text that would take long to parse."""
+    if len(text) > LARGEST:
+        raise InputError(f"{where}: larger than {LARGEST >> 10} KiB, which no such file is")
+    line, everywhere = _MOST_DOTS
+    if text.count(".") > everywhere:
+        raise InputError(f"{where}: more than {everywhere} dots, expected numbers in a file of their own")
+    for number, row in enumerate(text.split("\n"), 1):
+        if row.count(".") > line:
+            raise InputError(f"{where}:{number}: more than {line} dots, expected keys of a few parts")
 
 
 def parse(text: str, where: str) -> dict[str, Any]:
     """What TOML text says. Raises `InputError`."""
+    check(text, where)
     try:
         return tomllib.loads(text)
     except RecursionError as error:
@@ -74,20 +95,51 @@ def _lines(text: str) -> dict[Place, int]:
 
 
 def _statement(rows: list[str], start: int) -> tuple[dict[str, Any] | None, int]:
-    """The statement that begins at row `start`, parsed by itself, and the row after it.
+    """The header or key of the statement that begins at row `start`, parsed by itself, and the row after the statement.
 
-    In a valid file no true prefix of a statement of several rows is valid: its bracket or string is open until its end.
+    A statement ends where its brackets and strings do.
     """
-    for end in range(start + 1, min(len(rows), start + _LONGEST_STATEMENT) + 1):
-        try:
-            return tomllib.loads("\n".join(rows[start:end])), end
-        except tomllib.TOMLDecodeError:
-            continue
-    return None, len(rows)
+    depth, quote, end = 0, "", start
+    while end < len(rows):
+        depth, quote = _open_after(rows[end], depth, quote)
+        end += 1
+        if depth <= 0 and not quote:
+            break
+    row = rows[start]
+    match = None if row.lstrip().startswith("[") else _KEY.match(row)
+    try:
+        return tomllib.loads(row if match is None else f"{match[0]}0"), end
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return None, len(rows)
+
+
+def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
+    """How many brackets are open after a row, and by what the string ends that is, "" for none."""
+    at = 0 if quote or _SYNTAX.search(row) else len(row)
+    while at < len(row):
+        letter = row[at]
+        if quote and letter == "\\" and quote[0] == '"':
+            at += 2
+        elif quote and row.startswith(quote, at):
+            at += len(quote)
+            if len(quote) == 3:  # before its end a string may have two more of them
+                at += len(row[at : at + 2]) - len(row[at : at + 2].lstrip(letter))
+            quote = ""
+        elif quote:
+            at += 1
+        elif letter == "#":
+            break
+        elif letter in "\"'":
+            quote = 3 * letter if row.startswith(3 * letter, at) else letter
+            at += len(quote)
+        else:
+            depth += (letter in "[{") - (letter in "]}")
+            at += 1
+    return depth, quote if len(quote) == 3 else ""
 
 
 def _path(statement: dict[str, Any]) -> Place:
-    """The key of a statement: down while there is one key only, which may lead on into an inline table, at no harm."""
+    """The key of a statement whose value is a number."""
     path: list[str | int] = []
     value: Any = statement
     while True:

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
 
-__all__ = ["MOST_VALUES", "READABLE", "UNIT_BOX", "Grid", "Shape", "read_grid", "read_numpy", "write_grid"]
+__all__ = ["MOST_VALUES", "READABLE", "UNIT_BOX", "Grid", "Shape", "check_vol", "read_grid", "read_numpy", "write_grid"]
 
 READABLE = (".vol", ".npy", ".npz")
 """File name endings that `read_grid` knows."""
@@ -68,8 +69,7 @@ def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) ->
     def suits(shape: Shape) -> None:
         if len(shape) not in (3, 4) or 0 in shape:
             raise InputError(f"expected a grid of shape (Z, Y, X, C), got {shape}")
-        if math.prod(shape) > MOST_VALUES:
-            raise InputError(f"declares a grid of shape {shape}, expected at most {MOST_VALUES} values in all")
+        _check_size(shape)
         if check is not None:
             check(shape if len(shape) == 4 else (*shape, 1))
 
@@ -114,7 +114,8 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
     elif ending == ".npy":
         np.save(buffer, array, allow_pickle=False)
     else:
-        np.savez_compressed(buffer, allow_pickle=False, grid=array)
+        save = np.savez_compressed if array.nbytes < files.COMPRESSED_BYTES // 2 else np.savez
+        save(buffer, allow_pickle=False, grid=array)
     return files.write(file, buffer.getvalue())
 
 
@@ -139,48 +140,65 @@ def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.n
     return array
 
 
+def check_vol(path: Path) -> int:
+    """How many numbers a `.vol` file holds. Raises `InputError` where it is none, or does not hold what its header declares."""
+    with bounded_files.open_regular(path) as file:
+        shape, _ = _vol_header(file, path, _check_size)
+    return math.prod(shape)
+
+
 def _existing(file: Path) -> Path:
     if file.suffix.lower() not in READABLE:
         raise InputError(f"{file}: unknown kind of grid, expected one of {', '.join(READABLE)}")
-    if not file.exists():
-        raise InputError(f"{file}: no such file")
-    if not file.is_file():
-        raise InputError(f"{file}: not a file")
+    if (found := bounded_files.kind(file)) != "file":
+        raise InputError(f"{file}: {'not a file' if found else 'no such file'}")
     return file
+
+
+def _check_size(shape: Shape) -> None:
+    if math.prod(shape) > MOST_VALUES:
+        raise InputError(f"declares a grid of shape {shape}, expected at most {MOST_VALUES} values in all")
 
 
 def _read_vol(path: Path, check: Callable[[Shape], None]) -> Grid:
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER.size)
-            if head[:3] != _MAGIC[:3]:
-                raise InputError("not a .vol file: it does not begin with VOL")
-            if len(head) < _HEADER.size:
-                raise InputError(f"cut short: {len(head)} bytes, its header alone has {_HEADER.size}")
-            magic, kind, x, y, z, channels, *box = _HEADER.unpack(head)
-            if magic != _MAGIC:
-                raise InputError(f"expected version 3 of the format, got {magic[3]}")
-            if kind != _FLOAT:
-                raise InputError(f"expected float32 numbers, got {_OTHERS.get(kind, f'the unknown type {kind}')}")
-            if min(x, y, z, channels) < 1:
-                raise InputError(f"declares {x}x{y}x{z} voxels of {channels} channels, expected at least one of each")
-            if not all(math.isfinite(side) for side in box):
-                raise InputError("its box is not finite")
-            shape = (z, y, x, channels)
-            check(shape)
-            there, declared = path.stat().st_size - _HEADER.size, 4 * math.prod(shape)
-            if there != declared:
-                raise InputError(f"its header declares {declared} bytes of numbers, there are {there}")
-            data = file.read(declared)
-            if len(data) != declared:
-                raise InputError("it changed while it was read")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        with bounded_files.open_regular(path) as file:
+            shape, box = _vol_header(file, path, check)
+            data = file.read(4 * math.prod(shape))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(data) != 4 * math.prod(shape):
+        raise InputError(f"{path}: it changed while it was read")
     values = np.frombuffer(data, "<f4").astype(np.float32).reshape(shape)
     _check_finite(path, values)
-    return Grid(values, tuple(box))
+    return Grid(values, box)
+
+
+def _vol_header(file: IO[bytes], path: Path, check: Callable[[Shape], None]) -> tuple[Shape, tuple[float, ...]]:
+    """Shape (Z, Y, X, C) and box; the numbers follow. Raises `InputError`."""
+    try:
+        head = file.read(_HEADER.size)
+        if head[:3] != _MAGIC[:3]:
+            raise InputError("not a .vol file: it does not begin with VOL")
+        if len(head) < _HEADER.size:
+            raise InputError(f"cut short: {len(head)} bytes, its header alone has {_HEADER.size}")
+        magic, kind, x, y, z, channels, *box = _HEADER.unpack(head)
+        if magic != _MAGIC:
+            raise InputError(f"expected version 3 of the format, got {magic[3]}")
+        if kind != _FLOAT:
+            raise InputError(f"expected float32 numbers, got {_OTHERS.get(kind, f'the unknown type {kind}')}")
+        if min(x, y, z, channels) < 1:
+            raise InputError(f"declares {x}x{y}x{z} voxels of {channels} channels, expected at least one of each")
+        if not all(math.isfinite(side) for side in box):
+            raise InputError("its box is not finite")
+        shape = (z, y, x, channels)
+        check(shape)
+        there, declared = os.fstat(file.fileno()).st_size - _HEADER.size, 4 * math.prod(shape)
+        if there != declared:
+            raise InputError(f"its header declares {declared} bytes of numbers, there are {there}")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return shape, tuple(box)
 
 
 def _check_finite(path: Path, values: np.ndarray) -> None:

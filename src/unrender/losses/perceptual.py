@@ -7,6 +7,7 @@ layers answer (Johnson, Alahi and Fei-Fei 2016, Eq. 2). It needs PyTorch and the
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +20,12 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
+from unrender.io import bounded_files
 
 __all__ = ["LAYERS", "Perceptual"]
 
+_SAFE_UNPICKLER = (2, 6)
+"""PyTorch before this version runs code from a file also with `weights_only` (CVE-2025-32434)."""
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 """Channels of the convolutions; the resolution is halved between blocks."""
 
@@ -191,8 +195,11 @@ def _load(path: Path | None, age: int, layers: tuple[str, ...], dtype: str) -> _
 
 def _read(path: Path) -> Mapping[str, Any]:
     torch = _torch()
-    if not path.is_file():
+    if bounded_files.kind(path) != "file":
         raise InputError("not a file")
+    version = tuple(int(part) for part in re.findall(r"\d+", torch.__version__)[:2])
+    if path.suffix.lower() != ".safetensors" and version < _SAFE_UNPICKLER:
+        raise InputError(f"expected a .safetensors file: PyTorch {torch.__version__} may run code that lies in another")
     try:
         if path.suffix.lower() == ".safetensors":
             from safetensors.torch import load_file  # pyright: ignore[reportMissingImports]

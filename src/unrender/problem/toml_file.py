@@ -81,7 +81,7 @@ class _Problem(_Model):
     scene: StrictStr = Field(description="the path of a Mitsuba .xml file")
     parameters: list[_Parameter] = Field(description="at least one [[parameters]] table", min_length=1)
     views: list[_View] = Field(description="at least one [[views]] table", min_length=1)
-    name: StrictStr | None = Field(None, description="a string")
+    name: StrictStr | None = Field(None, description="a string of at most 200 characters", max_length=200)
     max_depth: StrictInt = Field(6, description="a whole number of at least 1")
     loss: StrictStr | dict[str, Any] = Field(
         "L2", description='a name such as "L1", or a table such as { type = "Huber", delta = 0.1 }'
@@ -95,7 +95,7 @@ def read(path: str | Path) -> Problem:
         InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
     """
     file = Path(path)
-    text = bounded_files.read_text(file).replace("\r\n", "\n")
+    text = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
     try:
         model = _Problem.model_validate(_parse(file, text))
         problem = _build(model, file)
@@ -118,6 +118,7 @@ def _message(file: Path, text: str, place: Place, what: str) -> str:
 
 
 def _parse(file: Path, text: str) -> dict[str, Any]:
+    toml_lines.check(text, str(file))
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

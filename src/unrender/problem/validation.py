@@ -13,7 +13,8 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.io import images, parameter_values, scene_files
+from unrender.core.text import shorten
+from unrender.io import bounded_files, images, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem import coarse_to_fine
@@ -37,6 +38,9 @@ __all__ = [
 ]
 
 Bounds = tuple[float | None, float | None]
+
+_DEEPEST = 1 << 20
+_LONGEST_KEY = 200
 
 
 @runtime_checkable
@@ -77,7 +81,9 @@ class CheckedParameter:
 def check_max_depth(max_depth: Any) -> int:
     """Raise `FieldError` for what is no longest path length."""
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {max_depth!r}")
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {shorten(repr(max_depth), 60)}")
+    if max_depth > _DEEPEST:
+        raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(max_depth), 60)}")
     return max_depth
 
 
@@ -114,6 +120,10 @@ def check_parameter(
     key = parameter.key
     if not isinstance(key, str) or key not in known:
         raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{_near_key(str(key), known)}")
+    if len(key) > _LONGEST_KEY:  # files are named by it
+        raise FieldError(
+            ("parameters", index, "key"), f"{key}: expected at most {_LONGEST_KEY} characters, got {len(key)}"
+        )
     info = known[key]
     if not info.differentiable and not info.perturbable:
         raise FieldError(("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}")
@@ -253,7 +263,7 @@ def open_renderer(scene: Any, max_depth: int) -> Renderer:
     from unrender.backend.variant import ensure
 
     try:
-        if isinstance(scene, (str, Path)) and Path(scene).is_file() and Path(scene).suffix.lower() == ".xml":
+        if isinstance(scene, (str, Path)) and bounded_files.kind(Path(scene)) == "file":
             scene_files.of(Path(scene))  # refuses what Mitsuba would include from elsewhere
     except InputError as error:
         raise FieldError(("scene",), str(error).removeprefix("scene ")) from error

@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from unrender.core.text import visible
 from unrender.report import formatting
 from unrender.runs.folder.schema import RunRecord
 
@@ -68,11 +69,19 @@ def environment(templates: BaseLoader) -> Environment:
         loader=templates,
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_visible,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     found.filters.update(number=formatting.number, duration=formatting.duration, count=formatting.count)
     return found
+
+
+def _visible(value: Any) -> Any:
+    """Text of others without control characters: a page is copied from, and viewed in a terminal."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return visible(value, "\n\t")
+    return value
 
 
 @cache

@@ -10,9 +10,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.backend.variant import ensure
 from unrender.core.errors import InputError
 from unrender.io.volumes import read_grid
+from unrender.rendering.mitsuba.description import parse
 
 __all__ = ["MediumKey", "attached_media", "extinction_transforms"]
 
@@ -50,15 +50,7 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
 
     Media and volumes that are ready-made objects have none.
     """
-    config = mi.parser.ParserConfig(ensure())
-    config.merge_equivalent = config.merge_meshes = config.parallel = False
-    if isinstance(description, Path):
-        state, folder = mi.parser.parse_file(config, str(description)), description.parent
-    else:
-        state, folder = mi.parser.parse_dict(config, dict(description)), Path()
-    mi.parser.transform_upgrade(config, state)
-    mi.parser.transform_resolve(config, state)
-    nodes: Any = state.nodes
+    nodes: Any = parse(description).state.nodes
     slots = []
     for node in _children(nodes, nodes[0]).values():
         if node.type in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
@@ -67,7 +59,7 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
                 # The parser does not know the type of media that are plugins in Python.
                 if child.type == mi.ObjectType.Medium or side in ("interior", "exterior") or "sigma_t" in child.props:
                     owner = node.props.id(), side
-                    slots.append((owner, _transform(nodes, child, folder)))
+                    slots.append((owner, _transform(nodes, child)))
     return {key: matrix for key, matrix in _numbered(slots) if matrix is not None}
 
 
@@ -78,7 +70,7 @@ def _children(nodes: Any, node: Any) -> dict[str, Any]:
     return {name: nodes[props[name].index()] for name in props.keys() if props.type(name) == resolved}  # noqa: SIM118
 
 
-def _transform(nodes: Any, medium: Any, folder: Path) -> np.ndarray | None:
+def _transform(nodes: Any, medium: Any) -> np.ndarray | None:
     volume = _children(nodes, medium).get("sigma_t")
     if volume is None or volume.props.plugin_name() != "gridvolume":
         return None
@@ -88,7 +80,7 @@ def _transform(nodes: Any, medium: Any, folder: Path) -> np.ndarray | None:
         to_world = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
     if props.get("use_grid_bbox", False) and "filename" in props:
         try:
-            box = np.array(read_grid(folder / props["filename"]).box).reshape(2, 3)
+            box = np.array(read_grid(props["filename"]).box).reshape(2, 3)
         except InputError:  # found by Mitsuba on another path
             return None
         place = np.eye(4)

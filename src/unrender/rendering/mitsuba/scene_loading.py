@@ -11,6 +11,8 @@ import mitsuba as mi
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
+from unrender.io import bounded_files
+from unrender.rendering.mitsuba import description as loading
 from unrender.rendering.mitsuba import emissive
 from unrender.rendering.mitsuba.grid_transforms import attached_media
 
@@ -42,22 +44,21 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
         return _loaded_before(description), {}
     if callable(description):
         description = description()
+    name = str(description) if isinstance(description, (str, Path)) else "dictionary"
     try:
         if isinstance(description, (str, Path)):
             path = Path(description)
-            if not path.is_file():
-                raise InputError(f"scene {path}: no such file")
-            with variant.two_threads():
-                scene = mi.load_file(str(path), parallel=False, optimize=False)
+            if (found := bounded_files.kind(path)) != "file":
+                raise InputError(f"scene {path}: {'not a file' if found else 'no such file'}")
+            scene = loading.load(path)
         elif isinstance(description, dict):
-            with variant.two_threads():
-                scene = mi.load_dict(description, parallel=False, optimize=False)
+            scene = loading.load(description)
         else:
             raise InputError(f"scene: expected an .xml path or a Mitsuba dictionary, got {type(description).__name__}")
-    except InputError:
-        raise
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith("scene") else f"scene {name}: {text}") from error
     except Exception as error:
-        name = str(description) if isinstance(description, (str, Path)) else "dictionary"
         raise InputError(f"scene {name}: Mitsuba could not load it: {_one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")

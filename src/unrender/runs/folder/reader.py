@@ -5,6 +5,7 @@ All that reads run folders goes through here and `history`: resume, report, comp
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +28,9 @@ __all__ = [
     "read_run_record",
     "root_mean_square",
 ]
+
+_MOST_LISTED = 1000
+"""Of the files in a folder that is no run folder, looked through for a hint."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +105,15 @@ def read_run_record(folder: Path) -> RunRecord:
     Raises:
         InputError: there is no such folder, it is no run folder, or run.json is malformed.
     """
-    if not folder.is_dir():
-        siblings = [p.name for p in folder.parent.iterdir() if p.is_dir()] if folder.parent.is_dir() else []
-        what = "a file, expected a run folder" if folder.exists() else "no such run folder"
+    if (found := bounded_files.kind(folder)) != "folder":
+        around = itertools.islice(folder.parent.iterdir(), _MOST_LISTED) if folder.parent.is_dir() else []
+        siblings = [p.name for p in around if p.is_dir()]
+        what = "a file, expected a run folder" if found else "no such run folder"
         raise InputError(f"{folder}: {what}{did_you_mean(folder.name, siblings)}")
-    if not (folder / schema.RECORD).is_file():
-        inside = sorted(p.parent.name for p in folder.glob(f"*/{schema.RECORD}"))
+    if bounded_files.kind(folder / schema.RECORD) != "file":
+        inside = sorted(
+            p.name for p in itertools.islice(folder.iterdir(), _MOST_LISTED) if (p / schema.RECORD).is_file()
+        )
         hint = f" (run folders inside it: {', '.join(inside[:5])})" if inside else ""
         raise InputError(f"{folder}: not a run folder: {schema.RECORD} is missing{hint}")
     return read_record(folder / schema.RECORD, folder)

@@ -1,0 +1,26 @@
+"""Files of spectra that a scene names, checked before Mitsuba reads them: `.spd`, lines of a wavelength and a value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from unrender.core.errors import InputError
+from unrender.io import bounded_files
+
+__all__ = ["check"]
+
+_LARGEST = 1 << 20
+
+
+def check(path: Path) -> None:
+    """Raise `InputError` for what is no such file."""
+    text = bounded_files.read_text(path, _LARGEST)
+    for number, line in enumerate(text.split("\n"), 1):
+        words = line.partition("#")[0].split()
+        try:
+            if len(words) not in (0, 2):
+                raise ValueError
+            for word in words:
+                float(word)
+        except ValueError as error:
+            raise InputError(f"{path}:{number}: expected a wavelength and a value") from error

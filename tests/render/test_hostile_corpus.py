@@ -1,0 +1,77 @@
+"""Hostile inputs and damaged run folders: none hangs, none runs code, and each is refused in a line, in little time and memory."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hostile_folders
+import hostile_inputs
+import pytest
+from hostile_inputs import INPUTS
+from hostile_worker import Outcome, take_in
+
+from unrender.core.errors import InputError
+
+_SECONDS, _WALL, _BYTES = 1.0, 10.0, 1 << 30
+"""Of an input at most. The clock goes on while other processes run: it is held to what is no hang."""
+
+_DEAR = (  # to write
+    "a PNG of zeros",
+    "forty textures of 75 million values",
+    "a hundred megabytes of problem file",
+    "an archive of 400000 names",
+    "an archive of four gigabytes of zeros",
+    "a list of a hundred thousand lines",
+    "a thousand includes",
+)
+
+
+@pytest.mark.parametrize("name", [name for name in INPUTS if name not in _DEAR])
+def test_a_hostile_input_is_refused(tmp_path: Path, name: str):
+    with pytest.raises(InputError) as caught:
+        INPUTS[name](tmp_path)()
+    line = str(caught.value)
+    assert line.isprintable()
+    assert len(line) <= 1500
+    assert "Mitsuba could not load" not in line
+
+
+def _judge(outcomes: list[Outcome], count: int, harmless: tuple[str, ...] = ()) -> None:
+    worst = [
+        f"{o.name}: {o.kind} {o.said}" for o in outcomes if o.kind != ("taken" if o.name in harmless else "refused")
+    ]
+    assert not worst
+    assert len(outcomes) >= count
+    assert [o.name for o in outcomes if not o.said.isprintable()] == []
+    assert max((o.seconds, o.name) for o in outcomes) < (_SECONDS,)
+    assert max((o.wall, o.name) for o in outcomes) < (_WALL,)
+    assert max((o.bytes, o.name) for o in outcomes) < (_BYTES,)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="measures by /proc")
+def test_hostile_inputs_take_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    outcomes = take_in(hostile_inputs.__name__, "INPUTS", list(INPUTS), tmp_path)
+    _print(outcomes, capsys)
+    _judge(outcomes, 80)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="measures by /proc")
+def test_damaged_folders_take_little(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    outcomes = take_in(hostile_folders.__name__, "FOLDERS", list(hostile_folders.FOLDERS), tmp_path)
+    _print(outcomes, capsys)
+    _judge(outcomes, 60, hostile_folders.HARMLESS)
+
+
+def _print(outcomes: list[Outcome], capsys: pytest.CaptureFixture[str]) -> None:
+    with capsys.disabled():
+        for what, worst in {
+            "seconds": max(outcomes, key=lambda o: o.seconds),
+            "memory": max(outcomes, key=lambda o: o.bytes),
+        }.items():
+            print(
+                f"\nmost {what}: {worst.name}: {worst.seconds:.2f} s, {worst.bytes / 1e6:.0f} MB of {len(outcomes)}",
+                end="",
+            )
