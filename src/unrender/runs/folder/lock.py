@@ -83,11 +83,13 @@ class Lock:
         """Let the folder go. Harmless where it is not held."""
         if self._file is None:
             return
-        with contextlib.suppress(OSError):
-            if self.is_held():
-                self.path.unlink()
-        os.close(self._file)
-        self._file = None
+        try:
+            with contextlib.suppress(OSError):
+                if self.is_held():
+                    self.path.unlink()
+        finally:
+            os.close(self._file)
+            self._file = None
 
     def _try(self) -> int | None:
         """The locked file; None where it was deleted in between: then try again."""
