@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -60,12 +61,26 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return found | states(folder)
 
 
-def kill_everywhere(tmp_path: Path, whole: dict[str, bytes], begin: Callable[[Path], Any], chosen: slice) -> int:
+@pytest.fixture
+def no_flush(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flushing takes most of the time, and no kill needs it."""
+    monkeypatch.setattr(os, "fsync", lambda file: None)
+
+
+def kill_everywhere(
+    tmp_path: Path,
+    whole: dict[str, bytes],
+    chosen: slice,
+    begin: Callable[[Path], Any] = run,
+    prepare: Callable[[Path], Any] = lambda folder: None,
+) -> int:
     """Kill `begin` at those of its file operations, and go on. Returns how many it has."""
+    prepare(tmp_path / "counted")
     with operations(tmp_path / "counted") as seen:
         begin(tmp_path / "counted")
     for number in range(len(seen))[chosen]:
         folder = tmp_path / f"killed-{number}"
+        prepare(folder)
         with pytest.raises(Killed), operations(folder, at=number):
             begin(folder)
         go_on(folder)
@@ -75,31 +90,31 @@ def kill_everywhere(tmp_path: Path, whole: dict[str, bytes], begin: Callable[[Pa
     return len(seen)
 
 
-def begin_anew(folder: Path) -> None:
-    run(folder)
-
-
-def resume_killed(original: Path) -> Callable[[Path], None]:
-    def begin(folder: Path) -> None:
-        if not folder.exists():
-            folder.mkdir()
-            shutil.copytree(original, folder, dirs_exist_ok=True)
-        ur.resume(folder)
-
-    return begin
-
-
+@pytest.mark.usefixtures("no_flush")
 def test_a_run_killed_at_some_file_operations(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    assert kill_everywhere(tmp_path, whole, begin_anew, slice(0, None, 9)) > 100
+    assert kill_everywhere(tmp_path, whole, slice(0, None, 5)) > 100
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_flush")
 def test_a_run_killed_at_every_file_operation(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    kill_everywhere(tmp_path, whole, begin_anew, slice(None))
+    kill_everywhere(tmp_path, whole, slice(None))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_flush")
+def test_a_resumed_run_killed_at_every_file_operation(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    with pytest.raises(Killed), operations(tmp_path / "interrupted", at=150):
+        run(tmp_path / "interrupted")
+
+    def copy(folder: Path) -> None:
+        shutil.copytree(tmp_path / "interrupted", folder)
+
+    assert kill_everywhere(tmp_path, whole, slice(None), ur.resume, copy) > 50
 
 
 def test_a_power_cut_leaves_the_last_checkpoint(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    """On the worst disk that POSIX allows, at every twelfth flush, and right after the end."""
+    """On the worst disk that POSIX allows, at every fifth flush, and right after the end."""
     promised: list[tuple[int, int]] = []
 
     class Note(ur.Callback):
@@ -107,7 +122,7 @@ def test_a_power_cut_leaves_the_last_checkpoint(tmp_path: Path, whole: dict[str,
             if run.step % 2 == 0:
                 promised.append((now.flushes, run.step))
 
-    with recording(tmp_path, every=12) as (now, cuts):
+    with recording(tmp_path, every=5) as (now, cuts):
         run(tmp_path / "run", callbacks=[Note()])
         end = now.copy()
     assert len(cuts) >= 5

@@ -260,11 +260,11 @@ def test_a_disk_that_is_full_is_a_warning_and_the_run_goes_on(problem, tmp_path,
     before = module.files.write
     written = []
 
-    def write(path: Path, data: bytes, durable: bool = True) -> Path:
+    def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
         written.append(path.name)
         if written.count("views.npz") >= when:
             raise ur.InputError(f"{path}: cannot be written: No space left on device")
-        return before(path, data, durable)
+        return before(path, data, durable, name_too)
 
     monkeypatch.setattr(module.files, "write", write)
     result = descend(problem, [Live(tmp_path)])

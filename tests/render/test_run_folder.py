@@ -180,7 +180,7 @@ def test_a_disk_that_stays_full_is_one_error_in_the_end(tmp_path: Path, monkeypa
     assert ur.resume(folder).parameters[RATE] == plain().parameters[RATE]
 
 
-def _write_nothing(path: Path, data: bytes, durable: bool = True) -> Path:
+def _write_nothing(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
     raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
 
 

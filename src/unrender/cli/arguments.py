@@ -16,6 +16,7 @@ from unrender import gallery
 from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
+from unrender.io import files
 from unrender.problem.problem import Problem
 
 __all__ = [
@@ -167,7 +168,7 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
                 raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
                 raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
-        given.mkdir(parents=True, exist_ok=True)
+        files.make_folder(given)
     except OSError as error:
         raise InputError(f"--out {given}: {error.strerror or error}") from error
     if not os.access(given, os.W_OK | os.X_OK):

@@ -29,7 +29,6 @@ __all__ = [
     "remove",
     "remove_leftovers",
     "replace_folder",
-    "sync_ancestors",
     "sync_folder",
     "sync_tree",
     "temporary",
@@ -48,12 +47,18 @@ _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 # ---------------------------------------------------------------------- files
 
 
-def write(path: Path, data: bytes, durable: bool = True) -> Path:
+def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
     """Write `data` beside `path` and rename it into place, making the folder where it is missing. Returns `path`.
 
-    Unless `durable` is false, it is on the disk before this returns, name and all: for what nobody misses after a power cut.
+    Args:
+        path: where.
+        data: what the file is to hold.
+        durable: whether its bytes are on the disk before it gets its name. False is for what nobody misses after a power cut.
+        name_too: whether its name is on the disk, too, when this returns. False is for several files of one folder, which `sync_folder`
+            then does for all; until then a power cut may leave what stood there before.
 
-    Raises `InputError` where the place cannot be written to; what stood there before is then untouched.
+    Raises:
+        InputError: the place cannot be written to; what stood there before is then untouched.
     """
     partial = temporary(path)
     try:
@@ -65,7 +70,7 @@ def write(path: Path, data: bytes, durable: bool = True) -> Path:
                     file.flush()
                     flush(file.fileno())
             partial.replace(path)
-            if durable:
+            if durable and name_too:
                 sync_folder(path.parent)
         finally:
             partial.unlink(missing_ok=True)
@@ -74,12 +79,14 @@ def write(path: Path, data: bytes, durable: bool = True) -> Path:
     return path
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], compress: bool = True, durable: bool = True) -> Path:
-    """Write an .npz archive of float32 arrays. Raises `InputError` as `write`."""
+def write_arrays(
+    path: Path, arrays: Mapping[str, np.ndarray], compress: bool = True, durable: bool = True, name_too: bool = True
+) -> Path:
+    """Write an .npz archive of float32 arrays; see `write`."""
     buffer = io.BytesIO()
     save = np.savez_compressed if compress else np.savez
     save(buffer, allow_pickle=False, **{k: np.asarray(v, np.float32) for k, v in arrays.items()})
-    return write(path, buffer.getvalue(), durable)
+    return write(path, buffer.getvalue(), durable, name_too)
 
 
 def temporary(path: Path, end: str = PARTIAL) -> Path:
@@ -122,13 +129,6 @@ def sync_folder(folder: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-def sync_ancestors(folder: Path) -> None:
-    """Have a folder's own name on the disk, and those of the folders above it. Folders that this process may not read are left out."""
-    for parent in folder.absolute().parents:
-        with contextlib.suppress(OSError):
-            sync_folder(parent)
 
 
 def sync_tree(folder: Path) -> None:

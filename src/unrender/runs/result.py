@@ -93,13 +93,12 @@ class Result:
         folder = Path(directory)
         try:
             files.make_folder(folder)
-            files.write_arrays(folder / schema.PARAMETERS, self.parameters)
-            files.write_arrays(folder / schema.INITIAL, self.initial)
-            if self.truth:
-                files.write_arrays(folder / schema.TRUTH, self.truth)
-            if self.pictures:
-                files.write_arrays(folder / schema.PICTURES, self.pictures)
-            files.write(folder / schema.HISTORY, lines(self.history))
+            archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
+            for name, values in {**archives, schema.PICTURES: self.pictures}.items():
+                if values or name in (schema.PARAMETERS, schema.INITIAL):
+                    files.write_arrays(folder / name, values, name_too=False)
+            files.write(folder / schema.HISTORY, lines(self.history), name_too=False)
+            files.sync_folder(folder)
             record = json.dumps(self.record(status or self.status), indent=2) + "\n"
             files.write(folder / schema.RECORD, record.encode())
         except OSError as error:

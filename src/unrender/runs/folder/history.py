@@ -82,10 +82,13 @@ class HistoryFile:
         self.size = 0
         """Of the file, in bytes."""
 
-    def rewrite(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Make the file hold just these, and go on from there. Raises `OSError` or `InputError`; the file is then as it was."""
+    def rewrite(self, records: Iterable[Mapping[str, Any]], name_too: bool = True) -> None:
+        """Make the file hold just these, and go on from there; see `files.write`.
+
+        Raises `OSError` or `InputError`; the file is then as it was.
+        """
         text = lines(records)
-        files.write(self.path, text)
+        files.write(self.path, text, name_too=name_too)
         opened = os.open(self.path, os.O_WRONLY | os.O_CLOEXEC)
         self.close()
         self._file, self.size, self._pending = opened, len(text), []

@@ -145,11 +145,12 @@ class RunWriter(Hook):
         Without pictures for a run that was told to terminate: whoever did waits for seconds at most.
         """
         self.write_checkpoint(descent, result)
-        # What took long is safe before what takes seconds more.
-        self._save(result, "running" if result.status == "finished" else result.status)
         if result.stopped != TERMINATED:
+            if result.status != "finished" or self._written_step != result.steps:
+                # What took long is safe, and how it ended is known, before what takes seconds more.
+                self._save(result, "running" if result.status == "finished" else result.status)
             result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
-            self._save(result, result.status)
+        self._save(result, result.status)
         return result
 
     def on_error(self, descent: Descent, error: BaseException) -> None:
@@ -196,7 +197,6 @@ class RunWriter(Hook):
     def _acquire(self) -> None:
         try:
             files.make_folder(self.folder)
-            files.sync_ancestors(self.folder)  # it may have been made by whoever named it
         except OSError as error:
             raise InputError(f"run folder {self.folder}: {error.strerror or error}") from error
         self._lock.acquire()
@@ -210,12 +210,13 @@ class RunWriter(Hook):
 
     def _write_start(self, result: Result) -> None:
         serialization.save(self.problem, self.folder)
-        files.write(self.folder / METHOD, _method_text(self.method))
-        files.write_arrays(self.folder / INITIAL, result.initial)
+        files.write(self.folder / METHOD, _method_text(self.method), name_too=False)
+        files.write_arrays(self.folder / INITIAL, result.initial, name_too=False)
         if result.truth:
-            files.write_arrays(self.folder / TRUTH, result.truth)
-        files.write_arrays(self.folder / PARAMETERS, result.parameters)
-        self._history.rewrite(result.history)
+            files.write_arrays(self.folder / TRUTH, result.truth, name_too=False)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters, name_too=False)
+        self._history.rewrite(result.history, name_too=False)
+        files.sync_folder(self.folder)
         self._write_record(result, "running")
 
     def _write_record(self, result: Result, status: str, error: str = "") -> None:
@@ -231,7 +232,7 @@ class RunWriter(Hook):
         self._history.sync()
         problem = result.problem["fingerprint"]
         checkpoint.write(self.folder, result.steps, seed, pack(state), deciding_versions(), problem)
-        files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False, name_too=False)
         self._write_record(result, "running")
         self._written_step = result.steps
 
