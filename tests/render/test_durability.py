@@ -104,7 +104,7 @@ def test_a_run_killed_at_every_file_operation(tmp_path: Path, whole: dict[str, b
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flush")
 def test_a_resumed_run_killed_at_every_file_operation(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    with pytest.raises(Killed), operations(tmp_path / "interrupted", at=150):
+    with pytest.raises(Killed), operations(tmp_path / "interrupted", at=100):
         run(tmp_path / "interrupted")
 
     def copy(folder: Path) -> None:
