@@ -32,6 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with signals:
             status = _execute(given)
+        status = signals.status or status
     except (KeyboardInterrupt, typer.Abort):  # the latter is what Typer makes of the former
         status = signals.status or INTERRUPTED
     except BaseException:

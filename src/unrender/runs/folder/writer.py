@@ -92,7 +92,7 @@ class RunWriter(Hook):
     _written_step: int = -1
     _written_at: float = field(default_factory=time.perf_counter)
     _cost: float = 0.0
-    _thin_from: int = MOST_KEPT
+    _thin_from: int = 0
 
     def __post_init__(self) -> None:
         self._lock = Lock(self.folder)
@@ -134,7 +134,7 @@ class RunWriter(Hook):
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """Append the step to the history; write a checkpoint where one is due."""
         self.append(record)
-        if self._history.size > self._thin_from:
+        if self._history.size > max(MOST_KEPT, self._thin_from):
             self._guarded("history", lambda: self._thin(descent.log.history))
         if self.checkpoint_due(descent.run.step):
             self.write_checkpoint(descent)
@@ -243,7 +243,7 @@ class RunWriter(Hook):
         if len(kept) < len(records):
             records[:] = kept
             self._history.rewrite(records)
-            self._thin_from = MOST_KEPT
+            self._thin_from = 0
 
     def _restore_folder(self, result: Result) -> None:
         """See that the folder is still there and locked; make it again where it was deleted."""
