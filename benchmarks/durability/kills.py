@@ -57,8 +57,8 @@ class _Case:
     def go_on(self, run: Path, whole: dict[str, bytes], anew: Sequence[object]) -> str:
         """Resume a run, or begin it anew where it had not begun."""
         if (run / "run.json").exists():
-            if json.loads((run / "run.json").read_text())["status"] != "finished":
-                self.must("resume", run)
+            finished = json.loads((run / "run.json").read_text())["status"] == "finished"
+            self.must("report" if finished else "resume", run)
         else:
             self.must(*anew)
         return "" if final_state(run) == whole else "other numbers"
@@ -170,7 +170,10 @@ def campaign(victims: Victims, folder: Path, command: str, number: int) -> dict[
         if victims.carry_out(*case.words(place), watch=str(place), at=operation) == KILLED:
             killed += 1
             at[names[operation].split()[0]] += 1
-            reason = case.judge(place)
+            try:
+                reason = case.judge(place)
+            except (RuntimeError, OSError, ValueError) as error:
+                reason = str(error)
             left = leftovers(place)
             if reason or left:
                 wrong.append(f"operation {operation}, {names[operation]}: {reason} {left}")

@@ -109,7 +109,7 @@ def test_an_export_that_died_is_set_right_by_the_next(tmp_path: Path) -> None:
     (tmp_path / "out").rename(tmp_path / f".out.{dead}.old")
     (tmp_path / f".out.{dead}.part").mkdir()
     (tmp_path / f".out.{dead}.part" / "scene.xml").write_text("half")
-    with pytest.raises(InputError, match="holds an earlier export"):  # it is back
+    with pytest.raises(ur.InputError, match="holds an earlier export"):  # it is back
         ur.export((problem, values), tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 

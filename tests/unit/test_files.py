@@ -134,6 +134,13 @@ def test_what_the_dead_left_is_removed_and_what_the_living_write_is_not(tmp_path
     assert (tmp_path / "page.html.1.part").exists()  # of the first process, which lives
 
 
+def test_who_writes_a_file_removes_what_the_dead_left_of_it(tmp_path: Path) -> None:
+    for name in ("page.html", "other.html"):
+        (tmp_path / f"{name}.{DEAD}.part").write_text("half")
+    files.write(tmp_path / "page.html", b"whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"other.html.{DEAD}.part", "page.html"]
+
+
 def test_nothing_is_removed_through_a_link(tmp_path: Path) -> None:
     away = tmp_path / "away"
     make(away / f".scene.{DEAD}.part", "theirs")

@@ -27,7 +27,7 @@ from unrender.report.equal_time import Comparison, Spread
 __all__ = ["DEFAULT_SECONDS", "compare"]
 
 DEFAULT_SECONDS = 20.0
-_MARKS = ("compare.json", "*-seed*/run.json")
+_MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
 def compare(

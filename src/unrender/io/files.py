@@ -50,6 +50,8 @@ _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
     """Write `data` beside `path` and rename it into place, making the folder where it is missing. Returns `path`.
 
+    What processes that died while they wrote it have left is removed where the file is `durable`.
+
     Args:
         path: where.
         data: what the file is to hold.
@@ -63,6 +65,8 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
     partial = temporary(path)
     try:
         make_folder(path.parent, durable)
+        if durable:
+            remove_leftovers(path.parent, (path.name,))
         try:
             with partial.open("wb") as file:
                 file.write(data)
