@@ -100,6 +100,20 @@ def test_a_scene_with_other_values_than_asked_for_is_not_left(tmp_path: Path, mo
     assert not list(tmp_path.iterdir())
 
 
+def test_an_export_that_died_is_set_right_by_the_next(tmp_path: Path) -> None:
+    """One that died between two renames, on a system that cannot exchange names, and one that died before."""
+    problem = ur.gallery.problem("lamp", resolution=8, reference_spp=4)
+    values = {key: np.asarray(value) for key, value in problem.initial().items()}
+    ur.export((problem, values), tmp_path / "out")
+    dead = 2**22 + 1
+    (tmp_path / "out").rename(tmp_path / f".out.{dead}.old")
+    (tmp_path / f".out.{dead}.part").mkdir()
+    (tmp_path / f".out.{dead}.part" / "scene.xml").write_text("half")
+    with pytest.raises(ur.InputError, match="holds an earlier export"):  # it is back
+        ur.export((problem, values), tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
 def test_posed_matrices_are_the_renderers_poses() -> None:
     """The matrix takes points where the renderer's rays see them."""
     loaded = mi.load_dict(scene({"type": "diffuse"}), parallel=False, optimize=False)

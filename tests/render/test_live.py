@@ -260,11 +260,11 @@ def test_a_disk_that_is_full_is_a_warning_and_the_run_goes_on(problem, tmp_path,
     before = module.files.write
     written = []
 
-    def write(path: Path, data: bytes) -> Path:
+    def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
         written.append(path.name)
         if written.count("views.npz") >= when:
             raise ur.InputError(f"{path}: cannot be written: No space left on device")
-        return before(path, data)
+        return before(path, data, durable, name_too)
 
     monkeypatch.setattr(module.files, "write", write)
     result = descend(problem, [Live(tmp_path)])
@@ -272,6 +272,52 @@ def test_a_disk_that_is_full_is_a_warning_and_the_run_goes_on(problem, tmp_path,
     (warning,) = result.warnings
     assert "No space left on device" in warning
     assert "\n" not in warning
+
+
+@pytest.mark.parametrize("when", [0, 2])
+def test_after_a_full_disk_the_controls_are_alive(problem, tmp_path, monkeypatch, when):
+    """Full from the beginning, or from the second step; until the fifth. Commands are followed meanwhile, too."""
+    monkeypatch.setattr(module, "_RETRY_SECONDS", 0.0)
+    full = [when == 0]
+    before, opened = module.files.write, Path.open
+
+    def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
+        if full[0]:
+            raise ur.InputError(f"{path}: cannot be written: No space left on device")
+        return before(path, data, durable, name_too)
+
+    def open_file(path: Path, mode: str = "r", *more: Any, **named: Any) -> Any:
+        if full[0] and mode == "ab":
+            raise OSError(28, "No space left on device")
+        return opened(path, mode, *more, **named)
+
+    monkeypatch.setattr(module.files, "write", write)
+    monkeypatch.setattr(Path, "open", open_file)
+    source, states = RunMonitor(tmp_path), []
+    steps = Then(
+        _2=lambda: full.__setitem__(0, True),
+        _5=lambda: full.__setitem__(0, False),
+        _7=lambda: states.append(source.snapshot()),
+        _8=lambda: order(tmp_path, "stop"),
+    )
+    result = descend(problem, [steps, Live(tmp_path)], steps=12)
+    assert (result.stopped, result.steps) == ("interrupted", 8)
+    (warning,) = result.warnings
+    assert "the run goes on, but cannot be watched until there is room" in warning
+    (seen,) = states
+    assert (seen.state, seen.problems) == (RUNNING, ())
+    assert seen.run.record.steps == len(seen.run.history) == 6  # as the step before left it
+    assert seen.run.initial.keys() == set(problem.initial())
+
+
+def test_commands_are_followed_while_the_disk_is_full(problem, tmp_path, monkeypatch):
+    live = Live(tmp_path)
+
+    def fill() -> None:
+        monkeypatch.setattr(live, "_update", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        order(tmp_path, "stop")
+
+    assert descend(problem, [Then(_3=fill), live]).steps == 3
 
 
 def test_what_is_not_finite_is_null_for_those_who_watch(problem, tmp_path):

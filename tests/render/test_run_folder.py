@@ -180,7 +180,7 @@ def test_a_disk_that_stays_full_is_one_error_in_the_end(tmp_path: Path, monkeypa
     assert ur.resume(folder).parameters[RATE] == plain().parameters[RATE]
 
 
-def _write_nothing(path: Path, data: bytes, durable: bool = False) -> Path:
+def _write_nothing(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
     raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
 
 
@@ -324,11 +324,56 @@ def test_a_number_given_to_another_process_is_told_apart(tmp_path: Path) -> None
     mine.release()
 
 
-def test_the_lock_of_another_machine_is_believed(tmp_path: Path) -> None:
+def mounted(folder: Path, monkeypatch: pytest.MonkeyPatch, kind: str, options: str) -> None:
+    """Let the folder's file system be one of another kind."""
+    device = folder.stat().st_dev
+    table = folder / "mounts"
+    table.write_text(
+        f"22 27 0:2 / /proc rw - proc proc rw\n36 27 {os.major(device)}:{os.minor(device)} / /data rw shared:1 - "
+        f"{kind} server:/data rw,{options}\n"
+    )
+    monkeypatch.setattr(lock, "_MOUNTS", table)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("nfs4", "local_lock=all"),
+        ("nfs", "nolock,local_lock=none"),
+        ("cifs", "nobrl"),
+        ("fuse.sshfs", "rw"),
+        ("ceph", "rw"),
+    ],
+)
+def test_the_lock_of_another_machine_is_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, options: str
+) -> None:
+    """Where it may be held though this machine's kernel knows of nobody."""
+    mounted(tmp_path, monkeypatch, kind, options)
     write_lock(tmp_path, host="elsewhere", started="")
+    assert lock.holder(tmp_path) is not None
     with pytest.raises(InputError, match=r"in use by process \d+ on elsewhere; if that is no more, delete .*lock"):
         Lock(tmp_path).acquire()
     assert (tmp_path / "lock").exists()
+
+
+@pytest.mark.parametrize(("kind", "options"), [("ext4", "rw"), ("overlay", "rw"), ("nfs4", "vers=4.2,local_lock=none")])
+def test_a_container_that_starts_again_finds_its_lock_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, options: str
+) -> None:
+    """Under another host name, with the same process number, on a file system whose locks exclude everybody."""
+    folder = tmp_path / "run"
+    start(folder, steps=6)
+    mounted(folder, monkeypatch, kind, options)
+    write_lock(folder, host="3f2a9c81d4e7", started="")
+    assert lock.holder(folder) is None
+    assert ur.resume(folder, steps=12).parameters[RATE] == plain().parameters[RATE]
+    held = Lock(folder)
+    held.acquire()
+    write_lock(folder, host="3f2a9c81d4e7", started="")  # and one that is held is refused, whatever it says
+    with pytest.raises(InputError, match="in use by process"):
+        ur.resume(folder, steps=20)
+    held.release()
 
 
 def test_without_locks_in_the_file_system_the_name_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

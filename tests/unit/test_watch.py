@@ -142,6 +142,23 @@ def test_the_page_shows_a_finished_run(tmp_path):
     assert [asked.get(f"{address}?stops={bad}").status_code for bad in ("nan", "inf", "99", "x")] == [400] * 4
 
 
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"status": "failed", "stopped": "non-finite"}, "failed, given up: gradients were not finite"),
+        ({"status": "failed", "stopped": "", "error": "a defect"}, ">failed<"),
+        ({"status": "interrupted", "stopped": "terminated"}, "terminated: this is what was reached"),
+    ],
+)
+def test_the_page_tells_a_run_that_failed_from_one_that_finished(tmp_path, fields, words):
+    run = write_run(tmp_path / "run")
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**record, **fields}))
+    page = Asked(run).get().text
+    assert words in page
+    assert ">finished" not in page
+
+
 def test_an_update_is_only_what_is_new(tmp_path):
     run = go_on(write_run(tmp_path / "run"))
     asked = Asked(run)

@@ -16,6 +16,7 @@ from unrender import gallery
 from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
+from unrender.io import files
 from unrender.problem.problem import Problem
 
 __all__ = [
@@ -141,7 +142,7 @@ def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float 
 
 
 def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
-    """Where results go: an empty folder, made here so that a wrong place is known before hours of work.
+    """Where results go: a folder without files, made here so that a wrong place is known before hours of work.
 
     Args:
         given: what the user asked for, or None for a new folder in out/.
@@ -162,12 +163,12 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
     try:
         if given.exists() and not given.is_dir():
             raise InputError(f"--out {given}: a file, expected a folder")
-        if given.is_dir() and any(given.iterdir()):
+        if given.is_dir() and any(not path.is_dir() for path in given.rglob("*")):
             if not any(True for mark in marks for _ in given.glob(mark)):
                 raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
                 raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
-        given.mkdir(parents=True, exist_ok=True)
+        files.make_folder(given)
     except OSError as error:
         raise InputError(f"--out {given}: {error.strerror or error}") from error
     if not os.access(given, os.W_OK | os.X_OK):

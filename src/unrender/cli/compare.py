@@ -16,6 +16,7 @@ from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
 from unrender.cli.execute import Plan, execute, introduce
+from unrender.cli.run import exit_status
 from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
 from unrender.core.text import visible
@@ -24,11 +25,10 @@ from unrender.methods import Method, method
 from unrender.report import formatting
 from unrender.report.equal_time import Comparison, Spread
 
-__all__ = ["DEFAULT_SECONDS", "INTERRUPTED", "compare"]
+__all__ = ["DEFAULT_SECONDS", "compare"]
 
-INTERRUPTED = 130
 DEFAULT_SECONDS = 20.0
-_MARKS = ("compare.json", "*-seed*/run.json")
+_MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
 def compare(
@@ -84,13 +84,13 @@ def compare(
             Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
             for number, one in itertools.product(range(seed, seed + seeds), chosen)
         ]
-        directories, interrupted = _run_all(console, plans, folder)
+        directories, status = _run_all(console, plans, folder)
     finally:
         arguments.remove_if_empty(folder)
     if directories:
         _report(console, directories, folder)
-    if interrupted:
-        raise typer.Exit(INTERRUPTED)
+    if status:
+        raise typer.Exit(status)
 
 
 def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
@@ -122,18 +122,23 @@ def _compare_folders(console: Console, directories: Sequence[Path], out: Path | 
     console.print(f"page: {_plain(str(page))}", soft_wrap=True)
 
 
-def _run_all(console: Console, plans: Sequence[Plan], folder: Path) -> tuple[list[Path], bool]:
-    """Carry out the plans until one is interrupted. Returns the run folders of runs that took a step, and whether one was interrupted."""
+def _run_all(console: Console, plans: Sequence[Plan], folder: Path) -> tuple[list[Path], int]:
+    """Carry out the plans until one is interrupted.
+
+    Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
+    """
     directories: list[Path] = []
+    status = 0
     for plan in plans:
         console.print(f"[bold]{plan.method.name}[/], seed {plan.seed}, {plan.seconds:g} s")
         directory = folder / f"{plan.method.name}-seed{plan.seed}"
         result = execute(plan, directory, console)
         if result.steps:
             directories.append(directory)
-        if result.stopped == "interrupted":
-            return directories, True
-    return directories, False
+        status = exit_status(result) or status
+        if result.status == "interrupted":
+            break
+    return directories, status
 
 
 def _parse_methods(names: str | None) -> list[Method]:

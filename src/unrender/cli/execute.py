@@ -104,13 +104,19 @@ def summarise(console: Console, problem: Problem, result: Result) -> None:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
     if result.resumed:
         table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
-    before, after = (np.mean(image_errors(result, which)) for which in ("initial", "result"))
-    table.add_row("image error", f"{before:.4g} before, {after:.4g} after (root mean square)")
+    if result.pictures:
+        before, after = (np.mean(image_errors(result, which)) for which in ("initial", "result"))
+        table.add_row("image error", f"{before:.4g} before, {after:.4g} after (root mean square)")
     start = problem.parameter_error(result.initial)
     for key, error in problem.parameter_error(result.parameters).items():
         table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")
     console.print(table)
     for warning in result.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
-    if result.stopped == "interrupted":
-        console.print("interrupted: what was reached is saved")
+    if result.status == "interrupted":
+        console.print(f"{result.stopped}: what was reached is saved")
+    if result.status == "failed":
+        applied = result.steps - result.skipped
+        console.print(
+            f"[red]failed[/]: given up after {result.steps} steps; kept are the values of the {applied} that were applied"
+        )

@@ -1,6 +1,7 @@
 """The `unrender` command: how it starts and how it ends.
 
-Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 130 where it was interrupted.
+Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 4 where a run failed; 130 where it was interrupted, 143
+where it was told to terminate, and what a run had reached is saved.
 Whatever is wrong is one line on standard error.
 """
 
@@ -14,12 +15,12 @@ import typer
 
 from unrender.backend import variant
 from unrender.cli.doctor import doctor
+from unrender.cli.exit_status import ENVIRONMENT, INPUT, INTERRUPTED, WORDS
+from unrender.cli.signals import Signals
 from unrender.core.errors import UnrenderError, VariantError
 from unrender.core.text import one_line
 
 __all__ = ["main"]
-
-INPUT, ENVIRONMENT, INTERRUPTED = 2, 3, 130
 
 # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
 _UsageError: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
@@ -28,6 +29,21 @@ _UsageError: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k._
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    signals = Signals(process=arguments is None)
+    try:
+        with signals:
+            status = _execute(given)
+        status = signals.status or status
+    except (KeyboardInterrupt, typer.Abort):  # the latter is what Typer makes of the former
+        status = signals.status or INTERRUPTED
+    except BaseException:
+        if not signals.status:
+            raise
+        status = signals.status  # what the interrupt became on its way out of compiled code
+    return _complain(WORDS[status], status) if status in WORDS else status
+
+
+def _execute(given: list[str]) -> int:
     try:
         if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
             return doctor()
@@ -36,8 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         status = app(given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
         sys.stdout.flush()
-        if status == INTERRUPTED:  # what Typer makes of Ctrl-C, and what a run returns that kept its results
-            return _complain("interrupted", INTERRUPTED)
         return status if isinstance(status, int) else 0
     except VariantError as error:
         return _complain(str(error), ENVIRONMENT)
@@ -47,8 +61,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
     except typer.Exit as end:
         return end.exit_code
-    except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted", INTERRUPTED)
     except BrokenPipeError:
         # Whoever read our output has gone; Python would complain once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -13,15 +13,15 @@ from unrender import report
 from unrender.cli import arguments
 from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
 from unrender.cli.execute import Plan, execute, introduce, summarise
+from unrender.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
 from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
 from unrender.methods import method
 from unrender.problem.problem import Problem
+from unrender.runs import result as results
 from unrender.runs.result import Result
 
-__all__ = ["INTERRUPTED", "conclude", "run"]
-
-INTERRUPTED = 130
+__all__ = ["conclude", "exit_status", "run"]
 
 
 def run(
@@ -45,7 +45,7 @@ def run(
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
-    Ctrl-C stops after the present step and keeps what was reached; `unrender resume` goes on from there.
+    Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
     """
     console = Console(highlight=False)
     chosen = method(method_name)
@@ -69,13 +69,20 @@ def run(
 
 
 def conclude(console: Console, problem: Problem, result: Result, folder: Path) -> None:
-    """Say what came out, write the page, and leave with the status of an interrupted run where it is one."""
+    """Say what came out, write the page, and leave with the status of an interrupted or failed run where it is one."""
     summarise(console, problem, result)
     if result.steps:
         console.print(f"page: {escape(str(report.page(folder)))}", soft_wrap=True)
-    if result.stopped == "interrupted":
-        console.print(f"to go on: unrender resume {escape(shlex.quote(str(folder)))}", soft_wrap=True)
-        raise typer.Exit(INTERRUPTED)
+    if status := exit_status(result):
+        again = "to go on" if result.status == "interrupted" else "to try once more from its last step"
+        console.print(f"{again}: unrender resume {escape(shlex.quote(str(folder)))}", soft_wrap=True)
+        raise typer.Exit(status)
+
+
+def exit_status(result: Result) -> int:
+    """Of a command whose run ended so."""
+    statuses = {results.INTERRUPTED: INTERRUPTED, results.TERMINATED: TERMINATED, results.NON_FINITE: FAILED}
+    return statuses.get(result.stopped, 0)
 
 
 def _budget_settings(

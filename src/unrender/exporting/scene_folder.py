@@ -15,9 +15,11 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core import arrays
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.exporting import maps, ready_made
 from unrender.exporting.graph import SceneGraph
 from unrender.exporting.setters import store
+from unrender.io import files
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.rendering.mitsuba import poses
@@ -56,6 +58,7 @@ class Exported:
     notices: tuple[str, ...]
 
 
+@exclusive("export")
 def export(
     what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
     out: str | Path,
@@ -82,9 +85,13 @@ def export(
     Raises:
         InputError: the run folder or the problem cannot be read, `out` cannot be written, or a parameter has no place in a description.
             Nothing is left behind then.
+
+    What is written is on the disk when this returns. An earlier export stands at its place until the new one does, which then takes its
+    place in one instant (where the system cannot exchange two names: in two, between which the next export sets right what was left).
     """
     variant.ensure()
     out = Path(out)
+    files.remove_leftovers(out.parent, (out.name,))
     _check_place(out, overwrite)
     if isinstance(what, (str, Path)):
         problem, parameters = reopen.problem_of(what), folders.read(what).parameters
@@ -97,7 +104,7 @@ def export(
     partial = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
         try:
-            partial.mkdir(parents=True)
+            files.make_folder(partial)
             notices = maps.write(values, partial)
             plain = not problem.renderer.pair.emissive
             if plain:
@@ -106,7 +113,7 @@ def export(
                 notices.append(
                     f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
                 )
-            _swap(partial, out)
+            files.replace_folder(partial, out)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
@@ -127,16 +134,6 @@ def _check_place(out: Path, overwrite: bool) -> None:
         raise InputError(f"export to {out}: the folder holds other things; give a new one")
     if not overwrite:
         raise InputError(f"export to {out}: holds an earlier export; give --overwrite (overwrite=True) to replace it")
-
-
-def _swap(partial: Path, out: Path) -> None:
-    if out.is_dir():
-        old = out.with_name(f".{out.name}.{os.getpid()}.old")
-        out.rename(old)
-        partial.rename(out)
-        shutil.rmtree(old, ignore_errors=True)
-    else:
-        partial.rename(out)
 
 
 def _fill(

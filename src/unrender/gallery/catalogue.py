@@ -6,6 +6,7 @@ from typing import Any
 
 from unrender.core import registry
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.core.suggestions import did_you_mean
 from unrender.gallery import fields
 from unrender.gallery.fields import Option
@@ -32,6 +33,7 @@ def options(name: str) -> list[Option]:
     return fields.of(_specification(name))
 
 
+@exclusive("gallery.problem")
 def problem(name: str, **options: Any) -> Problem:
     """A problem made by code, its truth known wherever there is one: its scene, its references (rendered now), where the descent starts.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
 from unrender.problem.errors import FieldError
@@ -72,6 +73,7 @@ class Problem:
         InputError: in one line, which field is wrong and what was expected.
     """
 
+    @exclusive("Problem")
     def __init__(
         self,
         scene: str | Path | dict[str, Any] | Callable[[], Any] | Renderer,

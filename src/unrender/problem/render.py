@@ -8,6 +8,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError, UnrenderError
+from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.problem.problem import Problem
@@ -19,6 +20,7 @@ _PATHS_PER_PASS = 1 << 21
 """Paths per pass, within the memory of a small machine."""
 
 
+@exclusive("render")
 def render(
     problem: Problem,
     parameters: Mapping[str, np.ndarray] | None = None,
@@ -57,6 +59,7 @@ def render(
     return (total / spp).astype(np.float32)
 
 
+@exclusive("render_pair")
 def render_pair(
     problem: Problem,
     current: Mapping[str, np.ndarray],

@@ -37,6 +37,8 @@ def save(problem: Problem, folder: Path) -> None:
     else:
         document = _described(problem, folder)
         note = "A description of a problem made in Python; resume(..., problem=) needs the problem itself"
+    if (folder / ARRAYS).is_dir():
+        files.sync_folder(folder / ARRAYS)
     files.write(folder / FILE, f"# {note}\n{tomli_w.dumps(document)}".encode())
 
 
@@ -97,7 +99,7 @@ class _Arrays:
             return {}
         buffer = io.BytesIO()
         np.save(buffer, array, allow_pickle=False)
-        files.write(self.folder / ARRAYS / f"{file}.npy", buffer.getvalue())
+        files.write(self.folder / ARRAYS / f"{file}.npy", buffer.getvalue(), name_too=False)
         return {name: f"{ARRAYS}/{file}.npy"}
 
 

@@ -99,8 +99,8 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     for run in runs:
         who = f"{run.record.method}, seed {run.record.seed}"
         notices += [f"{who}: {line}" for line in run.record.warnings]
-        if run.record.stopped == "interrupted":
-            notices.append(f"{who}: interrupted after {run.record.seconds:.3g} s.")
+        if run.record.status in ("interrupted", "failed"):
+            notices.append(f"{who}: {run.record.status} after {run.record.seconds:.3g} s.")
     return list(dict.fromkeys(notices))
 
 

@@ -15,8 +15,9 @@ STOP_REASONS = {
     "steps": "all steps done",
     "seconds": "stopped when time was up",
     "interrupted": "interrupted: this is what was reached",
+    "terminated": "terminated: this is what was reached",
     "callback": "stopped by a callback",
-    "non-finite": "given up: gradients were not finite",
+    "non-finite": "failed, given up: gradients were not finite; this is what was finite",
 }
 """How a run may end, in words."""
 _LISTED_VALUES = 4

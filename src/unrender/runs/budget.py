@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.runs.hooks import Hook
+from unrender.runs.result import NON_FINITE
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
@@ -17,7 +18,7 @@ _MOST_SKIPPED = 20
 
 
 class Budget(Hook):
-    """Stops a run that has used up its steps or seconds, or whose last twenty gradients were not finite."""
+    """Stops a run that has used up its steps or seconds, or whose last twenty steps were not finite."""
 
     def on_start(self, descent: Descent) -> None:
         """See `Hook.on_start`."""
@@ -35,8 +36,10 @@ class Budget(Hook):
         if run.seconds is not None and run.clock >= run.seconds:
             run.stop("seconds")
         if descent.state.skipped_in_a_row >= _MOST_SKIPPED:
-            run.stop("non-finite")
-            run.warnings.append(f"the last {_MOST_SKIPPED} gradients were not finite: the run was given up")
+            run.stop(NON_FINITE)
+            line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was given up; kept are the last values that were finite"
+            if line not in run.warnings:
+                run.warnings.append(line)
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["Live"]
 
 _INTERVAL = 1.0
+_RETRY_SECONDS = 5.0
 _SHARE = 0.02
 _POLL_SECONDS = 0.1
 _VIEWS = 8
@@ -55,7 +56,8 @@ class Live(Callback):
     The time between two updates grows with what they cost, so that they take at most 2 % of the run's.
 
     Args:
-        folder: the run folder. Where it cannot be written to, or vanishes, the run goes on with a warning.
+        folder: the run folder. Where it cannot be written to, the run goes on with a warning, commands are followed nevertheless, and
+            writing is tried again every few seconds. Where it vanishes, or `live` is a link, that is the end of it, with a warning.
         name, method, command, settings: as `Result` has them, for people.
     """
 
@@ -71,7 +73,9 @@ class Live(Callback):
         self._description = {"name": name, "method": method, "command": command, "settings": dict(settings or {})}
         self._history = _LiveHistory(self._folder)
         self._disabled = False
+        self._start: dict[str, np.ndarray] | None = None
         self._first_images_written = False
+        self._warned: set[str] = set()
         self._next_poll = self._next_update = 0.0
         self._cost = 0.0
         self._initial_error: dict[str, float] = {}
@@ -83,11 +87,12 @@ class Live(Callback):
             if self._live.is_symlink():
                 raise InputError(f"{self._live}: a link, expected a folder")
             self.clear()
+            self._start = run.full()
             self._live.mkdir(parents=True, exist_ok=True)
             self._write_start(run)
             self._write_status(run, "running", None)
         except (OSError, InputError) as error:
-            self._disable(run, error)
+            self._put_off(run, error)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
@@ -102,7 +107,7 @@ class Live(Callback):
             if now >= self._next_update or run.stopped:
                 self._update(run, record, "running")
         except (OSError, InputError) as error:
-            self._disable(run, error)
+            self._put_off(run, error)
 
     def on_end(self, run: Run, result: Result) -> None:
         """See `Callback.on_end`."""
@@ -113,7 +118,7 @@ class Live(Callback):
             self._write_status(run, "ended", last)
             (self._folder / CONTROL).unlink(missing_ok=True)
         except (OSError, InputError) as error:
-            self._disable(run, error)
+            self._put_off(run, error)
 
     def clear(self) -> None:
         """Remove what this callback wrote, once the run folder itself holds all of it."""
@@ -128,9 +133,12 @@ class Live(Callback):
     def _follow_command(self, run: Run, record: dict[str, Any]) -> None:
         command = self._read_command()
         if command == "pause" and not run.stopped:
-            self._update(run, record, "paused")
+            try:
+                self._update(run, record, "paused")
+            except (OSError, InputError) as error:
+                self._put_off(run, error)  # it is paused, though nobody can be told
             # In a folder that is gone, no command could end the pause.
-            while command == "pause" and not run.stopped and self._live.is_dir():
+            while command == "pause" and not run.stopped and self._folder.is_dir():
                 time.sleep(_POLL_SECONDS / 2)
                 command = self._read_command()
             self._next_update = 0.0
@@ -159,27 +167,30 @@ class Live(Callback):
     def _update(self, run: Run, record: dict[str, Any], status: str) -> None:
         dr.sync_thread()  # what is still being computed is the run's own time
         began = time.monotonic()
-        if not self._live.is_dir():  # writing would bring back a folder that somebody removed
-            raise InputError(f"{self._live}: the folder is gone")
+        if self._start is not None:
+            if self._folder.is_dir():
+                self._live.mkdir(exist_ok=True)
+            self._write_start(run)
         if not self._first_images_written and run.estimate is not None:
             self._first_images_written = True
             views = {**_references(run), **{f"{name}/initial": image for name, image in _images(run).items()}}
-            files.write_arrays(self._live / LIVE_START, views, compress=False)
-        files.write_arrays(self._live / LIVE_VIEWS, _views(run), compress=False)
-        files.write_arrays(self._live / schema.PARAMETERS, _reduced_parameters(run.full()), compress=False)
+            self._write_arrays(LIVE_START, views)
+        self._write_arrays(LIVE_VIEWS, _views(run))
+        self._write_arrays(schema.PARAMETERS, _reduced_parameters(run.full()))
         self._history.write(self._live)
         self._write_status(run, status, record)
         self._cost = time.monotonic() - began
         self._next_update = began + max(_INTERVAL, self._cost / _SHARE)
 
     def _write_start(self, run: Run) -> None:
-        initial = run.full()
+        """What stays the same in the course of the run. Until it is written, `_start` holds the parameters that the run began with."""
+        initial = self._start or {}
         self._initial_error = run.problem.parameter_error(initial)
-        files.write_arrays(self._live / LIVE_START, _references(run), compress=False)
-        files.write_arrays(self._live / schema.INITIAL, _reduced_parameters(initial), compress=False)
-        files.write_arrays(self._live / schema.PARAMETERS, _reduced_parameters(initial), compress=False)
+        self._write_arrays(LIVE_START, _references(run))
+        self._write_arrays(schema.INITIAL, _reduced_parameters(initial))
+        self._write_arrays(schema.PARAMETERS, _reduced_parameters(initial))
         if run.problem.truth:
-            files.write_arrays(self._live / schema.TRUTH, _reduced_parameters(run.problem.truth), compress=False)
+            self._write_arrays(schema.TRUTH, _reduced_parameters(run.problem.truth))
         description = self._description
         components = {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
         record = schema.RunRecord.model_construct(
@@ -194,6 +205,12 @@ class Live(Callback):
             problem={"parameters": list(initial), "views": len(run.problem.views), "loss": repr(run.problem.loss)},
         )
         _write_json(self._live / schema.RECORD, record)
+        self._start = None
+
+    def _write_arrays(self, name: str, values: Mapping[str, np.ndarray]) -> None:
+        if not self._live.is_dir():  # writing would bring back a folder that somebody removed
+            raise InputError(f"{self._live}: the folder is gone")
+        files.write_arrays(self._live / name, values, compress=False, durable=False)
 
     def _write_status(self, run: Run, status: str, record: Mapping[str, Any] | None) -> None:
         found = schema.LiveStatus.model_construct(
@@ -216,9 +233,19 @@ class Live(Callback):
         )
         _write_json(self._live / LIVE_STATUS, found)
 
-    def _disable(self, run: Run, error: Exception) -> None:
-        self._disabled = True
-        run.warnings.append(f"the run goes on, but can no longer be watched: {' '.join(str(error).split())}")
+    def _put_off(self, run: Run, error: Exception) -> None:
+        """Try again later what could not be written; never, where the folder is gone or none of this run's."""
+        reason = " ".join(str(error).split())
+        to_be_made = self._start is not None and self._folder.is_dir()
+        self._disabled = self._live.is_symlink() or not (self._live.is_dir() or to_be_made)
+        self._next_update = time.monotonic() + _RETRY_SECONDS
+        if self._disabled:
+            line = f"the run goes on, but can no longer be watched: {reason}"
+        else:
+            line = f"the run goes on, but cannot be watched until there is room: {reason}"
+        if (topic := f"{self._disabled} {reason[-40:]}") not in self._warned:
+            self._warned.add(topic)
+            run.warnings.append(line)
 
 
 class _LiveHistory:
@@ -237,8 +264,15 @@ class _LiveHistory:
         if _stamp(self._other) != self._before:
             path.unlink(missing_ok=True)
         elif self._records:
-            with path.open("ab") as file:
-                file.write(lines(self._records))
+            with path.open("ab", buffering=0) as file:
+                size = file.tell()
+                try:
+                    data = lines(self._records)
+                    while data:
+                        data = data[file.write(data) :]
+                except OSError:
+                    file.truncate(size)
+                    raise
         self._records.clear()
 
 
@@ -291,4 +325,4 @@ def _reduced_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
 
 def _write_json(path: Path, model: BaseModel) -> None:
-    files.write(path, lines([schema.serialize(model)]))
+    files.write(path, lines([schema.serialize(model)]), durable=False)

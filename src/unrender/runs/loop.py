@@ -62,7 +62,8 @@ class Descent:
         for _ in range(2):
             key = Key(run.seed, 0, stream=1)
             found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
-            run.parameters, state.optimizer = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
+            update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
+            run.parameters, state.optimizer = update.parameters, update.state
             state.noise.update(found.gradient, found.variance)
         return time.perf_counter() - started, snapshot(run, state)
 
@@ -129,15 +130,22 @@ def _announce(descent: Descent, estimate: Estimate, applied: bool) -> None:
 def _step(
     run: Run, state: RunState, on_update: Callable[[Estimate, bool], None] = lambda estimate, applied: None
 ) -> dict[str, Any]:
-    """One step. Returns its record of the history."""
+    """One step. Returns its record of the history.
+
+    One whose estimate is not finite is not applied, nor is one where the optimizer makes a step that is not finite of an estimate that is.
+    """
     problem = run.problem
     started = time.perf_counter()
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
-    finite = bool(np.isfinite(estimate.loss)) and trees.all_finite(estimate.gradient)
-    finite = finite and (estimate.variance is None or trees.all_finite(estimate.variance))
-    if finite:
-        run.parameters, state.optimizer = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
-        state.estimator = after
+    culprit = _not_finite(estimate)
+    if not culprit:
+        update = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
+        culprit = update.not_finite
+        if not culprit:
+            run.parameters, state.optimizer, state.estimator = update.parameters, update.state, after
+    finite = not culprit
+    if culprit:
+        _warn_of_skipping(run, culprit)
     run.clock += time.perf_counter() - started
 
     run.step += 1
@@ -159,14 +167,47 @@ def _step(
     return record
 
 
-def _apply(
-    problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree
-) -> tuple[Tree, Any]:
+def _not_finite(estimate: Estimate) -> str:
+    """What of an estimate is not finite, "" for nothing."""
+    if not np.isfinite(estimate.loss):
+        return "the loss"
+    for what, tree in (("gradient", estimate.gradient), ("gradient's variance", estimate.variance or {})):
+        for key, value in tree.items():
+            if not arrays.all_finite(value):
+                return f"the {what} of {key}"
+    return ""
+
+
+def _warn_of_skipping(run: Run, culprit: str) -> None:
+    """Warn of a step that is not applied, once for each culprit."""
+    line = f"{culprit} was not finite; such steps are not applied"
+    if not any(known.endswith(line) for known in run.warnings):
+        run.warnings.append(f"step {run.step}: {line}")
+
+
+@dataclass(frozen=True)
+class _Update:
+    """What an optimizer makes of an estimate.
+
+    Attributes:
+        parameters, state: after it.
+        not_finite: what of it is not finite, "" for nothing; it is then not to be applied.
+    """
+
+    parameters: Tree
+    state: Any
+    not_finite: str
+
+
+def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
     """Precondition, update, bound. The optimizer sees S g, the parameters S (step): descent in u where x = S u."""
     if not estimate.preconditioned:
         estimate = replace(estimate, gradient=problem.precondition(estimate.gradient), preconditioned=True)
     steps, state = optimizer.update(estimate, state, parameters)
     moved = trees.add(parameters, problem.precondition(steps))
-    moved = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
-    arrays.evaluate(moved, state)
-    return moved, state
+    bounded = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
+    arrays.evaluate(moved, bounded, state)
+    # Before they are bounded: the nearest point to what is no number may be a bound.
+    broken = next((key for key, value in moved.items() if not arrays.all_finite(value)), "")
+    culprit = f"the optimizer's step for {broken} (from its own state, or the preconditioner)" if broken else ""
+    return _Update(bounded, state, culprit)

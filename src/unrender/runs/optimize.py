@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.core import checks
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.optimizers.base import Optimizer
@@ -26,11 +27,12 @@ from unrender.runs.loop import Descent, descend, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
 from unrender.runs.refinement import Refinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run
+from unrender.runs.run import Run, terminate_if_told
 
 __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
 
 
+@exclusive("optimize", long=True)
 def optimize(
     problem: Problem,
     estimator: Estimator,
@@ -60,14 +62,21 @@ def optimize(
             is one at the end, too.
         annotations: what else the run folder should say.
 
-    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. A step whose loss or
-    gradient is not finite is not applied, nor remembered by the estimator; it is counted in `Result.skipped`.
+    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. SIGTERM ends a run that
+    has a run folder likewise, without final pictures, and then the process, unless the program handles it itself. Both are left to
+    their handlers outside of the main thread.
+
+    A step whose loss or gradient is not finite is not applied, nor remembered by the estimator, and neither is one that the optimizer
+    makes not finite; it is counted in `Result.skipped`, and a warning says what was not finite. After twenty in a row the run is given
+    up: `Result.status` is "failed", and the parameters are the last that were finite.
+
+    Threads take turns: while a run goes on, another thread's `optimize`, `resume` or `render` is refused.
 
     What goes wrong with the run folder while the run goes is a line among the warnings (and in the log), and the run goes on.
 
     Raises:
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
-            cannot be begun, or cannot be written in the end.
+            cannot be begun, or cannot be written in the end; a run goes on in another thread.
     """
     check(estimator, optimizer, steps, seconds)
     if checkpoint_every is not None:
@@ -81,7 +90,9 @@ def optimize(
     log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(log.result(run))
-        return descend(Descent(run, state, log, assemble_hooks(callbacks, writer)))
+        result = descend(Descent(run, state, log, assemble_hooks(callbacks, writer)))
+    terminate_if_told(run)
+    return result
 
 
 def assemble_hooks(callbacks: Sequence[Callback], *folder: Hook) -> list[Hook]:
@@ -96,6 +107,7 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
     return RunWriter(folder, run.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line))
 
 
+@exclusive("estimate")
 def estimate(
     problem: Problem, estimator: Estimator, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> Estimate:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from unrender import gallery
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
 from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
@@ -22,6 +23,7 @@ __all__ = ["problem_of", "resume"]
 _LONGEST = 1 << 24
 
 
+@exclusive("resume", long=True)
 def resume(
     directory: str | Path,
     problem: Problem | None = None,

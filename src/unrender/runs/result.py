@@ -19,9 +19,13 @@ from unrender.backend.variant import LLVM, current, llvm_version
 from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.runs.folder import schema
-from unrender.runs.folder.history import lines
+from unrender.runs.folder.history import lines, steps_in
 
-__all__ = ["Result", "deciding_versions", "hardware", "versions"]
+__all__ = ["INTERRUPTED", "NON_FINITE", "TERMINATED", "Result", "deciding_versions", "hardware", "versions"]
+
+INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
+"""Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a command to stop, SIGTERM, and gradients that
+were not finite."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +35,15 @@ class Result:
     Attributes:
         parameters: {key: array}, float32, the recovered values.
         initial: {key: array}, where the descent began.
-        history: one dictionary per step: "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
+        history: one dictionary per step (of a run of millions of steps in a run folder, per second, fourth, ... of the earlier
+            ones): "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
             "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
             "parameter_error" ({key: root mean square error}) now and then and at the last step; of parameters that are coarse at
             first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
         seconds: of optimization.
         warmup_seconds: of tracing and compiling kernels before the first step.
-        stopped: "steps", "seconds", "interrupted", "callback" or "non-finite".
+        stopped: "steps", "seconds" or "callback" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated" (SIGTERM);
+            "non-finite" (failed).
         skipped: steps whose gradient or loss was not finite, and which were not applied.
         warnings: one line each.
         info: of the last estimate, as NumPy arrays.
@@ -69,31 +75,32 @@ class Result:
     @property
     def steps(self) -> int:
         """How many steps were taken, skipped ones among them."""
-        return len(self.history)
+        return steps_in(self.history)
 
     @property
     def status(self) -> str:
-        """ "interrupted", or "finished"."""
-        return "interrupted" if self.stopped == "interrupted" else "finished"
+        """ "finished", "interrupted", or "failed": given up, `parameters` those of the last step that was applied."""
+        if self.stopped in (INTERRUPTED, TERMINATED):
+            return "interrupted"
+        return "failed" if self.stopped == NON_FINITE else "finished"
 
     def save(self, directory: str | Path, status: str | None = None) -> Path:
         """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz.
 
-        Each file is written beside its place and renamed; run.json, with `status` (None for the result's own), comes last. Raises
-        `InputError` where the folder cannot be written.
+        Each file is written beside its place, renamed, and on the disk when this returns; run.json, with `status` (None for the result's
+        own), comes last. Raises `InputError` where the folder cannot be written.
         """
         folder = Path(directory)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            files.write_arrays(folder / schema.PARAMETERS, self.parameters)
-            files.write_arrays(folder / schema.INITIAL, self.initial)
-            if self.truth:
-                files.write_arrays(folder / schema.TRUTH, self.truth)
-            if self.pictures:
-                files.write_arrays(folder / schema.PICTURES, self.pictures)
-            files.write(folder / schema.HISTORY, lines(self.history))
+            files.make_folder(folder)
+            archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
+            for name, values in {**archives, schema.PICTURES: self.pictures}.items():
+                if values or name in (schema.PARAMETERS, schema.INITIAL):
+                    files.write_arrays(folder / name, values, name_too=False)
+            files.write(folder / schema.HISTORY, lines(self.history), name_too=False)
+            files.sync_folder(folder)
             record = json.dumps(self.record(status or self.status), indent=2) + "\n"
-            files.write(folder / schema.RECORD, record.encode(), durable=True)
+            files.write(folder / schema.RECORD, record.encode())
         except OSError as error:
             raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
         return folder
@@ -105,6 +112,8 @@ class Result:
             status: "running", "finished", "interrupted" or "failed".
             error: the exception by which the run failed; "" for none.
         """
+        if status == "failed" and not error:
+            error = "given up: the last gradients were not finite"
         fields: dict[str, Any] = {
             "status": status,
             "name": self.name,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from unrender.core import arrays, trees
+import numpy as np
+
+from unrender.core import trees
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.problem.fingerprint import differences
@@ -21,14 +24,14 @@ from unrender.runs.folder.checkpoint import Checkpoint
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.method_file import Method
 from unrender.runs.folder.schema import HISTORY, METHOD, RunRecord
-from unrender.runs.folder.state import check_alike, unpack
+from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import Hook
 from unrender.runs.loop import Descent, descend, initialize, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of
 from unrender.runs.optimize import assemble_hooks, check, open_writer
-from unrender.runs.result import Result, deciding_versions
-from unrender.runs.run import SNAPSHOT_COUNTS, restore
+from unrender.runs.result import NON_FINITE, Result, deciding_versions
+from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
 
 __all__ = ["StoredRun", "load_run", "resume_run"]
 
@@ -77,6 +80,7 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     return StoredRun(folder, record, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))
 
 
+@exclusive("resume", long=True)
 def resume_run(
     stored: StoredRun,
     problem: Problem,
@@ -86,25 +90,44 @@ def resume_run(
     optimizer: Optimizer | None = None,
 ) -> Result:
     """Resume the run. See `unrender.resume`."""
-    folder, method, record = stored.folder, stored.method, stored.record
+    folder, method = stored.folder, stored.method
     parts = method_file.parts(method, folder / METHOD, estimator, optimizer)
     check(parts.estimator, parts.optimizer, method.steps, method.seconds)
     run, state = prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
     run.folder = folder
-    annotations = RunAnnotations(record.method, _method_settings(record), record.command, method.final_spp)
-    log = RunMetadata(describe_run(run, annotations), run.full())
-    fingerprint = fingerprint_of(run)
-    log.description["problem"] |= {"fingerprint": fingerprint, "origin": origin(problem)}
+    initial, fingerprint = run.full(), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
-        source = _find_checkpoint(stored)
-        changes = _changes(stored, source.checkpoint, fingerprint)
-        if changes and not force:
-            raise InputError(f"run folder {folder}: not as it was: {changes}; to go on nevertheless, force it")
-        _check_budget_left(folder, method, source.checkpoint)
-        if source.checkpoint is not None:
-            initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))
-        restoring = _Restore(record, source, changes, writer)
-        return descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer)]))
+        for source in _sources(stored):
+            changes = _changes(stored, source.checkpoint, fingerprint)
+            if changes and not force:
+                raise InputError(f"run folder {folder}: not as it was: {changes}; to go on nevertheless, force it")
+            _check_budget_left(folder, method, source.checkpoint)
+            if source.checkpoint is not None:
+                initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))
+            restoring = _Restore(stored.record, source, changes, writer)
+            log = _metadata(run, stored, initial, fingerprint)
+            try:
+                result = descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer)]))
+                break
+            except _UnusableCheckpoint as error:
+                source.passed_over.append(str(error))  # the one before may serve
+        else:
+            raise InputError(f"run folder {folder}: no checkpoint can be used")
+    terminate_if_told(run)
+    return result
+
+
+class _UnusableCheckpoint(InputError):
+    """A checkpoint that can be read, but holds no state that this run can go on with."""
+
+
+def _metadata(run: Run, stored: StoredRun, initial: dict[str, np.ndarray], fingerprint: dict[str, str]) -> RunMetadata:
+    """What the result is to say of the run beside what it found."""
+    record = stored.record
+    annotations = RunAnnotations(record.method, _method_settings(record), record.command, stored.method.final_spp)
+    log = RunMetadata(describe_run(run, annotations), initial)
+    log.description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
+    return log
 
 
 @dataclass(frozen=True)
@@ -114,7 +137,7 @@ class _Source:
     Attributes:
         checkpoint: None for the run's start.
         records: the history, which may be longer.
-        passed_over: one line for each later checkpoint that cannot be used.
+        passed_over: one line for each later checkpoint that cannot be used; whoever finds that this one cannot adds to it.
     """
 
     checkpoint: Checkpoint | None
@@ -122,19 +145,22 @@ class _Source:
     passed_over: list[str]
 
 
-def _find_checkpoint(stored: StoredRun) -> _Source:
-    """The last checkpoint that can be read and whose steps the history has."""
+def _sources(stored: StoredRun) -> Iterator[_Source]:
+    """The checkpoints that can be read and whose steps the history has, the latest first; the run's start where there is none.
+
+    Raises `InputError` where all are passed over.
+    """
     path = stored.folder / HISTORY
     records, malformed = history.read_records(path, stored.folder) if path.exists() else ([], "")
 
     def reject(found: Checkpoint) -> str:
-        if found.manifest.step <= len(records):
+        if found.manifest.step <= history.steps_in(records):
             return ""
-        reason = f"of step {found.manifest.step}, but {HISTORY} has only {len(records)} steps"
+        reason = f"of step {found.manifest.step}, but {HISTORY} has only {history.steps_in(records)} steps"
         return reason + (f" ({malformed})" if malformed else "")
 
-    found, passed_over = checkpoint.latest(stored.folder, reject)
-    return _Source(found, records, passed_over)
+    for found, passed_over in checkpoint.candidates(stored.folder, reject):
+        yield _Source(found, records, passed_over)
 
 
 def _changes(stored: StoredRun, found: Checkpoint | None, fingerprint: dict[str, str]) -> str:
@@ -181,15 +207,23 @@ class _Restore(Hook):
     def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """See `Hook.on_warm_up`."""
         log, source = descent.log, self.source
-        saved = fresh if source.checkpoint is None else _unpack(source.checkpoint, fresh, warm)
+        saved = fresh if source.checkpoint is None else self._unpack(source.checkpoint, fresh, warm)
         warnings = [f"passed over: {line}" for line in source.passed_over]
         warnings += [f"resumed by force though not as it was: {self.changes}"] if self.changes else []
         saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
-        log.history[:] = source.records[: saved["step"]]
+        log.history[:] = (record for record in source.records if record["step"] < saved["step"])
         log.description["resumed"] = [*self.record.resumed, saved["step"]]
         log.warmup_seconds += self.record.warmup_seconds
         restore(descent.run, descent.state, saved)
+        if self.record.stopped == NON_FINITE:  # who resumes a run that was given up wants it to try once more
+            descent.state.skipped_in_a_row = 0
         self.writer.resume(log.history, descent.result())
+
+    def _unpack(self, found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return _unpack(found, fresh, warm)
+        except InputError as error:
+            raise _UnusableCheckpoint(str(error)) from error
 
 
 def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
@@ -212,6 +246,7 @@ def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> d
     expected = trees.shapes(fresh["parameters"])
     if trees.shapes(saved["parameters"]) != expected:
         raise InputError(f"{where}: parameters: expected shapes {expected}, got {trees.shapes(saved['parameters'])}")
-    if not all(arrays.all_finite(value) for value in saved["parameters"].values()):
-        raise InputError(f"{where}: parameters: not finite")
+    for name in ("parameters", "optimizer"):
+        if part := not_finite(saved[name], name):
+            raise InputError(f"{where}: {part}: not finite")
     return saved

@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.signals import GRACEFUL
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.runs.noise import GradientNoise
+from unrender.runs.result import INTERRUPTED, TERMINATED
 
-__all__ = ["SNAPSHOT_COUNTS", "Run", "RunState", "interruptible", "restore", "snapshot"]
+__all__ = ["SNAPSHOT_COUNTS", "Run", "RunState", "interruptible", "restore", "snapshot", "terminate_if_told"]
 
 
 @dataclass
@@ -124,19 +126,38 @@ def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
 
 @contextmanager
 def interruptible(run: Run) -> Iterator[None]:
-    """Let the first Ctrl-C end the run after the present step; the second one interrupts at once."""
+    """Let the first Ctrl-C, or SIGTERM, end the run after the present step; a second one does what it did before.
+
+    In the main thread alone. SIGTERM is left to whoever handles it already, unless the handler has the attribute `GRACEFUL`, and to the
+    system where the run has no folder that keeps what was reached.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGINT)
+    reasons = {signal.SIGINT: INTERRUPTED}
+    terminated = signal.getsignal(signal.SIGTERM)
+    if (terminated is signal.SIG_DFL and run.folder is not None) or hasattr(terminated, GRACEFUL):
+        reasons[signal.SIGTERM] = TERMINATED
+    before = {number: signal.getsignal(number) for number in reasons}
+
+    def restore_handlers() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def stop(number: int, frame: Any) -> None:
-        del number, frame
-        run.stop("interrupted")
-        signal.signal(signal.SIGINT, before)
+        del frame
+        run.stop(reasons[signal.Signals(number)])
+        restore_handlers()
 
-    signal.signal(signal.SIGINT, stop)
+    for number in reasons:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore_handlers()
+
+
+def terminate_if_told(run: Run) -> None:
+    """End the process as SIGTERM would have, once a run that it stopped is saved, where nobody handles it."""
+    if run.stopped == TERMINATED and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.raise_signal(signal.SIGTERM)

@@ -173,8 +173,12 @@ def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
         error = ", ".join(formatting.number(value) for value in list(run.error_after.values())[:3])
     paused = snapshot.state == monitor.PAUSED
     state_text = _STATES[snapshot.state]
-    if run is not None and run.record.stopped and snapshot.state in (monitor.FINISHED, monitor.SAVING):
-        state_text += f": {tables.STOP_REASONS.get(run.record.stopped, run.record.stopped)}"
+    if run is not None and snapshot.state in (monitor.FINISHED, monitor.SAVING):
+        reason = tables.STOP_REASONS.get(run.record.stopped, run.record.stopped)
+        if snapshot.state == monitor.FINISHED and run.record.status in ("interrupted", "failed"):
+            state_text = reason or run.record.status
+        elif reason:
+            state_text += f": {reason}"
     return RunRow(
         number, label, snapshot.state, state_text, step, seconds, samples, loss, error, snapshot.accepts_commands, paused,
         str(snapshot.path),

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,19 @@ from unrender.runs.folder import schema
 from unrender.runs.folder.schema import CHECKPOINTS, MANIFEST, STATE, Manifest
 from unrender.runs.folder.state import Packed
 
-__all__ = ["FOLDER", "KEEP", "MANIFEST", "STATE", "Checkpoint", "clear", "latest", "read", "remove_partial", "write"]
+__all__ = [
+    "FOLDER",
+    "KEEP",
+    "MANIFEST",
+    "STATE",
+    "Checkpoint",
+    "candidates",
+    "clear",
+    "latest",
+    "read",
+    "remove_partial",
+    "write",
+]
 
 FOLDER = CHECKPOINTS
 KEEP = 3
@@ -58,7 +70,7 @@ def write(
     Raises `OSError` where that fails, and leaves the earlier ones as they were.
     """
     root = folder / FOLDER
-    partial, final = root / f".{step:08d}.{os.getpid()}.part", root / f"{step:08d}"
+    partial, final = root / f".{step:08d}.{os.getpid()}.{files.PARTIAL}", root / f"{step:08d}"
     data = safetensors.numpy.save(packed.tensors)
     manifest = {
         "format": _FORMAT,
@@ -72,13 +84,17 @@ def write(
     }
     try:
         _remove(partial)
-        partial.mkdir(parents=True)
+        files.make_folder(root)
+        partial.mkdir()
         _write(partial / STATE, data)
         _write(partial / MANIFEST, json.dumps(manifest, allow_nan=False).encode())
-        files.sync_folder(partial)
-        _remove(final)
-        partial.rename(final)
-        files.sync_folder(root)
+        if final.is_dir() and not final.is_symlink():
+            files.replace_folder(partial, final)
+        else:
+            _remove(final)
+            files.sync_folder(partial)
+            partial.rename(final)
+            files.sync_folder(root)
     except OSError:
         _remove(partial)
         raise
@@ -87,34 +103,44 @@ def write(
     return final
 
 
-def latest(folder: Path, reject: Callable[[Checkpoint], str] = lambda _: "") -> tuple[Checkpoint | None, list[str]]:
-    """The latest checkpoint of a run folder that can be read and that is not rejected; None where there is none.
+def candidates(
+    folder: Path, reject: Callable[[Checkpoint], str] = lambda _: ""
+) -> Iterator[tuple[Checkpoint | None, list[str]]]:
+    """The checkpoints of a run folder that can be read and are not rejected, the latest first; None alone where there is none at all.
 
     Args:
         folder: the run folder.
         reject: says why a checkpoint does not suit; "" for one that does.
 
-    Returns:
-        The checkpoint, and one line for each later one that was passed over.
+    Yields:
+        Each with one line for every later one that was passed over, in a list that the caller may add to: why this one is, too.
 
     Raises:
-        InputError: there are some, but none can be read.
+        InputError: there are some, but all are passed over; what is wrong with the latest.
     """
     root = folder / FOLDER
     if root.is_symlink():
         raise InputError(f"{root}: a link, expected a folder")
     passed_over: list[str] = []
-    for path in reversed(_finished(root)):
+    found = _finished(root)
+    for path in reversed(found):
         try:
-            found = read(path)
-            if reason := reject(found):
+            one = read(path)
+            if reason := reject(one):
                 raise InputError(f"{path}: {reason}")
-            return found, passed_over
         except InputError as error:
             passed_over.append(str(error))
+            continue
+        yield one, passed_over
     if passed_over:
         raise InputError(passed_over[0])
-    return None, []
+    if not found:
+        yield None, []
+
+
+def latest(folder: Path, reject: Callable[[Checkpoint], str] = lambda _: "") -> tuple[Checkpoint | None, list[str]]:
+    """The first of the `candidates`. Raises `InputError` where there are some, but none can be read."""
+    return next(candidates(folder, reject))
 
 
 def read(path: Path) -> Checkpoint:
@@ -141,10 +167,14 @@ def clear(folder: Path) -> None:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what runs that died left unfinished. For the process that holds the folder."""
+    """Remove the checkpoints that runs which died left half-written or half-removed. For the process that holds the folder."""
     root = folder / FOLDER
-    for path in (*folder.glob("*.part"), *(root.glob(".*.part") if not root.is_symlink() else ())):
-        _remove(path)
+    if root.is_symlink() or not root.is_dir():
+        return
+    files.remove_leftovers(root)
+    for path in root.iterdir():
+        if _NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink() and not (path / MANIFEST).exists():
+            _remove(path)
 
 
 def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
@@ -185,7 +215,7 @@ def _write(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
         file.write(data)
         file.flush()
-        os.fsync(file.fileno())
+        files.flush(file.fileno())
 
 
 def _remove(path: Path) -> None:

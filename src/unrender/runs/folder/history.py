@@ -1,11 +1,15 @@
-"""history.jsonl: one line a step, written as soon as the step is done; and read, whole or as it grows."""
+"""history.jsonl: one line a step, written as soon as the step is done; and read, whole or as it grows.
+
+A run of millions of steps keeps fewer lines of its earlier ones (`thinned`), so that no file grows past what is read in seconds.
+"""
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,19 +23,50 @@ from unrender.runs.folder.schema import HISTORY_AXES, HISTORY_COLUMNS
 __all__ = [
     "LARGEST",
     "LARGEST_LINE",
+    "MOST_KEPT",
     "ErrorHistory",
     "History",
     "HistoryFile",
     "HistoryReader",
     "lines",
     "read_records",
+    "steps_in",
+    "thinned",
 ]
 
 LARGEST_LINE = 1 << 20
 """In bytes."""
 LARGEST = 1 << 30
 """Of the whole file, in bytes."""
+MOST_KEPT = 1 << 26
+"""Bytes of a run's file from which on its earlier steps are thinned."""
 _CHUNK = 1 << 20
+
+
+# ---------------------------------------------------------------------- records
+
+
+def steps_in(records: Sequence[Mapping[str, Any]]) -> int:
+    """How many steps a history is of, those among them whose records were thinned out."""
+    return max(int(records[-1].get("step", 0)) + 1, len(records)) if records else 0
+
+
+def thinned(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The records with about every second of the earlier three quarters left out.
+
+    Of those the ones remain whose step is a multiple of twice the first ones' stride, and those that record a change of resolution: a
+    history that is thinned time and again stays evenly spaced, by powers of two.
+    """
+    early = len(records) - len(records) // 4
+    if early < 2:
+        return list(records)
+    stride = 1
+    while all(record["step"] % (2 * stride) == 0 for record in records[: early // 2] if "resolution" not in record):
+        stride *= 2
+        if stride > records[-1]["step"]:
+            return list(records)
+    kept = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or "resolution" in r]
+    return [*kept, *records[early:]]
 
 
 # ---------------------------------------------------------------------- writing
@@ -43,17 +78,20 @@ class HistoryFile:
     def __init__(self, path: Path):
         self.path = path
         self._file: int | None = None
-        self._size = 0
         self._pending: list[bytes] = []
+        self.size = 0
+        """Of the file, in bytes."""
 
-    def rewrite(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Make the file hold just these, and go on from there. Raises `OSError` or `InputError`."""
-        self.close()
-        self._pending = []
+    def rewrite(self, records: Iterable[Mapping[str, Any]], name_too: bool = True) -> None:
+        """Make the file hold just these, and go on from there; see `files.write`.
+
+        Raises `OSError` or `InputError`; the file is then as it was.
+        """
         text = lines(records)
-        files.write(self.path, text)
-        self._file = os.open(self.path, os.O_WRONLY | os.O_CLOEXEC)
-        self._size = len(text)
+        files.write(self.path, text, name_too=name_too)
+        opened = os.open(self.path, os.O_WRONLY | os.O_CLOEXEC)
+        self.close()
+        self._file, self.size, self._pending = opened, len(text), []
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Add one line. Raises `OSError`; the file then ends with the last whole line."""
@@ -64,18 +102,18 @@ class HistoryFile:
         written = 0
         try:
             while written < len(data):
-                written += os.pwrite(self._file, data[written:], self._size + written)
+                written += os.pwrite(self._file, data[written:], self.size + written)
         except OSError:
             if written:
-                os.ftruncate(self._file, self._size)
+                os.ftruncate(self._file, self.size)
             raise
-        self._size += len(data)
+        self.size += len(data)
         self._pending = []
 
     def sync(self) -> None:
         """Have it on the disk before this returns. Raises `OSError`."""
         if self._file is not None:
-            os.fsync(self._file)
+            files.flush(self._file)
 
     def close(self) -> None:
         """Harmless where it is closed."""
@@ -101,20 +139,27 @@ def _finite_or_null(value: Any) -> Any:
 
 
 def read_records(path: Path, folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """The records of a history up to the first line that is no record of its step, and what is wrong with that line, "" for nothing.
+    """The records of a history up to the first line that is no record of a later step, and what is wrong with that line, "" for nothing.
 
-    A last line that was cut off is nothing wrong. Raises `InputError` where the file cannot be read.
+    A last line that was cut off is nothing wrong. Raises `InputError` where the file cannot be read, or is larger than `LARGEST`.
     """
     found: list[dict[str, Any]] = []
-    for line in bounded_files.read_text(path, folder=folder).split("\n")[:-1]:
-        where = f"{path}:{len(found) + 1}"
-        try:
-            record = bounded_files.parse_json(line, where)
-        except InputError as error:
-            return found, str(error)
-        if not isinstance(record, dict) or type(record.get("step")) is not int or record["step"] != len(found):
-            return found, f"{where}: expected the record of step {len(found)}, got {line.strip()[:60]}"
-        found.append(record)
+    with bounded_files.open_regular(path, folder) as file:
+        if os.fstat(file.fileno()).st_size > LARGEST:
+            raise InputError(f"{path}: larger than {LARGEST >> 30} GiB, which no run writes")
+        while (line := file.readline(LARGEST_LINE + 1)).endswith(b"\n"):
+            where = f"{path}:{len(found) + 1}"
+            try:
+                record = bounded_files.parse_json(line.removeprefix(codecs.BOM_UTF8 if not found else b""), where)
+            except InputError as error:
+                return found, str(error)
+            step = record.get("step") if isinstance(record, dict) else None
+            if type(step) is not int or step < steps_in(found):
+                shown = bounded_files.printable(line.decode(errors="replace").strip()[:60])
+                return found, f"{where}: expected the record of step {steps_in(found)} or a later one, got {shown}"
+            found.append(record)
+    if len(line) > LARGEST_LINE:
+        return found, f"{path}:{len(found) + 1}: a line of more than {LARGEST_LINE >> 20} MiB"
     return found, ""
 
 

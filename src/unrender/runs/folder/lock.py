@@ -1,8 +1,9 @@
 """Who holds a run folder: one process at a time, and one that died holds nothing.
 
 The file `lock` names the process and is locked (`flock`) while it lives: the kernel lets go when it ends, however it ends, so neither a
-crash nor a process id that was given to another can leave a folder locked. Where the file system does not lock, or another machine wrote
-the file, the name decides: process id and time of its start, counted from the machine's own start and so untouched by clocks set back.
+crash, nor a process id that was given to another, nor a container that starts again under another host name can leave a folder locked.
+Where the file system does not lock, or its locks hold within one machine though others write to it too, the name decides: process id and
+time of its start, counted from the machine's own start and so untouched by clocks set back.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +24,14 @@ from unrender.runs.folder.schema import LOCK
 
 __all__ = ["Holder", "Lock", "holder"]
 _LARGEST = 1 << 12
+_MOUNTS = Path("/proc/self/mountinfo")
+_SERVER = re.compile(r"nfs4?$|cifs$|smb3$")
+_SHARED = re.compile(
+    r"nfs|cifs|smb|9p|afs|ceph|lustre|gpfs|beegfs|ocfs2|gfs2|orangefs|pvfs2|glusterfs|virtiofs|fuse(?!blk)|vboxsf|prl_fs"
+)
+"""File systems that several machines may write to."""
+_WITHIN_ONE_MACHINE = {"nolock", "local_lock=flock", "local_lock=all", "nobrl"}
+"""Options of those in whose presence locks are not passed on."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +83,13 @@ class Lock:
         """Let the folder go. Harmless where it is not held."""
         if self._file is None:
             return
-        with contextlib.suppress(OSError):
-            if self.is_held():
-                self.path.unlink()
-        os.close(self._file)
-        self._file = None
+        try:
+            with contextlib.suppress(OSError):
+                if self.is_held():
+                    self.path.unlink()
+        finally:
+            os.close(self._file)
+            self._file = None
 
     def _try(self) -> int | None:
         """The locked file; None where it was deleted in between: then try again."""
@@ -95,7 +107,8 @@ class Lock:
                 os.close(file)
                 return None
             known = _read(self.path)
-            if known is not None and not known.is_gone() and not (locked and known.host == platform.node()):
+            decided = locked and (_locks_for_all(file) or (known is not None and known.host == platform.node()))
+            if known is not None and not known.is_gone() and not decided:
                 raise InputError(self._in_use(known))
             me = Holder(os.getpid(), platform.node(), _started(os.getpid()))
             os.ftruncate(file, 0)
@@ -116,7 +129,43 @@ class Lock:
 def holder(folder: Path) -> Holder | None:
     """The process that holds a run folder, as far as can be told without asking for it; None where none does, or it has ended."""
     found = _read(folder / LOCK)
-    return None if found is None or found.is_gone() else found
+    return None if found is None or found.is_gone() or _is_free(folder / LOCK) else found
+
+
+def _is_free(path: Path) -> bool:
+    """Whether the lock is known to be held by no process on any machine."""
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return _locks_for_all(file)
+    except OSError:
+        return False
+    finally:
+        os.close(file)
+
+
+def _locks_for_all(file: int) -> bool:
+    """Whether a lock of this file excludes every process that could hold it, on whatever machine.
+
+    On a file system of this machine all processes ask its one kernel. NFS and SMB pass locks on to the server unless they are mounted not
+    to; of others that several machines may share nothing is known.
+    """
+    device = os.fstat(file).st_dev
+    number = f"{os.major(device)}:{os.minor(device)}"
+    try:
+        mounts = [line.split(" - ") for line in _MOUNTS.read_text().splitlines()]
+    except OSError:
+        return False  # not Linux: what it is cannot be told
+    for mount, described in (parts for parts in mounts if len(parts) == 2):
+        if mount.split()[2] == number:
+            kind, _, options = described.split(" ", 2)
+            return not _SHARED.match(kind) or (
+                bool(_SERVER.match(kind)) and _WITHIN_ONE_MACHINE.isdisjoint(options.split(","))
+            )
+    return True  # btrfs and overlays have numbers that no mount has; what is shared has its own
 
 
 def _read(path: Path) -> Holder | None:

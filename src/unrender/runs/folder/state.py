@@ -20,7 +20,7 @@ import numpy as np
 from unrender.core import arrays, registry
 from unrender.core.errors import InputError
 
-__all__ = ["Packed", "check_alike", "pack", "unpack"]
+__all__ = ["Packed", "check_alike", "not_finite", "pack", "unpack"]
 
 _PACKAGE = __name__.partition(".")[0]
 _DEEPEST = 64
@@ -120,6 +120,24 @@ def _check_array(array: Any, patterns: list[Any], where: str) -> None:
         if form == (pattern.dtype if grows else None, shape[1 if grows else 0 :], len(shape)):
             return
     raise InputError(f"{where}: expected shape {arrays.shape(patterns[0])}, got {arrays.shape(array)}")
+
+
+def not_finite(state: Any, where: str = "state") -> str:
+    """Where a state first holds a number that is not finite: "state.second_moment['wall']"; "" where it holds none."""
+    if dataclasses.is_dataclass(state) and not isinstance(state, type):
+        parts = ((getattr(state, each.name), f"{where}.{each.name}") for each in dataclasses.fields(state))
+    elif isinstance(state, Mapping):
+        parts = ((part, f"{where}[{key!r}]") for key, part in state.items())
+    elif isinstance(state, (tuple, list)):
+        parts = ((part, f"{where}[{index}]") for index, part in enumerate(state))
+    elif isinstance(state, _FLOATS):
+        return "" if math.isfinite(state) else where
+    elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
+        host = arrays.numpy(state)
+        return where if host.dtype.kind == "f" and not np.isfinite(host).all() else ""
+    else:
+        return ""
+    return next((found for part, name in parts if (found := not_finite(part, name))), "")
 
 
 @dataclass

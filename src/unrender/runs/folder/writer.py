@@ -1,4 +1,8 @@
-"""The run folder while its run goes: begun before the first step, kept up at every one, whole at every instant."""
+"""The run folder while its run goes: begun before the first step, kept up at every one, whole at every instant.
+
+All but the history is on the disk when it has its name, and the history when a checkpoint counts on it: so what a power cut leaves is what
+a kill would have left at the last checkpoint, or later.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ from unrender.problem import serialization
 from unrender.problem.problem import Problem
 from unrender.runs.final_images import render_pictures
 from unrender.runs.folder import checkpoint
-from unrender.runs.folder.history import HistoryFile
+from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
 from unrender.runs.folder.schema import (
     CONTROL,
@@ -34,9 +38,9 @@ from unrender.runs.folder.schema import (
     REPORT,
     TRUTH,
 )
-from unrender.runs.folder.state import pack
+from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.hooks import Hook
-from unrender.runs.result import Result, deciding_versions
+from unrender.runs.result import TERMINATED, Result, deciding_versions
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
@@ -50,6 +54,7 @@ _FILES = (
 _STEPS, _MOST_SECONDS = 50, 60.0
 _SHARE = 1 / 50
 _CHECK_SECONDS = 1.0
+_EXPORT = "scene"
 
 _log = logging.getLogger("unrender")
 
@@ -87,6 +92,7 @@ class RunWriter(Hook):
     _written_step: int = -1
     _written_at: float = field(default_factory=time.perf_counter)
     _cost: float = 0.0
+    _thin_from: int = 0
 
     def __post_init__(self) -> None:
         self._lock = Lock(self.folder)
@@ -108,6 +114,7 @@ class RunWriter(Hook):
         try:
             if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
                 _clear(self.folder)
+            _sweep(self.folder)
             self._write_start(result)
             self._started = True
         except OSError as error:
@@ -116,25 +123,33 @@ class RunWriter(Hook):
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
         """Go on after `records`, with which the history is rewritten. Raises `InputError` where that cannot be."""
         try:
-            checkpoint.remove_partial(self.folder)
+            _sweep(self.folder)
             self._history.rewrite(records)
             files.write(self.folder / METHOD, _method_text(self.method))
             self._write_record(result, "running")
-            self._written_step, self._started = len(records), True
+            self._written_step, self._started = result.steps, True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """Append the step to the history; write a checkpoint where one is due."""
         self.append(record)
+        if self._history.size > max(MOST_KEPT, self._thin_from):
+            self._guarded("history", lambda: self._thin(descent.log.history))
         if self.checkpoint_due(descent.run.step):
             self.write_checkpoint(descent)
 
     def on_result(self, descent: Descent, result: Result) -> Result:
-        """Write the last checkpoint and the result, render the final pictures, and write the result with them."""
+        """Write the last checkpoint and the result, render the final pictures, and write the result with them.
+
+        Without pictures for a run that was told to terminate: whoever did waits for seconds at most.
+        """
         self.write_checkpoint(descent, result)
-        self._save(result, "running")  # what took long is safe before what takes seconds more
-        result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
+        if result.stopped != TERMINATED:
+            if result.status != "finished" or self._written_step != result.steps:
+                # What took long is safe, and how it ended is known, before what takes seconds more.
+                self._save(result, "running" if result.status == "finished" else result.status)
+            result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
         self._save(result, result.status)
         return result
 
@@ -181,7 +196,7 @@ class RunWriter(Hook):
 
     def _acquire(self) -> None:
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            files.make_folder(self.folder)
         except OSError as error:
             raise InputError(f"run folder {self.folder}: {error.strerror or error}") from error
         self._lock.acquire()
@@ -195,12 +210,13 @@ class RunWriter(Hook):
 
     def _write_start(self, result: Result) -> None:
         serialization.save(self.problem, self.folder)
-        files.write(self.folder / METHOD, _method_text(self.method))
-        files.write_arrays(self.folder / INITIAL, result.initial)
+        files.write(self.folder / METHOD, _method_text(self.method), name_too=False)
+        files.write_arrays(self.folder / INITIAL, result.initial, name_too=False)
         if result.truth:
-            files.write_arrays(self.folder / TRUTH, result.truth)
-        files.write_arrays(self.folder / PARAMETERS, result.parameters)
-        self._history.rewrite(result.history)
+            files.write_arrays(self.folder / TRUTH, result.truth, name_too=False)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters, name_too=False)
+        self._history.rewrite(result.history, name_too=False)
+        files.sync_folder(self.folder)
         self._write_record(result, "running")
 
     def _write_record(self, result: Result, status: str, error: str = "") -> None:
@@ -211,12 +227,23 @@ class RunWriter(Hook):
         self._restore_folder(result)
         if self._taken_over:
             return
+        if where := not_finite(state["optimizer"], "optimizer"):
+            raise InputError(f"the state holds numbers that are not finite ({where}); the one before stays the last")
         self._history.sync()
         problem = result.problem["fingerprint"]
         checkpoint.write(self.folder, result.steps, seed, pack(state), deciding_versions(), problem)
-        files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False)
+        files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False, name_too=False)
         self._write_record(result, "running")
         self._written_step = result.steps
+
+    def _thin(self, records: list[dict[str, Any]]) -> None:
+        """Keep fewer records of the earlier steps, in memory and in the file."""
+        kept = thinned(records)
+        self._thin_from = self._history.size + MOST_KEPT // 8  # not at every step where it is of no use, or fails
+        if len(kept) < len(records):
+            records[:] = kept
+            self._history.rewrite(records)
+            self._thin_from = 0
 
     def _restore_folder(self, result: Result) -> None:
         """See that the folder is still there and locked; make it again where it was deleted."""
@@ -260,8 +287,15 @@ def _clear(folder: Path) -> None:
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     checkpoint.clear(folder)
-    checkpoint.remove_partial(folder)
     for name in (serialization.ARRAYS, LIVE):
         place = folder / name
         if place.is_dir() and not place.is_symlink() and not os.path.ismount(place):
             shutil.rmtree(place, ignore_errors=True)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what processes that died left half-written: runs, reports, and exports to where they go by default."""
+    files.remove_leftovers(folder, (*_FILES, _EXPORT))
+    for name in (serialization.ARRAYS, LIVE):
+        files.remove_leftovers(folder / name)
+    checkpoint.remove_partial(folder)

@@ -1,0 +1,74 @@
+"""Ctrl-C and SIGTERM: one line and an exit status of their own, at whatever instant and however often they come.
+
+A run takes both over while it goes, and ends in good order after its step (`runs.run.interruptible`). Elsewhere, and when they come a
+second time, the command is interrupted where it is; while it is still busy with that, one more ends the process at once. What a run had
+written remains, as after a kill.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+from unrender.cli.exit_status import WORDS
+from unrender.core.signals import GRACEFUL
+
+__all__ = ["Signals"]
+
+_SHOW_CURSOR = b"\x1b[?25h"
+
+
+class Signals:
+    """Handles both signals, as a context manager, in the main thread.
+
+    Args:
+        process: whether the process ends with the command: then a Ctrl-C that comes after it is ignored.
+
+    Attributes:
+        status: the exit status of the signal that came; 0 for none.
+    """
+
+    def __init__(self, process: bool):
+        self.status = 0
+        self._process = process
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, _Handler(self))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            ignored = self._process and number == signal.SIGINT
+            signal.signal(number, signal.SIG_IGN if ignored else handler)
+
+    def receive(self, number: int) -> None:
+        """What a signal does."""
+        if self.status:
+            if sys.stderr.isatty():
+                os.write(2, _SHOW_CURSOR)
+            os.write(2, f"unrender: {WORDS[self.status]}\n".encode())
+            os._exit(self.status)
+        self.status = 128 + number
+        raise KeyboardInterrupt
+
+
+class _Handler:
+    """A handler of signals in whose place a run may put its own."""
+
+    def __init__(self, signals: Signals):
+        self._signals = signals
+        setattr(self, GRACEFUL, True)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        self._signals.receive(number)
