@@ -8,10 +8,11 @@ from pathlib import Path
 import hostile_folders
 import hostile_inputs
 import pytest
-from hostile_inputs import INPUTS
+from hostile_inputs import INPUTS, ply
 from hostile_worker import Outcome, take_in
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba import description
 
 _SECONDS, _WALL, _BYTES = 1.0, 10.0, 1 << 30
 """Of an input at most. The clock goes on while other processes run: it is held to what is no hang."""
@@ -75,3 +76,15 @@ def _print(outcomes: list[Outcome], capsys: pytest.CaptureFixture[str]) -> None:
                 f"\nmost {what}: {worst.name}: {worst.seconds:.2f} s, {worst.bytes / 1e6:.0f} MB of {len(outcomes)}",
                 end="",
             )
+
+
+def test_what_mitsuba_warns_of_is_printable(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """It quotes names of files, and would write to the terminal itself."""
+    path = tmp_path / "a\x1b]0;owned\x07.ply"
+    path.write_bytes(ply(((3, 0, 1, 2),) * 20_000, form="ascii"))
+    capfd.readouterr()
+    description.load({"type": "ply", "filename": path})
+    said = capfd.readouterr()
+    assert "performance warning" in said.err
+    assert "\\x1b]0;owned\\x07.ply" in said.err
+    assert "\x1b" not in said.out + said.err

@@ -50,10 +50,8 @@ def _placed(path: str, bsdf: dict[str, Any], scale: float, origin: np.ndarray) -
 def _extent(path: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         box = load({"type": _kind(path), "filename": path}).bbox()
-    except InputError as error:
-        raise InputError(f"mesh {error}") from error
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = " ".join(str(error).split()).removeprefix(f"{path}: ")[:300]
         raise InputError(f"mesh {path}: Mitsuba could not read it: {reason}") from error
     low, high = (np.array(corner, float).reshape(3) for corner in (box.min, box.max))
     if not np.isfinite([low, high]).all() or np.max(high - low) <= 0:

@@ -54,7 +54,7 @@ class Parsed:
         """
         for node in self.state.nodes:
             self._check_files(node.props)
-        with plugins.only(plugins.own_folder()), _printable_log():
+        with variant.two_threads(), plugins.only(plugins.own_folder()), _printable_log():
             found = mi.parser.instantiate(self.config, self.state)
         return found[0] if isinstance(found, list) else found
 
@@ -73,8 +73,7 @@ def load(description: Path | Mapping[str, Any]) -> Any:
     Raises:
         InputError: see `parse` and `Parsed.instantiate`. What Mitsuba itself refuses is an exception of its own.
     """
-    with variant.two_threads():
-        return parse(description).instantiate()
+    return parse(description).instantiate()
 
 
 def parse(description: Path | Mapping[str, Any]) -> Parsed:
