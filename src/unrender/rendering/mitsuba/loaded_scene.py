@@ -123,11 +123,12 @@ class LoadedScene:
         """
         self._restore([key for key in self._settings if key not in values])
         changed = [key for key, value in values.items() if not self._is_set(key, value, attached)]
-        # Within the backward pass of an operation of the user's graph, leaves must be all of it or all from before it: Dr.Jit (1.5)
-        # loses the gradients of a mixture.
-        for key in values if attached and changed else changed:
+        # Where others change the scene between two passes, leaves are made anew within the backward pass of an operation of theirs:
+        # then all of them, since Dr.Jit (1.5) loses the gradients of leaves of which some were made within it and some before.
+        for key in values if self._shared and attached and changed else changed:
             value = values[key]
-            leaf = from_tensor(value, self._own[key])
+            # What the scene holds already, Mitsuba would not set again: a copy.
+            leaf = from_tensor(value if key in changed else _copy(value), self._own[key])
             self.leaves.pop(key, None)
             if attached:
                 dr.enable_grad(leaf)
@@ -216,6 +217,13 @@ def _is_array(value: Any) -> bool:
     except TypeError:
         return False
     return not isinstance(value, (int, float))
+
+
+def _copy(value: mi.TensorXf) -> mi.TensorXf:
+    """The same numbers in other memory."""
+    copied = mi.TensorXf(value.array * dr.opaque(mi.Float, 1), tuple(value.shape))
+    dr.eval(copied)
+    return copied
 
 
 def _reference(value: Any) -> Any:
