@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import http.client
+import json
 import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -90,6 +93,19 @@ def test_idle_connections_do_not_keep_the_owner_out(tmp_path: Path) -> None:
         began = time.monotonic()
         assert status(address) == 200
         assert time.monotonic() - began < 1
+
+
+@pytest.mark.slow
+def test_idle_and_busy_strangers_do_not_keep_the_owner_out(tmp_path: Path) -> None:
+    """A small form of the benchmark `watch.connections`, by its clients."""
+    clients = Path(__file__).parents[2] / "benchmarks" / "watch" / "connections" / "clients.py"
+    with served(write_run(tmp_path / "run"), refusal_seconds=0.5) as address:
+        assert status(address) == 200
+        words = [sys.executable, str(clients), address.url, "300", "30", "5"]
+        found = json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    assert sorted(found["waits"])[len(found["waits"]) // 2] < 1  # 30 where it was refused
+    assert found["idle"] > 290
+    assert found["answered"] > 1
 
 
 @pytest.mark.usefixtures("limits")
