@@ -9,8 +9,6 @@ from typing import Any, Literal
 
 import mitsuba as mi
 import numpy as np
-import skimage.data
-from skimage.transform import resize
 
 __all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp", "to_linear"]
 
@@ -28,6 +26,9 @@ def to_linear(srgb: np.ndarray) -> np.ndarray:
 
 def photograph(name: Photograph, resolution: int) -> np.ndarray:
     """The middle square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
+    import skimage.data
+    from skimage.transform import resize
+
     picture = np.asarray(getattr(skimage.data, name)())
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
