@@ -1,6 +1,7 @@
 """The user's cache folder: what can be computed again, kept so that it need not be.
 
-It lies where the system wants such folders, or where the environment variable `UNRENDER_CACHE_DIR` says; an empty one switches it off. In it:
+It lies where the system wants such folders, or where the environment variable `UNRENDER_CACHE_DIR` says; an empty one switches it off.
+In it:
 
     references/    reference images of the gallery's problems
     kernels/       kernels that Dr.Jit has compiled
@@ -16,7 +17,18 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["ENVIRONMENT_VARIABLE", "KERNELS", "REFERENCES", "bypassed", "folder", "root", "size", "tidy", "trim", "use_for_kernels"]
+__all__ = [
+    "ENVIRONMENT_VARIABLE",
+    "KERNELS",
+    "REFERENCES",
+    "bypassed",
+    "folder",
+    "root",
+    "size",
+    "tidy",
+    "trim",
+    "use_for_kernels",
+]
 
 ENVIRONMENT_VARIABLE = "UNRENDER_CACHE_DIR"
 REFERENCES, KERNELS = "references", "kernels"

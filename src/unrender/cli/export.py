@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Variant
@@ -24,6 +22,9 @@ def export(
     variant: Variant = "auto",
 ) -> None:
     """Write a run's result as a scene folder: XML, textures, meshes, volumes, and the recovered maps alone."""
+    from rich.console import Console
+    from rich.markup import escape
+
     console = Console(highlight=False)
     if not directory.is_dir():
         raise InputError(f"{directory}: no such run folder")

@@ -9,26 +9,30 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-
-import typer
+from importlib import metadata
 
 from unrender.backend import variant
-from unrender.cli.doctor import doctor
 from unrender.core.errors import UnrenderError, VariantError
 
 __all__ = ["main"]
 
 INPUT, ENVIRONMENT, INTERRUPTED = 2, 3, 130
 
-# Typer may bring its own copy of click, so its errors are found from the one that typer exports.
-_UsageError: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:  # at once: nothing else is imported
+        print(metadata.version("unrender"))
+        return 0
+    import typer
+
+    # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
+    usage_error: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
     try:
         if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
+            from unrender.cli.doctor import doctor
+
             return doctor()
         variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
         from unrender.cli.app import app
@@ -42,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(str(error), ENVIRONMENT)
     except UnrenderError as error:
         return _complain(str(error), INPUT)
-    except _UsageError as error:
+    except usage_error as error:
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
     except typer.Exit as end:
         return end.exit_code

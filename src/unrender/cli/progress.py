@@ -1,15 +1,17 @@
-"""How far a run is: a bar that moves on a terminal, a line now and then elsewhere."""
+"""What a command is doing: a bar that moves on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
+import math
 import time
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
+from unrender.core import phases
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
@@ -24,9 +26,10 @@ _SMOOTHING = 0.1
 
 
 class Progress(Callback):
-    """Shows steps, loss, parameter error (where the truth is known), gradient noise, speed and the time left.
+    """Names each phase of a command as it begins (loading, reference images, compiling), and shows how far it is. Of the steps it shows
+    loss, parameter error (where the truth is known), gradient noise, speed and the time left; the loss is smoothed over about ten steps.
 
-    The loss is smoothed over about ten steps. Use as a context manager, so that the bar is taken down whatever happens.
+    Use as a context manager, so that it hears of the phases, and the bar is taken down whatever happens.
 
     Args:
         console: where to; None for standard output.
@@ -34,31 +37,78 @@ class Progress(Callback):
 
     def __init__(self, console: Console | None = None):
         self._console = console or Console()
+        self._began = time.perf_counter()
+        self._stopwatch = phases.Stopwatch()
+        self._listening: AbstractContextManager[None] | None = None
+        self._within: list[str] = []
+        self._printed = ""
         self._bar: Bar | None = None
         self._started = self._shown = self._before = 0.0
         self._loss: float | None = None
         self._error: dict[str, float] = {}
-        self._skipped = 0
 
     def __enter__(self) -> Progress:
+        self._listening = phases.listening(self)
+        self._listening.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._close()
+        if self._listening is not None:
+            self._listening.__exit__(None, None, None)
+            self._listening = None
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """{phase: seconds} so far; the time that nobody named is in no phase."""
+        return dict(self._stopwatch.seconds)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since this was made."""
+        return time.perf_counter() - self._began
+
+    # ------------------------------------------------------------------ phases
+
+    def on_phase(self, name: str) -> None:
+        """See `phases.Listener.on_phase`."""
+        self._stopwatch.on_phase(name)
+        self._within.append(name)
+        if self._console.is_terminal:
+            self._open(name, None)
+        elif name != self._printed:
+            self._print(name)
+            self._printed = name
+
+    def on_progress(self, share: float) -> None:
+        """See `phases.Listener.on_progress`."""
+        now = time.perf_counter()
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], total=1.0, completed=share)
+        elif self._within and now - self._shown >= _LINE_SECONDS and share < 1:
+            self._print(f"{self._within[-1]} {100 * share:.0f}%")
+
+    def on_phase_end(self, name: str) -> None:
+        """See `phases.Listener.on_phase_end`."""
+        self._stopwatch.on_phase_end(name)
+        self._within.pop()
+        self._close()
+        if self._within and self._console.is_terminal:
+            self._open(self._within[-1], None)
+
+    # ------------------------------------------------------------------ steps
 
     def on_start(self, run: Run) -> None:
         """See `Callback.on_start`."""
-        self._started, self._before = time.perf_counter(), run.progress()
+        self._started, self._before, self._shown = time.perf_counter(), run.progress(), 0.0
+        self._loss, self._error = None, {}
         if self._console.is_terminal:
-            columns = BarColumn(bar_width=20), TextColumn("{task.description}", markup=False)
-            self._bar = Bar(*columns, console=self._console, transient=True, auto_refresh=False)
-            self._bar.start()
-            self._bar.add_task("", total=1.0)
+            self._open("", 1.0)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
         loss = record["loss"]
-        if np.isfinite(loss):
+        if math.isfinite(loss):
             self._loss = loss if self._loss is None else self._loss + _SMOOTHING * (loss - self._loss)
         self._error = record.get("parameter_error") or self._error
         now = time.perf_counter()
@@ -68,19 +118,35 @@ class Progress(Callback):
                 self._shown = now
                 self._bar.update(self._bar.task_ids[0], completed=run.progress(), description=self._line(run, record))
                 self._bar.refresh()
+            if last:
+                self._close()
         elif last or now - self._shown >= _LINE_SECONDS:
-            self._shown = now
-            self._console.print(self._line(run, record), markup=False, highlight=False, soft_wrap=True)
+            self._print(self._line(run, record))
 
     def on_end(self, run: Run, result: Result) -> None:
         """See `Callback.on_end`."""
         del run, result
         self._close()
 
+    # ------------------------------------------------------------------ the parts
+
+    def _open(self, name: str, total: float | None) -> None:
+        """A bar: one that moves by itself where it is not known how much there is to do."""
+        self._close()
+        columns = BarColumn(bar_width=20), TextColumn("{task.description}", markup=False)
+        self._bar = Bar(*columns, console=self._console, transient=True, auto_refresh=total is None)
+        self._bar.start()
+        self._bar.add_task(name, total=total)
+
     def _close(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+    def _print(self, line: str) -> None:
+        self._shown = time.perf_counter()
+        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.file.flush()
 
     def _line(self, run: Run, record: dict[str, Any]) -> str:
         parts = [f"step {run.step}" + (f"/{run.steps}" if run.steps else "")]

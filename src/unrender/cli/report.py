@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from unrender import report as pages
-
 __all__ = ["report"]
 
 
 def report(directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]) -> None:
     """Write the page of a run folder anew, and print where it is."""
+    from unrender import report as pages
+
     typer.echo(str(pages.page(directory)))

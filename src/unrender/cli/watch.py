@@ -12,7 +12,6 @@ import typer
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.watch import server
 
 __all__ = ["watch"]
 
@@ -28,6 +27,8 @@ def watch(
 
     It is served to this machine alone, under an address that holds a secret. Ctrl-C ends the page, not the runs.
     """
+    from unrender.watch import server
+
     for directory in directories:
         if not directory.is_dir():
             siblings = [p.name for p in directory.parent.iterdir() if p.is_dir()] if directory.parent.is_dir() else []

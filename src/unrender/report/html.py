@@ -12,7 +12,7 @@ from typing import Any
 from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from unrender.report import formatting
+from unrender.display import formatting
 from unrender.runs.folder.schema import RunRecord
 
 __all__ = ["environment", "facts", "flatten", "loader", "render", "source"]

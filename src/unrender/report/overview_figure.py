@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from unrender.report import formatting, panels, plots, tone_mapping
+from unrender.display import formatting, plots
+from unrender.report import panels, tone_mapping
 from unrender.report.curves import Band
 from unrender.report.equal_time import Comparison, Metric
 

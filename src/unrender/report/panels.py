@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import formatting, tone_mapping
+from unrender.display import formatting
+from unrender.report import tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import curves, formatting, image_metrics, tone_mapping
+from unrender.display import formatting
+from unrender.report import curves, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
 __all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "parameter_row", "tiles", "view_rows"]

@@ -24,6 +24,7 @@ from unrender.runs.hooks import CallbackHook, Hook
 from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
+from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run
@@ -76,17 +77,22 @@ def optimize(
     run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
     log = RunMetadata(describe_run(run, annotations), run.full())
     if run_directory is None:
-        return descend(Descent(run, state, log, assemble_hooks(callbacks)))
+        return descend(Descent(run, state, log, assemble_hooks(callbacks, earlier=annotations.phases)))
     run.folder = Path(run_directory)
     log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(log.result(run))
-        return descend(Descent(run, state, log, assemble_hooks(callbacks, writer)))
+        return descend(Descent(run, state, log, assemble_hooks(callbacks, writer, earlier=annotations.phases)))
 
 
-def assemble_hooks(callbacks: Sequence[Callback], *folder: Hook) -> list[Hook]:
-    """What takes part in every run, then what keeps its run folder, then the user's callbacks."""
-    return [InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
+def assemble_hooks(
+    callbacks: Sequence[Callback], *folder: Hook, earlier: Mapping[str, float] | None = None
+) -> list[Hook]:
+    """What takes part in every run, then what keeps its run folder, then the user's callbacks.
+
+    `earlier` is the seconds of phases before the run.
+    """
+    return [PhaseTimes(earlier), InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:

@@ -44,6 +44,10 @@ class Result:
         name, method, settings, seed, command, problem: what was run.
         resumed: the steps at which it was resumed.
         truth: {key: array} where it is known.
+        image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
+            reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
+        phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
+            and, of the command line, what came before. Of the last session, where the run was resumed.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
     """
 
@@ -65,6 +69,8 @@ class Result:
     resumed: Sequence[int] = ()
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    phases: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -123,6 +129,10 @@ class Result:
             "warnings": list(self.warnings),
             "problem": dict(self.problem),
             "resumed": list(self.resumed),
+            "image_errors": {
+                name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
+            },
+            "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:
             fields["error"] = error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,9 @@ def resume_run(
     callbacks: Sequence[Callback] = (),
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
+    earlier: Mapping[str, float] | None = None,
 ) -> Result:
-    """Resume the run. See `unrender.resume`."""
+    """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before."""
     folder, method, record = stored.folder, stored.method, stored.record
     parts = method_file.parts(method, folder / METHOD, estimator, optimizer)
     check(parts.estimator, parts.optimizer, method.steps, method.seconds)
@@ -104,7 +105,7 @@ def resume_run(
         if source.checkpoint is not None:
             initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))
         restoring = _Restore(record, source, changes, writer)
-        return descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer)]))
+        return descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer, earlier=earlier)]))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
-from unrender.runs.final_images import render_pictures
+from unrender.runs import phase_times
+from unrender.runs.final_images import render_final_images
 from unrender.runs.folder import checkpoint
 from unrender.runs.folder.history import HistoryFile
 from unrender.runs.folder.lock import Lock
@@ -134,7 +135,10 @@ class RunWriter(Hook):
         """Write the last checkpoint and the result, render the final pictures, and write the result with them."""
         self.write_checkpoint(descent, result)
         self._save(result, "running")  # what took long is safe before what takes seconds more
-        result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
+        started = time.perf_counter()
+        images = render_final_images(descent.run.problem, result, self.final_spp)
+        result = replace(result, pictures=images.pictures, image_errors=images.errors)
+        result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
         return result
 
