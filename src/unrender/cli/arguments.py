@@ -37,6 +37,7 @@ __all__ = [
     "open_problem",
     "remove_if_empty",
     "settings",
+    "short_name",
     "use_variant",
 ]
 
@@ -150,6 +151,11 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
         if _is_file(name):
             return Problem.from_file(name)
         return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+
+
+def short_name(problem: str) -> str:
+    """What folders are called after: the problem's name, or its file's without the ending."""
+    return Path(problem).stem if problem.endswith(".toml") else problem
 
 
 def _is_file(name: str) -> bool:

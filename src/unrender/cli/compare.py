@@ -69,29 +69,22 @@ def compare(
         _compare_folders(console, [Path(name) for name in what], out, overwrite)
         return
     _check_single(what)
-    typed = arguments.settings(settings, "--set")
-    options = arguments.settings(problem_settings, "--problem-set")
+    typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
             from unrender.cli.execute import Plan, introduce
 
-            chosen = _parse_methods(methods)
-            given = _settings_by_method(chosen, typed)
-            for one in chosen:
-                one.start(given[one.name])
+            chosen, given = _methods_and_settings(methods, typed)
             arguments.check_problem(what[0], options)
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
-        name = Path(what[0]).stem if what[0].endswith(".toml") else what[0]
-        folder = arguments.folder(out, f"{name}-compare", overwrite, *_MARKS)
+        folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
             running = arguments.use_variant(variant)
             problem = arguments.open_problem(what[0], options, not no_cache)
             introduce(console, problem, running)
             command = shlex.join(context.find_root().obj or ["unrender"])
-            plans = [  # methods take turns, so that a machine that slows down slows all of them
-                Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
-                for number, one in itertools.product(range(seed, seed + seeds), chosen)
-            ]
+            turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
+            plans = [Plan(problem, m, given[m.name], None, seconds, n, final_spp, command, options) for n, m in turns]
             directories, interrupted = _run_all(console, plans, folder, progress)
         finally:
             arguments.remove_if_empty(folder)
@@ -152,6 +145,17 @@ def _run_all(console: Console, plans: Sequence[Plan], folder: Path, progress: Pr
         if result.stopped == "interrupted":
             return directories, True
     return directories, False
+
+
+def _methods_and_settings(
+    names: str | None, typed: Mapping[str, str]
+) -> tuple[list[Method], dict[str, dict[str, str]]]:
+    """The methods, and the settings of each, all of which it takes. Raises `InputError`."""
+    chosen = _parse_methods(names)
+    given = _settings_by_method(chosen, typed)
+    for one in chosen:
+        one.start(given[one.name])
+    return chosen, given
 
 
 def _parse_methods(names: str | None) -> list[Method]:

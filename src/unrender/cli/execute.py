@@ -21,6 +21,7 @@ from unrender.runs.final_images import image_name
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
+from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.result import Result
 
 __all__ = ["Plan", "execute", "image_error", "introduce", "summarise"]
@@ -58,7 +59,8 @@ def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -
     options = plan.method.configure(plan.settings).model_dump()
     settings = {"options": options, "problem_options": dict(plan.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
-    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, progress.seconds)
+    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
+    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, earlier)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
     result = optimize(
         plan.problem,

@@ -74,8 +74,7 @@ def run(
             steps, seconds = _budget_settings(given, steps, seconds)
             chosen.start(given)
             arguments.check_problem(problem, options)
-        name = Path(problem).stem if problem.endswith(".toml") else problem
-        folder = arguments.folder(out, f"{name}-{chosen.name}", overwrite, "run.json", "lock")
+        folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
