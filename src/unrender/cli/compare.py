@@ -64,21 +64,18 @@ def compare(
 
     console = Console(highlight=False)
     if all(Path(name).is_dir() for name in what):
-        if methods or settings or problem_settings or seconds is not None:
-            raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
-        _compare_folders(console, [Path(name) for name in what], out, overwrite)
-        return
+        run_options = methods or settings or problem_settings or seconds is not None
+        return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
-        with phases.phase("loading"):
-            from unrender.cli.execute import Plan, introduce
-
-            chosen, given = _methods_and_settings(methods, typed)
-            arguments.check_problem(what[0], options)
+        chosen, given = _methods_and_settings(methods, typed)
+        arguments.check_problem(what[0], options)
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
+            from unrender.cli.execute import Plan, introduce
+
             running = arguments.use_variant(variant)
             problem = arguments.open_problem(what[0], options, not no_cache)
             introduce(console, problem, running)
@@ -114,8 +111,12 @@ def _check_single(what: Sequence[str]) -> None:
         raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
 
 
-def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:
-    """Compare runs made earlier."""
+def _compare_folders(
+    console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool, run_options: bool
+) -> None:
+    """Compare runs made earlier. `run_options`: whether options were given that only runs made here have."""
+    if run_options:
+        raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
     from unrender import report
     from unrender.cli import comparison_table
 
@@ -151,10 +152,11 @@ def _methods_and_settings(
     names: str | None, typed: Mapping[str, str]
 ) -> tuple[list[Method], dict[str, dict[str, str]]]:
     """The methods, and the settings of each, all of which it takes. Raises `InputError`."""
-    chosen = _parse_methods(names)
-    given = _settings_by_method(chosen, typed)
-    for one in chosen:
-        one.start(given[one.name])
+    with phases.phase("loading"):
+        chosen = _parse_methods(names)
+        given = _settings_by_method(chosen, typed)
+        for one in chosen:
+            one.start(given[one.name])
     return chosen, given
 
 
