@@ -23,6 +23,16 @@ __all__ = ["TOLERANCE", "doctor", "gradient_error"]
 TOLERANCE = 1e-3
 """The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
 
+_FEATURES = {
+    "denoise": "denoised images on the CPU",
+    "flip": "the measure FLIP",
+    "tensorboard": "TensorBoard",
+    "torch": "functions behind a network, perceptual losses",
+    "dev": "tests of this package",
+    "docs": "its documentation",
+}
+"""What the extras are for."""
+
 _STEP = 0.05
 _RESOLUTION = 16
 _SPP = 64
@@ -166,18 +176,33 @@ def _first_line(program: str, *arguments: str) -> str | None:
 
 
 def _missing() -> list[str]:
-    """One line per extra of the package that is not fully installed."""
+    """One line per optional feature whose packages are not installed and can be on this Python: with the command that installs them.
+
+    The command names the packages themselves: this one may not be on an index to take its extras from.
+    """
+    from packaging.requirements import InvalidRequirement, Requirement
+
     try:
         required = metadata.requires("unrender") or []
     except metadata.PackageNotFoundError:
         return []
     absent: dict[str, list[str]] = {}
-    for requirement in required:
-        name = re.match(r"[\w.-]+", requirement)
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
-        if name and extra and _version(name[0]) is None:
-            absent.setdefault(extra[1], []).append(name[0])
+    for text in required:
+        try:
+            requirement = Requirement(text)
+        except InvalidRequirement:
+            continue
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", text)
+        if extra is None or _version(requirement.name) is not None:
+            continue
+        if requirement.marker is not None and requirement.marker.evaluate({"extra": extra[1]}):
+            requirement.marker = None
+            absent.setdefault(extra[1], []).append(str(requirement))
     return [
-        f"(optional) {', '.join(names)}; install: pip install 'unrender[{extra}]'"
+        f"(optional, {_FEATURES.get(extra, extra)}) install: pip install {' '.join(map(_quoted, names))}"
         for extra, names in sorted(absent.items())
     ]
+
+
+def _quoted(requirement: str) -> str:
+    return f"'{requirement}'" if re.search(r"[<>=!~\[]", requirement) else requirement

@@ -17,6 +17,7 @@ from unrender.display import formatting
 from unrender.evaluation import debiased
 from unrender.methods import Method
 from unrender.problem.problem import Problem
+from unrender.runs import advice
 from unrender.runs.final_images import image_name
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
@@ -59,6 +60,8 @@ def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -
     options = plan.method.configure(plan.settings).model_dump()
     settings = {"options": options, "problem_options": dict(plan.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
+    for line in advice.remarks(plan.problem, optimizer):
+        console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
     annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, earlier)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)

@@ -16,6 +16,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.problem.serialization import origin
+from unrender.runs import advice, components
 from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
@@ -34,8 +35,8 @@ __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer
 
 def optimize(
     problem: Problem,
-    estimator: Estimator,
-    optimizer: Optimizer,
+    estimator: Estimator | str,
+    optimizer: Optimizer | None = None,
     steps: int | None = None,
     seconds: float | None = None,
     seed: int = 0,
@@ -48,8 +49,8 @@ def optimize(
 
     Args:
         problem: what to recover, from which images.
-        estimator: where gradients come from.
-        optimizer: what becomes of them.
+        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along.
+        optimizer: what becomes of them; None for the method's.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
@@ -70,11 +71,13 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
             cannot be begun, or cannot be written in the end.
     """
+    estimator, optimizer = components.resolve(estimator, optimizer)
     check(estimator, optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
     run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
+    run.warnings += advice.remarks(problem, optimizer)
     log = RunMetadata(describe_run(run, annotations), run.full())
     if run_directory is None:
         return descend(Descent(run, state, log, assemble_hooks(callbacks, earlier=annotations.phases)))
@@ -103,16 +106,17 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
 
 
 def estimate(
-    problem: Problem, estimator: Estimator, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
+    problem: Problem, estimator: Estimator | str, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> Estimate:
     """One estimate from a fresh state, its arrays as NumPy: to look at a gradient.
 
     Args:
         problem: what to recover.
-        estimator: where gradients come from.
+        estimator: where gradients come from, or the name of a method.
         parameters: {key: array} for all parameters of the problem, or None for the initial ones.
         seed: of its random numbers.
     """
+    estimator = components.resolve_estimator(estimator, "estimate")
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))
