@@ -24,8 +24,10 @@ def rmse(first: np.ndarray, second: np.ndarray, reference: np.ndarray) -> tuple[
 
     Returns:
         The root of that mean, 0 where it is negative, and its standard error; both infinite where a value is not finite. The variance of
-        a pixel's product is that of ((A + B)/2 - R)·(A - B), whose mean is 0. Where the error is within two standard errors of 0, the
-        second number is the root of two standard errors of the mean square: what the error may well be.
+        the mean is estimated in two ways, neither of which is low, and the smaller one is taken: from ((A + B)/2 - R)·(A - B) of each
+        pixel, too large where noise has heavy tails, and from the spread of (A - R)·(B - R) over pixels, too large where errors differ
+        from pixel to pixel. Where the error is within two standard errors of 0, the second number is the root of two standard errors
+        of the mean square: what the error may well be.
 
     Raises:
         InputError: the pictures have different sizes.
@@ -34,9 +36,10 @@ def rmse(first: np.ndarray, second: np.ndarray, reference: np.ndarray) -> tuple[
     if not (a.shape == b.shape == r.shape and a.ndim == 3 and a.size):
         raise InputError(f"metrics: expected three pictures of one size, got {a.shape}, {b.shape} and {r.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
-        square = float(np.mean((a - r) * (b - r)))
-        products = np.sum(((a + b) / 2 - r) * (a - b), axis=2)
-        error = float(np.sqrt(np.sum(products**2))) / a.size
+        products = np.sum((a - r) * (b - r), axis=2)
+        square = float(np.sum(products)) / a.size
+        bounds = np.sum(((a + b) / 2 - r) * (a - b), axis=2), products - products.mean()
+        error = math.sqrt(min(float(np.sum(bound**2)) for bound in bounds)) / a.size
     if not (math.isfinite(square) and math.isfinite(error)):
         return math.inf, math.inf
     value = math.sqrt(max(square, 0.0))

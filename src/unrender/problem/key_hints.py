@@ -25,9 +25,9 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     able = [name for name, info in known.items() if info.differentiable or info.perturbable]
     owner, _, rest = key.partition(".")
     if rest and owner not in {name.partition(".")[0] for name in known}:
-        alike = [name for name in able if name.endswith("." + rest)]
-        nameless = [name for name in alike if _NAMELESS.fullmatch(name.partition(".")[0])]
-        close = did_you_mean(owner, {name.partition(".")[0] for name in alike if name not in nameless})
+        alike = [name for name in known if name.endswith("." + rest)]
+        nameless = [name for name in alike if _is_nameless(name)]
+        close = did_you_mean(owner, {name.partition(".")[0] for name in alike if not _is_nameless(name)})
         if nameless and not close:
             others = "" if len(nameless) == 1 else f" ({len(nameless)} objects have none)"
             return f'; nothing has the id {owner}: give the object that holds {rest} id="{owner}"{others}'
