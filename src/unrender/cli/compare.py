@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unrender.cli.execute import Plan
-    from unrender.cli.progress import Progress
     from unrender.methods import Method
+    from unrender.runs.progress import Progress
 
 __all__ = ["DEFAULT_SECONDS", "INTERRUPTED", "compare"]
 
@@ -60,7 +60,7 @@ def compare(
     """
     from rich.console import Console
 
-    from unrender.cli.progress import Progress
+    from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
     if all(Path(name).is_dir() for name in what):

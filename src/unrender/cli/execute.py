@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.cli.progress import Progress
 from unrender.display import formatting
 from unrender.evaluation import debiased
 from unrender.methods import Method
@@ -23,6 +22,7 @@ from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
+from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 
 __all__ = ["Plan", "execute", "image_error", "introduce", "summarise"]

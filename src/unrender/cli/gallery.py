@@ -58,7 +58,7 @@ def gallery(
     folder = None if out is None else arguments.folder(out, name, overwrite, "view0-reference.png")
     try:
         from unrender.cli.execute import introduce
-        from unrender.cli.progress import Progress
+        from unrender.runs.progress import Progress
 
         with Progress(console):
             running = arguments.use_variant(variant)

@@ -33,7 +33,7 @@ def resume(
     """
     from rich.console import Console
 
-    from unrender.cli.progress import Progress
+    from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
     if steps is not None or seconds is not None:

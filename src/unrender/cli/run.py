@@ -25,8 +25,8 @@ from unrender.core.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unrender.cli.progress import Progress
     from unrender.problem.problem import Problem
+    from unrender.runs.progress import Progress
     from unrender.runs.result import Result
 
 __all__ = ["INTERRUPTED", "conclude", "run"]
@@ -60,7 +60,7 @@ def run(
     """
     from rich.console import Console
 
-    from unrender.cli.progress import Progress
+    from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
     given = arguments.settings(settings, "--set")

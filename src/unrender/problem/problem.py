@@ -13,6 +13,7 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
+from unrender.problem import notebook
 from unrender.problem.errors import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
@@ -120,6 +121,16 @@ class Problem:
         from unrender.problem.toml_file import read
 
         return read(path)
+
+    def __repr__(self) -> str:
+        return notebook.line(self)
+
+    def _repr_html_(self) -> str:
+        return notebook.html(self)
+
+    def initial_values(self) -> dict[str, np.ndarray]:
+        """`initial` as NumPy arrays."""
+        return {key: np.array(value) for key, value in self._initial.items()}
 
     def initial(self) -> Tree:
         """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""

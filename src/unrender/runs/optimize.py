@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.display.notebook_bar import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
@@ -25,10 +27,11 @@ from unrender.runs.hooks import CallbackHook, Hook
 from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
+from unrender.runs.notebook_progress import NotebookProgress
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run
+from unrender.runs.run import Run, RunState
 
 __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
 
@@ -44,6 +47,7 @@ def optimize(
     run_directory: str | Path | None = None,
     checkpoint_every: int | None = None,
     annotations: RunAnnotations | None = None,
+    progress: bool | None = None,
 ) -> Result:
     """Recover the problem's parameters by descent.
 
@@ -61,6 +65,7 @@ def optimize(
         checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a fiftieth of the time. There
             is one at the end, too.
         annotations: what else the run folder should say.
+        progress: whether to show a bar; None does so in notebooks.
 
     Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. A step whose loss or
     gradient is not finite is not applied, nor remembered by the estimator; it is counted in `Result.skipped`.
@@ -71,18 +76,47 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
             cannot be begun, or cannot be written in the end.
     """
+    named = estimator
     estimator, optimizer = components.resolve(estimator, optimizer)
     check(estimator, optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
+    if isinstance(named, str) and not annotations.method:
+        annotations = replace(annotations, method=named)
     run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
     run.warnings += advice.remarks(problem, optimizer)
     log = RunMetadata(describe_run(run, annotations), run.full())
+    with _progress(progress) as shown:
+        return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)
+
+
+@contextmanager
+def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
+    """The callback that shows a bar, while it is up; none where none is wanted."""
+    if wanted is False or (wanted is None and not in_notebook()):
+        yield []
+        return
+    from unrender.runs.progress import Progress  # rich takes long to import
+
+    with NotebookProgress() if in_notebook() else Progress() as bar:
+        yield [bar]
+
+
+def _descend(
+    run: Run,
+    state: RunState,
+    log: RunMetadata,
+    callbacks: Sequence[Callback],
+    annotations: RunAnnotations,
+    run_directory: str | Path | None,
+    checkpoint_every: int | None,
+) -> Result:
+    """Run, with a run folder or without."""
     if run_directory is None:
         return descend(Descent(run, state, log, assemble_hooks(callbacks, earlier=annotations.phases)))
     run.folder = Path(run_directory)
-    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
+    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(log.result(run))
         return descend(Descent(run, state, log, assemble_hooks(callbacks, writer, earlier=annotations.phases)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,10 +21,13 @@ from unrender.io import files
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 __all__ = ["Result", "deciding_versions", "hardware", "versions"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """The outcome of `optimize`.
 
@@ -71,6 +74,24 @@ class Result:
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
     image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        from unrender.runs import notebook
+
+        return notebook.line(self)
+
+    def _repr_html_(self) -> str:
+        from unrender.runs import notebook
+
+        return notebook.html(self)
+
+    def plot(self) -> Figure:
+        """A matplotlib figure: pictures of the views where there are some (`pictures`), recovered maps beside truth and start, curves of
+        parameter error and loss. It belongs to no pyplot session: `result.plot().savefig("result.png")`.
+        """
+        from unrender.runs.figure import plot
+
+        return plot(self)
 
     @property
     def steps(self) -> int:

@@ -1,4 +1,4 @@
-"""What a command is doing: a bar that moves on a terminal, a line now and then elsewhere."""
+"""What a call is doing: a bar that moves on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
