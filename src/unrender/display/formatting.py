@@ -47,13 +47,13 @@ def duration(seconds: float | None) -> str:
 
 
 def with_error(value: float, error: float) -> str:
-    """A measured value >= 0 and its standard error: 0.0312 ± 0.0004. Where the value is 0 or not above twice its error: below 0.012."""
+    """A measured value >= 0 and its standard error: 0.0312 ± 0.0004. Where it is not above twice its error: below 0.012."""
     if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value)
+    if error <= 0:
         return number(value)
     if value <= 2 * error:
         return f"below {number(math.hypot(value, error))}"
-    if error <= 0:
-        return number(value)
     places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error
     if value >= 1e5 or error < 1e-6:
         return f"{number(value)} ± {number(error)}"

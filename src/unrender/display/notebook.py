@@ -35,7 +35,7 @@ def facts(rows: Mapping[str, str]) -> str:
         f"<tr style='background:none'><th {cell}>{escape(name)}</th><td {cell}>{escape(value)}</td></tr>"
         for name, value in rows.items()
     )
-    return f'<table style="border:none;margin:.3em 0">{"".join(found)}</table>'
+    return f'<table style="border:none;margin:.3em 0;font-size:inherit">{"".join(found)}</table>'
 
 
 def picture_row(shown: Mapping[str, np.ndarray]) -> str:
@@ -48,8 +48,9 @@ def picture_row(shown: Mapping[str, np.ndarray]) -> str:
         sharp = "image-rendering:pixelated;" if max(width, height) < _FEW_PIXELS else ""
         size = f"width:{_SHOWN_WIDTH}px;height:auto;aspect-ratio:{width}/{height}"
         found.append(
-            f'<figure style="margin:0"><img src="{pictures.data_uri(colours)}" alt="{escape(caption)}" '
-            f'style="{sharp}{size};display:block"><figcaption style="opacity:.75">{escape(caption)}</figcaption></figure>'
+            f'<figure style="margin:0;width:{_SHOWN_WIDTH}px"><img src="{pictures.data_uri(colours)}" alt="{escape(caption)}" '
+            f'style="{sharp}{size};display:block">'
+            f'<figcaption style="opacity:.75;overflow-wrap:anywhere">{escape(caption)}</figcaption></figure>'
         )
     return f'<div style="display:flex;flex-wrap:wrap;gap:10px;margin:.4em 0">{"".join(found)}</div>'
 

@@ -55,6 +55,7 @@ def facts(record: RunRecord) -> dict[str, str]:
             "method": record.method,
             "settings": record.settings,
             "seed": record.seed,
+            "time": formatting.phases(record.phases),
             "variant": record.variant,
             "hardware": record.hardware,
             "versions": record.versions,

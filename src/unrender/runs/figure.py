@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["ResultFigure", "plot"]
 
 _WIDTH, _CURVES_HEIGHT, _COLUMNS = 9.0, 2.8, 6
+_LONGEST_TITLE = 22
 
 
 class ResultFigure(Figure):
@@ -58,7 +60,7 @@ def plot(result: Result) -> ResultFigure:
 def _draw(axes: Axes, title: str, drawn: dict[str, curves.Curve]) -> None:
     axes.set_title(title, fontsize=9, loc="left")
     axes.set_xlabel("seconds", fontsize=9)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(which="both", labelsize=8)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     for key, (seconds, values) in drawn.items():
@@ -76,4 +78,6 @@ def _title(text: str) -> str:
     """Without matplotlib's mathematics, broken where it is long."""
     plain = text.replace("$", r"\$").lstrip("_")
     what, colon, key = plain.partition(": ")
-    return f"{what}\n{key}" if colon and len(plain) > 24 else plain
+    if not colon or len(plain) <= _LONGEST_TITLE:
+        return plain
+    return "\n".join([what, *textwrap.wrap(key.replace(".", ". "), _LONGEST_TITLE)]).replace(". ", ".")
