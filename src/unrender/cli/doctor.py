@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.backend import llvm, variant
+from unrender.backend import cache, llvm, variant
 from unrender.core.errors import VariantError
 
 __all__ = ["TOLERANCE", "doctor", "gradient_error"]
@@ -57,7 +57,7 @@ def doctor(console: Console | None = None) -> int:
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in [*_versions(), *_hardware(), ("backend", backend)]:
+    for name, value in [*_versions(), *_hardware(), *_cache(), ("backend", backend)]:
         table.add_row(name, escape(value))
     if error is not None:
         good = error <= TOLERANCE
@@ -153,6 +153,17 @@ def _hardware() -> list[tuple[str, str]]:
         ("CPU", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
         ("GPU", (gpu or "CUDA works") if problem is None else f"not used: {problem}" + (f" ({gpu})" if gpu else "")),
     ]
+
+
+def _cache() -> list[tuple[str, str]]:
+    """Where references and kernels are kept, and how much of them there is."""
+    place = cache.root()
+    if place is None:
+        return [("cache", f"switched off ({cache.ENVIRONMENT_VARIABLE} is empty)")]
+    if cache.folder(cache.REFERENCES) is None:
+        return [("cache", f"{place} cannot be written: nothing is kept; {cache.ENVIRONMENT_VARIABLE} names another")]
+    sizes = ", ".join(f"{part} {cache.size(part) / 1e6:.0f} MB" for part in (cache.REFERENCES, cache.KERNELS))
+    return [("cache", f"{place} ({sizes})")]
 
 
 def _processor() -> str:
