@@ -38,7 +38,7 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def reference(**options: Any) -> np.ndarray:
-    room = IndirectRoom(**(SMALL | options))
+    room = IndirectRoom(**(SMALL | options))  # pyright: ignore[reportArgumentType]
     return specification.reference(load(room.scene), 0, room.reference_spp, room.max_depth)
 
 

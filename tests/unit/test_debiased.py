@@ -46,7 +46,8 @@ def test_the_mean_square_is_unbiased_and_its_standard_error_right(sigma: float) 
 
 def test_pure_noise_is_below_a_bound_and_not_a_number() -> None:
     rng = np.random.default_rng(3)
-    value, error = debiased.rmse(*pictures(rng, 0.5), np.zeros((12, 10, 3)))
+    first, second = pictures(rng, 0.5)
+    value, error = debiased.rmse(first, second, np.zeros((12, 10, 3)))
     assert formatting.with_error(value, error).startswith("below 0.")
     assert math.hypot(value, error) < 0.35 < math.sqrt(0.5) * 0.5 * 1.1
 

@@ -53,14 +53,14 @@ def test_a_method_s_option_by_its_name_elsewhere() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: optimizers.Adam(lr=0.1), "Adam has no option lr; did you mean learning_rate?"),
-        (lambda: PathGradient(samples_per_pixel=4), "PathGradient has no option samples_per_pixel; did you mean spp?"),
-        (lambda: Huber(width=1.0), "Huber has no option width; it has delta"),
+        ((optimizers.Adam, {"lr": 0.1}), "Adam has no option lr; did you mean learning_rate?"),
+        ((PathGradient, {"samples_per_pixel": 4}), "PathGradient has no option samples_per_pixel; did you mean spp?"),
+        ((Huber, {"width": 1.0}), "Huber has no option width; it has delta"),
     ],
 )
 def test_constructors_name_the_option_that_was_meant(make: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
-        make()
+        make[0](**make[1])
     assert str(caught.value).startswith(message)
 
 

@@ -93,9 +93,8 @@ def _picture(
     first = spp // 2
     if first == 0:
         return render(problem, values, view, spp, seed), None
-    halves = [render(problem, values, view, first, seed + offset) for offset in (0, _SECOND_HALF)]
-    error = debiased.rmse(*halves, np.asarray(problem.views[view].reference))
-    return (halves[0] + halves[1]) / 2, error
+    one, other = (render(problem, values, view, first, seed + offset) for offset in (0, _SECOND_HALF))
+    return (one + other) / 2, debiased.rmse(one, other, np.asarray(problem.views[view].reference))
 
 
 def _affordable(problem: Problem, result: Result) -> int:

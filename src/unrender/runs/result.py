@@ -22,7 +22,7 @@ from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from unrender.runs.figure import ResultFigure
 
 __all__ = ["Result", "deciding_versions", "hardware", "versions"]
 
@@ -85,7 +85,7 @@ class Result:
 
         return notebook.html(self)
 
-    def plot(self) -> Figure:
+    def plot(self) -> ResultFigure:
         """A matplotlib figure: pictures of the views where there are some (`pictures`), recovered maps beside truth and start, curves of
         parameter error and loss. It belongs to no pyplot session: `result.plot().savefig("result.png")`.
         """
