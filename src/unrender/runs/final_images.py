@@ -19,8 +19,8 @@ __all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"
 
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
-_SHARE, _LEAST_SECONDS = 0.1, 1.0
-"""Of the time of the steps, what final pictures may take, but a second at least."""
+_SHARE, _LEAST_SECONDS = 0.08, 1.0
+"""Of the time of the steps, what final pictures may take, but a second at least: with the trial and what is written, under a tenth."""
 _TRIAL_PATHS = 1 << 18
 
 _SEEDS = {"initial": 1, "result": 2}
