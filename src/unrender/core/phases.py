@@ -2,10 +2,11 @@
 
 Code that takes seconds names what it does, wherever it stands:
 
+    from unrender.core import phases
+
     with phases.phase("reference images") as advance:
-        for index in range(count):
-            ...
-            advance((index + 1) / count)
+        for index in range(8):
+            advance((index + 1) / 8)
 
 Without a listener that costs next to nothing. A command line or a notebook listens, and shows what is going on.
 """

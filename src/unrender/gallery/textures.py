@@ -65,7 +65,7 @@ def _resized(picture: np.ndarray, resolution: int) -> np.ndarray:
     if factor > 1:
         blurred = ndimage.gaussian_filter(picture, ((factor - 1) / 2, (factor - 1) / 2, 0), mode="mirror")
     small = ndimage.zoom(blurred, (1 / factor, 1 / factor, 1), order=1, mode="mirror", grid_mode=True)
-    return np.clip(small, picture.min(), picture.max())
+    return np.clip(np.asarray(small), picture.min(), picture.max())
 
 
 def grid(resolution: int) -> tuple[np.ndarray, np.ndarray]:
