@@ -23,6 +23,8 @@ KERNELS = "DRJIT_CACHE_DIR"
 # Every process of the run shares one folder, the commands that tests start too. `make clean` empties it.
 os.environ.setdefault(KERNELS, str(HERE.parent / ".pytest_cache" / "kernels"))
 os.makedirs(os.environ[KERNELS], exist_ok=True)
+# Not the user's own.
+os.environ.setdefault("UNRENDER_CACHE_DIR", str(HERE.parent / ".pytest_cache" / "unrender"))
 variant.prepare()  # before any test module imports Dr.Jit
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import math
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from unrender.backend import variant
+from unrender.backend import cache, variant
 from unrender.cli import doctor
 from unrender.core.errors import VariantError
 
@@ -58,4 +59,32 @@ def test_a_machine_that_cannot_run_gets_three_and_the_command(monkeypatch: pytes
 def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch):
     required = ["numpy", "no-such-thing>=2; extra == 'dev'", "pytest; extra == 'dev'"]
     monkeypatch.setattr(doctor.metadata, "requires", lambda name: required)
-    assert doctor._missing() == ["(optional) no-such-thing; install: pip install 'unrender[dev]'"]
+    assert doctor._missing() == ["(optional, tests of this package) install: pip install 'no-such-thing>=2'"]
+
+
+def test_only_packages_that_can_be_installed_are_named(monkeypatch: pytest.MonkeyPatch):
+    required = [
+        "no-such-flip; python_version < '3' and extra == 'flip'",
+        "no-such-flip; platform_system != 'none' and extra == 'flip'",
+        "no-such-thing[fast]; extra == 'other'",
+        "not a requirement",
+    ]
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: required)
+    assert doctor._missing() == [
+        "(optional, the measure FLIP) install: pip install no-such-flip",
+        "(optional, other) install: pip install 'no-such-thing[fast]'",
+    ]
+
+
+def test_the_cache_folder_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, str(tmp_path))
+    place = cache.folder(cache.REFERENCES)
+    assert place is not None
+    (place / "one.npz").write_bytes(bytes(2_000_000))
+    _, said = run()
+    assert f"{tmp_path} (references 2 MB, kernels 0 MB)" in said
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, "")
+    assert "switched off" in dict(doctor._cache())["cache"]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, str(tmp_path / "file"))
+    assert "cannot be written" in dict(doctor._cache())["cache"]

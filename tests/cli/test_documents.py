@@ -41,6 +41,7 @@ SLOW = {
 
 # What the example of a docstring takes as given.
 GIVEN = {
+    "unrender.core.phases": "",
     "unrender": "",
     "unrender.exporting.scene_folder.export": """
         import unrender as ur

@@ -16,7 +16,7 @@ from unrender.problem.problem import Problem
 
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective">
-        <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/></film>
+        <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/><rfilter type="box"/></film>
     </sensor>
     <emitter type="constant"/>
     <shape type="rectangle" id="wall">

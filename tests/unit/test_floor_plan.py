@@ -10,7 +10,18 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "unrender"
 FLOORS = (
-    *("core", "backend", "io", "statistics", "evaluation", "rendering", "losses", "schedules", "preconditioners"),
+    *(
+        "core",
+        "backend",
+        "io",
+        "statistics",
+        "evaluation",
+        "display",
+        "rendering",
+        "losses",
+        "schedules",
+        "preconditioners",
+    ),
     *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "loops"),
     *("report", "exporting", "watch", "cli"),
 )

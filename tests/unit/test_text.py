@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.progress import Progress, TextColumn
 from rich.table import Table
 
-from unrender.cli.terminal import Console, echo
 from unrender.core.errors import InputError, VariantError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import LONGEST_LINE, one_line, printable, shorten, visible
+from unrender.display.terminal import Console, echo
 from unrender.report import html
 
 EVIL = {

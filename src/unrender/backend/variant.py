@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unrender.backend import install_hints, llvm, plugins
+from unrender.backend import cache, install_hints, llvm, plugins
 from unrender.core.errors import VariantError
 from unrender.core.suggestions import did_you_mean
 
@@ -60,7 +60,8 @@ def prepare() -> None:
 
     Dr.Jit reads `DRJIT_LIBLLVM_PATH` once, when it is imported, and without it takes the first library it finds, even
     one that aborts later. So the variable is set here, to the newest one known to work. One that the user has set is
-    left alone (and judged by `use`). Nothing is loaded, no kernel runs. Does nothing once Dr.Jit is imported.
+    left alone (and judged by `use`). Likewise `DRJIT_CACHE_DIR`, the folder
+    of compiled kernels. Nothing is loaded, no kernel runs. Does nothing once Dr.Jit is imported.
 
     Raises:
         VariantError: a system library without which Dr.Jit cannot be imported at all is missing.
@@ -70,6 +71,7 @@ def prepare() -> None:
     if missing := llvm.missing_companions():
         install = install_hints.command(missing)
         raise VariantError(f"{' and '.join(missing)} not found, which Dr.Jit needs; install: {install}")
+    cache.use_for_kernels()
     given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
     if given:
         usable = llvm.is_usable(llvm.identify(Path(given)).major)

@@ -1,13 +1,13 @@
-"""The parts of the `unrender` command. Importing this imports Dr.Jit."""
+"""The parts of the `unrender` command. Importing this is quick: each command imports what it needs when it is called."""
 
 from __future__ import annotations
 
+from importlib import metadata
 from typing import Annotated
 
 import typer
 
 from unrender.cli.compare import compare
-from unrender.cli.doctor import doctor
 from unrender.cli.export import export
 from unrender.cli.gallery import gallery
 from unrender.cli.methods import methods
@@ -15,7 +15,6 @@ from unrender.cli.report import report
 from unrender.cli.resume import resume
 from unrender.cli.run import run
 from unrender.cli.watch import watch
-from unrender.runs.result import versions
 
 __all__ = ["app"]
 
@@ -23,6 +22,7 @@ app = typer.Typer(
     help="Recover what a scene is made of (textures, materials, light) from images of it.",
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # rich's help takes half a second to import
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(run)
@@ -38,6 +38,8 @@ app.command()(methods)
 @app.command("doctor")
 def _doctor() -> None:
     """Tell what this machine has, try a gradient, say what to install."""
+    from unrender.cli.doctor import doctor
+
     raise typer.Exit(doctor())
 
 
@@ -47,6 +49,6 @@ def _unrender(
     version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
 ) -> None:
     if version:
-        typer.echo(versions()["unrender"])
+        typer.echo(metadata.version("unrender"))
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())

@@ -8,21 +8,24 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from unrender import gallery
-from unrender.backend import variant
+from unrender.backend import cache, variant
+from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import files
-from unrender.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from unrender.problem.problem import Problem
 
 __all__ = [
     "DEFAULT_STEPS",
     "CheckpointEvery",
     "FinalSpp",
+    "NoCache",
     "Overwrite",
     "ProblemName",
     "ProblemSettings",
@@ -35,6 +38,7 @@ __all__ = [
     "open_problem",
     "remove_if_empty",
     "settings",
+    "short_name",
     "use_variant",
 ]
 
@@ -62,7 +66,16 @@ CheckpointEvery = Annotated[
     int | None, typer.Option(min=1, help="Steps between checkpoints. Default: 50 or so.", show_default=False)
 ]
 FinalSpp = Annotated[
-    int | None, typer.Option(min=1, help="Samples per pixel of the final pictures. Default: as many as take seconds.")
+    int | None,
+    typer.Option(
+        min=1, help="Samples per pixel of the final pictures. Default: as many as a tenth of the time allows."
+    ),
+]
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Render a gallery problem's references anew, and keep none.", show_default=False),
 ]
 
 
@@ -97,14 +110,17 @@ def use_variant(name: str, threads: int | None = None) -> str:
     known = ("auto", *variant.VARIANTS)
     if name not in known:
         raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
-    chosen = variant.use(name)
-    if threads is not None:
-        variant.use_threads(threads)
+    with phases.phase("loading"):
+        chosen = variant.use(name)
+        if threads is not None:
+            variant.use_threads(threads)
     return chosen
 
 
 def check_problem(name: str, options: Mapping[str, str]) -> None:
     """Raise `InputError` where `open_problem` would fail for reasons that can be told without Mitsuba."""
+    from unrender import gallery
+
     if _is_file(name):
         if Path(name).suffix.lower() == ".xml":
             raise InputError(
@@ -120,12 +136,27 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
         raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
 
 
-def open_problem(name: str, options: Mapping[str, str]) -> Problem:
-    """The problem of a TOML file or of the gallery. A variant must be in use. Raises `InputError`."""
-    check_problem(name, options)
-    if _is_file(name):
-        return Problem.from_file(name)
-    return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
+    """The problem of a TOML file or of the gallery. A variant must be in use. Raises `InputError`.
+
+    Args:
+        name: as typed.
+        options: of a gallery problem.
+        cached: whether its references may come from the cache folder, and go there.
+    """
+    with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():
+        from unrender import gallery
+        from unrender.problem.problem import Problem
+
+        check_problem(name, options)
+        if _is_file(name):
+            return Problem.from_file(name)
+        return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+
+
+def short_name(problem: str) -> str:
+    """What folders are called after: the problem's name, or its file's without the ending."""
+    return Path(problem).stem if problem.endswith(".toml") else problem
 
 
 def _is_file(name: str) -> bool:

@@ -6,24 +6,21 @@ import itertools
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from unrender import report
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
-from unrender.cli.execute import Plan, execute, introduce
+from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant
 from unrender.cli.run import exit_status
-from unrender.cli.terminal import Console
+from unrender.core import phases
 from unrender.core.errors import InputError
-from unrender.core.text import visible
-from unrender.evaluation.metrics import has_flip
-from unrender.methods import Method, method
-from unrender.report import formatting
-from unrender.report.equal_time import Comparison, Spread
+
+if TYPE_CHECKING:
+    from unrender.cli.execute import Plan
+    from unrender.display.terminal import Console
+    from unrender.methods import Method
+    from unrender.runs.progress import Progress
 
 __all__ = ["DEFAULT_SECONDS", "compare"]
 
@@ -54,51 +51,55 @@ def compare(
     variant: Variant = "auto",
     final_spp: FinalSpp = None,
     overwrite: Overwrite = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Compare methods at equal time on one problem, or runs made earlier.
 
     Every run gets the same seconds of optimization. Compiling kernels before the first step is left out for all alike.
     """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
     console = Console(highlight=False)
     if all(Path(name).is_dir() for name in what):
-        if methods or settings or problem_settings or seconds is not None:
-            raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
-        _compare_folders(console, [Path(name) for name in what], out, overwrite)
-        return
+        run_options = methods or settings or problem_settings or seconds is not None
+        return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))
     _check_single(what)
-    chosen = _parse_methods(methods)
-    given = _settings_by_method(chosen, arguments.settings(settings, "--set"))
-    for one in chosen:
-        one.start(given[one.name])
-    options = arguments.settings(problem_settings, "--problem-set")
-    arguments.check_problem(what[0], options)
-    _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
-    name = Path(what[0]).stem if what[0].endswith(".toml") else what[0]
-    folder = arguments.folder(out, f"{name}-compare", overwrite, *_MARKS)
-    try:
-        running = arguments.use_variant(variant)
-        problem = arguments.open_problem(what[0], options)
-        introduce(console, problem, running)
-        command = shlex.join(context.find_root().obj or ["unrender"])
-        plans = [  # methods take turns, so that a machine that slows down slows all of them
-            Plan(problem, one, given[one.name], None, seconds, number, final_spp, command, options)
-            for number, one in itertools.product(range(seed, seed + seeds), chosen)
-        ]
-        directories, status = _run_all(console, plans, folder)
-    finally:
-        arguments.remove_if_empty(folder)
-    if directories:
-        _report(console, directories, folder)
+    typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    with Progress(console) as progress:
+        chosen, given = _methods_and_settings(methods, typed)
+        arguments.check_problem(what[0], options)
+        _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
+        folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
+        try:
+            from unrender.cli.execute import Plan, introduce
+
+            running = arguments.use_variant(variant)
+            problem = arguments.open_problem(what[0], options, not no_cache)
+            introduce(console, problem, running)
+            command = shlex.join(context.find_root().obj or ["unrender"])
+            turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
+            plans = [Plan(problem, m, given[m.name], None, seconds, n, final_spp, command, options) for n, m in turns]
+            directories, status = _run_all(console, plans, folder, progress)
+        finally:
+            arguments.remove_if_empty(folder)
+        if directories:
+            _report(console, directories, folder)
     if status:
         raise typer.Exit(status)
 
 
 def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
     """Compare runs made here."""
-    comparison, notices = report.load_comparison(directories)
-    _print_comparison(console, comparison)
+    with phases.phase("page"):
+        from unrender import report
+        from unrender.cli import comparison_table
+
+        comparison, notices = report.load_comparison(directories)
+        page = report.write_comparison(comparison, notices, folder)
+    comparison_table.show(console, comparison)
     console.print("Time of compilation is left out for every method alike.")
-    console.print(f"page: {_plain(str(report.write_comparison(comparison, notices, folder)))}", soft_wrap=True)
+    console.print(f"page: {comparison_table.plain(str(page))}", soft_wrap=True)
 
 
 def _check_single(what: Sequence[str]) -> None:
@@ -108,31 +109,40 @@ def _check_single(what: Sequence[str]) -> None:
         raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
 
 
-def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:
-    """Compare runs made earlier."""
+def _compare_folders(
+    console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool, run_options: bool
+) -> None:
+    """Compare runs made earlier. `run_options`: whether options were given that only runs made here have."""
+    if run_options:
+        raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
+    from unrender import report
+    from unrender.cli import comparison_table
+
     folder = arguments.folder(out, "compare", overwrite, *_MARKS)
     try:
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
     finally:
         arguments.remove_if_empty(folder)
-    _print_comparison(console, comparison)
+    comparison_table.show(console, comparison)
     for notice in notices:
-        console.print(f"note: {_plain(notice)}", soft_wrap=True)
-    console.print(f"page: {_plain(str(page))}", soft_wrap=True)
+        console.print(f"note: {comparison_table.plain(notice)}", soft_wrap=True)
+    console.print(f"page: {comparison_table.plain(str(page))}", soft_wrap=True)
 
 
-def _run_all(console: Console, plans: Sequence[Plan], folder: Path) -> tuple[list[Path], int]:
+def _run_all(console: Console, plans: Sequence[Plan], folder: Path, progress: Progress) -> tuple[list[Path], int]:
     """Carry out the plans until one is interrupted.
 
     Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
     """
+    from unrender.cli.execute import execute
+
     directories: list[Path] = []
     status = 0
     for plan in plans:
         console.print(f"[bold]{plan.method.name}[/], seed {plan.seed}, {plan.seconds:g} s")
         directory = folder / f"{plan.method.name}-seed{plan.seed}"
-        result = execute(plan, directory, console)
+        result = execute(plan, directory, console, progress)
         if result.steps:
             directories.append(directory)
         status = exit_status(result) or status
@@ -141,7 +151,21 @@ def _run_all(console: Console, plans: Sequence[Plan], folder: Path) -> tuple[lis
     return directories, status
 
 
+def _methods_and_settings(
+    names: str | None, typed: Mapping[str, str]
+) -> tuple[list[Method], dict[str, dict[str, str]]]:
+    """The methods, and the settings of each, all of which it takes. Raises `InputError`."""
+    with phases.phase("loading"):
+        chosen = _parse_methods(names)
+        given = _settings_by_method(chosen, typed)
+        for one in chosen:
+            one.start(given[one.name])
+    return chosen, given
+
+
 def _parse_methods(names: str | None) -> list[Method]:
+    from unrender.methods import method
+
     if names is None:
         return [method("plain"), method("rcv")]
     chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
@@ -167,46 +191,3 @@ def _settings_by_method(chosen: Sequence[Method], given: Mapping[str, str]) -> d
                 raise InputError(f"--set {name}={value}: {owner} is not one of the methods {', '.join(found)}")
             found[owner][option] = value
     return found
-
-
-def _print_comparison(console: Console, comparison: Comparison) -> None:
-    """The median over each method's runs, and the range: of every metric, and of the last pictures."""
-    parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
-    for metric in parameters or comparison.metrics:
-        console.print(f"[bold]{_plain(metric.title)}[/]", soft_wrap=True)
-        first = metric.methods[comparison.groups[0].label]
-        times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
-        table = _table("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
-        for group in comparison.groups:
-            outcome = metric.methods[group.label]
-            cells = [moment.error for moment in (*outcome.moments, outcome.at_samples[-1])]
-            table.add_row(_plain(group.label), str(len(group.runs)), *map(_spread, cells))
-        console.print(table)
-    if comparison.image_error[comparison.groups[0].label].median is not None:
-        console.print("[bold]Last pictures, each run's at its own end[/]")
-        table = _table("method", *comparison.images)
-        for group in comparison.groups:
-            table.add_row(_plain(group.label), *(_spread(of[group.label]) for of in comparison.images.values()))
-        console.print(table)
-        if not has_flip():
-            console.print("FLIP is left out: its package is missing (pip install 'unrender[flip]')", markup=False)
-
-
-def _plain(text: str) -> str:
-    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
-    return escape(visible(text))
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in headings:
-        table.add_column(_plain(heading), overflow="fold")
-    return table
-
-
-def _spread(of: Spread) -> str:
-    if of.median is None:
-        return "–"
-    middle = formatting.number(of.median)
-    low, high = formatting.number(of.low), formatting.number(of.high)
-    return middle if low == high else f"{middle} ({low}–{high})"

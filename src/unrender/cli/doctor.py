@@ -14,14 +14,24 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.backend import llvm, variant
-from unrender.cli.terminal import Console
+from unrender.backend import cache, llvm, variant
 from unrender.core.errors import VariantError
+from unrender.display.terminal import Console
 
 __all__ = ["TOLERANCE", "doctor", "gradient_error"]
 
 TOLERANCE = 1e-3
 """The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
+
+_FEATURES = {
+    "denoise": "denoised images on the CPU",
+    "flip": "the measure FLIP",
+    "tensorboard": "TensorBoard",
+    "torch": "functions behind a network, perceptual losses",
+    "dev": "tests of this package",
+    "docs": "its documentation",
+}
+"""What the extras are for."""
 
 _STEP = 0.05
 _RESOLUTION = 16
@@ -47,7 +57,7 @@ def doctor(console: Console | None = None) -> int:
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in [*_versions(), *_hardware(), ("backend", backend)]:
+    for name, value in [*_versions(), *_hardware(), *_cache(), ("backend", backend)]:
         table.add_row(name, escape(value))
     if error is not None:
         good = error <= TOLERANCE
@@ -145,6 +155,17 @@ def _hardware() -> list[tuple[str, str]]:
     ]
 
 
+def _cache() -> list[tuple[str, str]]:
+    """Where references and kernels are kept, and how much of them there is."""
+    place = cache.root()
+    if place is None:
+        return [("cache", f"switched off ({cache.ENVIRONMENT_VARIABLE} is empty)")]
+    if cache.folder(cache.REFERENCES) is None:
+        return [("cache", f"{place} cannot be written: nothing is kept; {cache.ENVIRONMENT_VARIABLE} names another")]
+    sizes = ", ".join(f"{part} {cache.size(part) / 1e6:.0f} MB" for part in (cache.REFERENCES, cache.KERNELS))
+    return [("cache", f"{place} ({sizes})")]
+
+
 def _processor() -> str:
     try:
         if match := re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
@@ -166,18 +187,33 @@ def _first_line(program: str, *arguments: str) -> str | None:
 
 
 def _missing() -> list[str]:
-    """One line per extra of the package that is not fully installed."""
+    """One line per optional feature whose packages are not installed and can be on this Python: with the command that installs them.
+
+    The command names the packages themselves: this one may not be on an index to take its extras from.
+    """
+    from packaging.requirements import InvalidRequirement, Requirement
+
     try:
         required = metadata.requires("unrender") or []
     except metadata.PackageNotFoundError:
         return []
     absent: dict[str, list[str]] = {}
-    for requirement in required:
-        name = re.match(r"[\w.-]+", requirement)
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
-        if name and extra and _version(name[0]) is None:
-            absent.setdefault(extra[1], []).append(name[0])
+    for text in required:
+        try:
+            requirement = Requirement(text)
+        except InvalidRequirement:
+            continue
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", text)
+        if extra is None or _version(requirement.name) is not None:
+            continue
+        if requirement.marker is not None and requirement.marker.evaluate({"extra": extra[1]}):
+            requirement.marker = None
+            absent.setdefault(extra[1], []).append(str(requirement))
     return [
-        f"(optional) {', '.join(names)}; install: pip install 'unrender[{extra}]'"
+        f"(optional, {_FEATURES.get(extra, extra)}) install: pip install {' '.join(map(_quoted, names))}"
         for extra, names in sorted(absent.items())
     ]
+
+
+def _quoted(requirement: str) -> str:
+    return f"'{requirement}'" if re.search(r"[<>=!~\[]", requirement) else requirement

@@ -11,16 +11,21 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.cli.progress import Progress
-from unrender.cli.terminal import Console
+from unrender.display import formatting
+from unrender.display.terminal import Console
+from unrender.evaluation import debiased
 from unrender.methods import Method
 from unrender.problem.problem import Problem
+from unrender.runs import advice
+from unrender.runs.final_images import image_name
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
+from unrender.runs.phase_times import RUN_PHASES
+from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 
-__all__ = ["Plan", "execute", "image_errors", "introduce", "summarise"]
+__all__ = ["Plan", "execute", "image_error", "introduce", "summarise"]
 
 
 @dataclass(frozen=True)
@@ -49,38 +54,44 @@ class Plan:
     checkpoint_every: int | None = None
 
 
-def execute(plan: Plan, directory: Path, console: Console) -> Result:
+def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came."""
     estimator, optimizer = plan.method.start(plan.settings)
     options = plan.method.configure(plan.settings).model_dump()
     settings = {"options": options, "problem_options": dict(plan.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
-    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp)
+    for line in advice.remarks(plan.problem, optimizer):
+        console.print(f"note: {escape(line)}", soft_wrap=True)
+    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
+    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, earlier)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
-    with Progress(console) as progress:
-        result = optimize(
-            plan.problem,
-            estimator,
-            optimizer,
-            plan.steps,
-            plan.seconds,
-            plan.seed,
-            [progress, live],
-            directory,
-            plan.checkpoint_every,
-            annotations,
-        )
+    result = optimize(
+        plan.problem,
+        estimator,
+        optimizer,
+        plan.steps,
+        plan.seconds,
+        plan.seed,
+        [progress, live],
+        directory,
+        plan.checkpoint_every,
+        annotations,
+    )
     live.clear()
     return result
 
 
-def image_errors(result: Result, which: str = "result") -> list[float]:
-    """Root mean square error of each view's picture against its reference."""
+def image_error(result: Result, which: str = "result") -> str:
+    """The mean over views of the root mean square error against the reference, in words: its noise taken out where it is known."""
+    views = range(int(result.problem["views"]))
+    known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
+    if len(known) == len(views):
+        return formatting.with_error(*debiased.mean(known))
     errors = []
-    for index in range(int(result.problem["views"])):
-        difference = result.pictures[f"view{index}/{which}"] - result.pictures[f"view{index}/reference"]
+    for view in views:
+        difference = result.pictures[f"view{view}/{which}"] - result.pictures[f"view{view}/reference"]
         errors.append(float(np.sqrt(np.mean(np.square(difference, dtype=np.float64)))))
-    return errors
+    return f"{formatting.number(float(np.mean(errors)))} with noise"
 
 
 def introduce(console: Console, problem: Problem, variant: str) -> None:
@@ -94,7 +105,7 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
         console.print(f"note: {escape(notice)}", soft_wrap=True)
 
 
-def summarise(console: Console, problem: Problem, result: Result) -> None:
+def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
     """What came out."""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
@@ -105,11 +116,13 @@ def summarise(console: Console, problem: Problem, result: Result) -> None:
     if result.resumed:
         table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
     if result.pictures:
-        before, after = (np.mean(image_errors(result, which)) for which in ("initial", "result"))
-        table.add_row("image error", f"{before:.4g} before, {after:.4g} after (root mean square)")
+        first, last = (image_error(result, which) for which in ("initial", "result"))
+        table.add_row("image error", f"{first} before, {last} after (root mean square, noise removed)")
     start = problem.parameter_error(result.initial)
     for key, error in problem.parameter_error(result.parameters).items():
         table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")
+    after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
+    table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)
     for warning in result.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Variant
-from unrender.cli.terminal import Console
 from unrender.core.errors import InputError
+from unrender.display.terminal import Console
 
 __all__ = ["export"]
 
@@ -24,6 +23,8 @@ def export(
     variant: Variant = "auto",
 ) -> None:
     """Write a run's result as a scene folder: XML, textures, meshes, volumes, and the recovered maps alone."""
+    from rich.markup import escape
+
     console = Console(highlight=False)
     if not directory.is_dir():
         raise InputError(f"{directory}: no such run folder")

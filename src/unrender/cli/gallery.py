@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from PIL import Image
-from rich.markup import escape
-from rich.table import Table
 
-from unrender import gallery as problems
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, Overwrite, ProblemSettings, Variant
-from unrender.cli.execute import introduce
-from unrender.cli.terminal import Console
-from unrender.evaluation.metrics import exposure, srgb
-from unrender.io.files import write
-from unrender.problem.problem import Problem
-from unrender.problem.render import render
+from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.table import Table
+
+    from unrender.problem.problem import Problem
 
 __all__ = ["gallery"]
 
@@ -36,8 +31,14 @@ def gallery(
     variant: Variant = "auto",
     spp: FinalSpp = None,
     overwrite: Overwrite = False,
+    no_cache: NoCache = False,
 ) -> None:
     """List the gallery's problems, or tell more of one."""
+    from rich.markup import escape
+
+    from unrender import gallery as problems
+    from unrender.display.terminal import Console
+
     console = Console(highlight=False)
     if name is None:
         table = _table()
@@ -56,8 +57,12 @@ def gallery(
         return
     folder = None if out is None else arguments.folder(out, name, overwrite, "view0-reference.png")
     try:
-        running = arguments.use_variant(variant)
-        problem = arguments.open_problem(name, options)
+        from unrender.cli.execute import introduce
+        from unrender.runs.progress import Progress
+
+        with Progress(console):
+            running = arguments.use_variant(variant)
+            problem = arguments.open_problem(name, options, not no_cache)
         introduce(console, problem, running)
         console.print(_parameters(problem))
         if folder is not None:
@@ -69,10 +74,15 @@ def gallery(
 
 
 def _table() -> Table:
+    from rich.table import Table
+
     return Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
 
 
 def _parameters(problem: Problem) -> Table:
+    import numpy as np
+    from rich.markup import escape
+
     table = _table()
     initial = {key: np.asarray(value) for key, value in problem.initial().items()}
     for key, error in problem.parameter_error(problem.initial()).items():
@@ -84,6 +94,12 @@ def _parameters(problem: Problem) -> Table:
 
 def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
     """PNG files of each view's reference, start and truth, all as bright as the reference."""
+    import numpy as np
+
+    from unrender.evaluation.metrics import exposure
+    from unrender.io.files import write
+    from unrender.problem.render import render
+
     written: list[Path] = []
     for index, view in enumerate(problem.views):
         reference = np.asarray(view.reference, np.float32)
@@ -97,6 +113,11 @@ def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
 
 
 def _png(linear: np.ndarray) -> bytes:
+    import numpy as np
+    from PIL import Image
+
+    from unrender.evaluation.metrics import srgb
+
     buffer = io.BytesIO()
     Image.fromarray((srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
     return buffer.getvalue()

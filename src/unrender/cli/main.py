@@ -10,11 +10,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-
-import typer
+from importlib import metadata
 
 from unrender.backend import variant
-from unrender.cli.doctor import doctor
 from unrender.cli.exit_status import ENVIRONMENT, INPUT, INTERRUPTED, WORDS
 from unrender.cli.signals import Signals
 from unrender.core.errors import UnrenderError, VariantError
@@ -22,13 +20,15 @@ from unrender.core.text import one_line
 
 __all__ = ["main"]
 
-# Typer may bring its own copy of click, so its errors are found from the one that typer exports.
-_UsageError: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:  # at once: nothing else is imported
+        print(metadata.version("unrender"))
+        return 0
+    import typer
+
     signals = Signals(process=arguments is None)
     try:
         with signals:
@@ -44,8 +44,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _execute(given: list[str]) -> int:
+    import typer
+
+    # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
+    usage_error: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
     try:
         if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
+            from unrender.cli.doctor import doctor
+
             return doctor()
         variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
         from unrender.cli.app import app
@@ -57,7 +63,7 @@ def _execute(given: list[str]) -> int:
         return _complain(str(error), ENVIRONMENT)
     except UnrenderError as error:
         return _complain(str(error), INPUT)
-    except _UsageError as error:
+    except usage_error as error:
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
     except typer.Exit as end:
         return end.exit_code

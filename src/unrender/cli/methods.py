@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from unrender.cli.terminal import Console
-from unrender.methods import Method, method
-from unrender.methods import methods as registered
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from unrender.methods import Method
 
 __all__ = ["methods"]
 
 
 def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None) -> None:
     """List the methods, their options and defaults."""
+    from rich.markup import escape
+
+    from unrender.display.terminal import Console
+    from unrender.methods import method
+    from unrender.methods import methods as registered
+
     console = Console(highlight=False)
     for one in [method(name)] if name else registered().values():
         console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
@@ -25,6 +30,9 @@ def methods(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="O
 
 
 def _options(one: Method) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)

@@ -9,13 +9,8 @@ import typer
 
 from unrender.cli import arguments
 from unrender.cli.arguments import Threads
-from unrender.cli.execute import introduce
-from unrender.cli.progress import Progress
 from unrender.cli.run import conclude
-from unrender.cli.terminal import Console
-from unrender.runs import reopen
-from unrender.runs.live import Live
-from unrender.runs.resume import load_run, resume_run
+from unrender.core import phases
 
 __all__ = ["resume"]
 
@@ -36,16 +31,25 @@ def resume(
 
     It goes on from its last checkpoint and becomes the run that it would have been without the interruption.
     """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
     console = Console(highlight=False)
     if steps is not None or seconds is not None:
         steps, seconds = arguments.budget(steps, seconds)
-    found = load_run(directory, steps, seconds)
-    alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
-    running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)
-    problem = reopen.problem_of(directory)
-    introduce(console, problem, running)
-    live = Live(directory, problem.name, found.record.method, found.record.command)
     with Progress(console) as progress:
-        result = resume_run(found, problem, force, [progress, live])
-    live.clear()
-    conclude(console, problem, result, directory)
+        with phases.phase("loading"):
+            from unrender.cli.execute import introduce
+            from unrender.runs import reopen
+            from unrender.runs.live import Live
+            from unrender.runs.resume import load_run, resume_run
+
+            found = load_run(directory, steps, seconds)
+            alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
+            running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)
+            problem = reopen.problem_of(directory)
+        introduce(console, problem, running)
+        live = Live(directory, problem.name, found.record.method, found.record.command)
+        result = resume_run(found, problem, force, [progress, live], earlier=progress.seconds)
+        live.clear()
+        conclude(console, problem, result, directory, progress)

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
-from unrender import report
 from unrender.cli import arguments
-from unrender.cli.arguments import CheckpointEvery, FinalSpp, Overwrite, ProblemName, ProblemSettings, Threads, Variant
-from unrender.cli.execute import Plan, execute, introduce, summarise
+from unrender.cli.arguments import (
+    CheckpointEvery,
+    FinalSpp,
+    NoCache,
+    Overwrite,
+    ProblemName,
+    ProblemSettings,
+    Threads,
+    Variant,
+)
 from unrender.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
-from unrender.cli.terminal import Console
+from unrender.core import phases
 from unrender.core.errors import InputError
-from unrender.methods import method
-from unrender.problem.problem import Problem
-from unrender.runs import result as results
-from unrender.runs.result import Result
+
+if TYPE_CHECKING:
+    from unrender.display.terminal import Console
+    from unrender.problem.problem import Problem
+    from unrender.runs.progress import Progress
+    from unrender.runs.result import Result
 
 __all__ = ["conclude", "exit_status", "run"]
 
@@ -42,37 +50,55 @@ def run(
     overwrite: Overwrite = False,
     checkpoint_every: CheckpointEvery = None,
     threads: Threads = None,
+    no_cache: NoCache = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
     Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
     """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
     console = Console(highlight=False)
-    chosen = method(method_name)
     given = arguments.settings(settings, "--set")
-    steps, seconds = _budget_settings(given, steps, seconds)
-    chosen.start(given)
     options = arguments.settings(problem_settings, "--problem-set")
-    arguments.check_problem(problem, options)
-    name = Path(problem).stem if problem.endswith(".toml") else problem
-    folder = arguments.folder(out, f"{name}-{chosen.name}", overwrite, "run.json", "lock")
-    try:
-        running = arguments.use_variant(variant, threads)
-        opened = arguments.open_problem(problem, options)
-        introduce(console, opened, running)
-        command = shlex.join(context.find_root().obj or ["unrender"])
-        plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
-        result = execute(plan, folder, console)
-    finally:
-        arguments.remove_if_empty(folder)
-    conclude(console, opened, result, folder)
+    with Progress(console) as progress:
+        with phases.phase("loading"):
+            from unrender.cli.execute import Plan, execute, introduce
+            from unrender.methods import method
+
+            chosen = method(method_name)
+            steps, seconds = _budget_settings(given, steps, seconds)
+            chosen.start(given)
+            arguments.check_problem(problem, options)
+        folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
+        try:
+            running = arguments.use_variant(variant, threads)
+            opened = arguments.open_problem(problem, options, not no_cache)
+            introduce(console, opened, running)
+            command = shlex.join(context.find_root().obj or ["unrender"])
+            plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
+            result = execute(plan, folder, console, progress)
+        finally:
+            arguments.remove_if_empty(folder)
+        conclude(console, opened, result, folder, progress)
 
 
-def conclude(console: Console, problem: Problem, result: Result, folder: Path) -> None:
-    """Say what came out, write the page, and leave with the status of an interrupted or failed run where it is one."""
-    summarise(console, problem, result)
+def conclude(console: Console, problem: Problem, result: Result, folder: Path, progress: Progress) -> None:
+    """Write the page, say what came out, and leave with the status of an interrupted or failed run where it is one."""
+    from rich.markup import escape
+
+    from unrender.cli.execute import summarise
+
+    page = None
     if result.steps:
-        console.print(f"page: {escape(str(report.page(folder)))}", soft_wrap=True)
+        with phases.phase("page"):
+            from unrender import report
+
+            page = report.page(folder)
+    summarise(console, problem, result, progress)
+    if page is not None:
+        console.print(f"page: {escape(str(page))}", soft_wrap=True)
     if status := exit_status(result):
         again = "to go on" if result.status == "interrupted" else "to try once more from its last step"
         console.print(f"{again}: unrender resume {escape(shlex.quote(str(folder)))}", soft_wrap=True)
@@ -81,6 +107,8 @@ def conclude(console: Console, problem: Problem, result: Result, folder: Path) -
 
 def exit_status(result: Result) -> int:
     """Of a command whose run ended so."""
+    from unrender.runs import result as results
+
     statuses = {results.INTERRUPTED: INTERRUPTED, results.TERMINATED: TERMINATED, results.NON_FINITE: FAILED}
     return statuses.get(result.stopped, 0)
 

@@ -7,14 +7,15 @@ import os
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.watch import server
-from unrender.watch.redirect import Redirect
+
+if TYPE_CHECKING:
+    from unrender.watch import server
 
 __all__ = ["watch"]
 
@@ -32,6 +33,8 @@ def watch(
 
     It is served to this machine alone, under an address that holds a secret. Ctrl-C ends the page, not the runs.
     """
+    from unrender.watch import server
+
     for directory in directories:
         if directory.exists() and not directory.is_dir():
             raise InputError(f"{directory}: a file, expected a run folder")
@@ -60,6 +63,8 @@ def _similar(directory: Path) -> str:
 
 def _open(address: server.Address, stack: contextlib.ExitStack) -> Callable[[], object] | None:
     """Open the page in a browser; returns what to call once the browser is there."""
+    from unrender.watch.redirect import Redirect
+
     try:
         redirect = stack.enter_context(Redirect(address.url))
     except OSError as error:

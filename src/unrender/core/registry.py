@@ -17,6 +17,7 @@ module is ever imported because a file names it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import importlib.metadata
 import logging
@@ -224,9 +225,29 @@ def _add(made_by: Any, name: str | None, kind: str | None, states: str | None, p
                 f"two components are called {called}: a {known.kind} of {known.made_by.__module__} and a {chosen.name} of "
                 f"{made_by.__module__}; register one of them by another name: @register(name=...)"
             )
+        if dataclasses.is_dataclass(made_by):
+            _explain_unknown_arguments(made_by)
         _components[space, called] = Component(called, chosen.name, made_by, math.inf if position is None else position)
         _state_modules.update({made_by.__module__, states or made_by.__module__})
     return made_by
+
+
+def _explain_unknown_arguments(made_by: type) -> None:
+    """Have the constructor refuse unknown keyword arguments by an `InputError` that names the nearest known one."""
+    original: Any = made_by.__dict__.get("__init__")
+    if original is None or hasattr(original, "__wrapped__"):
+        return
+    known = [field.name for field in dataclasses.fields(made_by) if field.init]
+
+    @functools.wraps(original)
+    def construct(self: Any, *arguments: Any, **named: Any) -> None:
+        for name in named:
+            if name not in known:
+                hint = did_you_mean(name, known) or (f"; it has {', '.join(known)}" if known else "; it has none")
+                raise InputError(f"{made_by.__name__} has no option {name}{hint}")
+        original(self, *arguments, **named)
+
+    made_by.__init__ = construct
 
 
 def _check_kind(kind: str) -> Kind:

@@ -10,12 +10,29 @@ __all__ = ["did_you_mean"]
 
 _MOST, _LONGEST = 1000, 200
 """Names that are compared and their characters: comparing takes time, and names may come from a file that anybody made."""
+_SYNONYMS = {
+    "lr": ("learning_rate",),
+    "step_size": ("learning_rate",),
+    "rate": ("learning_rate",),
+    "eps": ("epsilon",),
+    "betas": ("beta_1", "beta_2"),
+    "iterations": ("steps",),
+    "iters": ("steps",),
+    "epochs": ("steps",),
+    "samples_per_pixel": ("spp",),
+    "sample_count": ("spp",),
+    "batch_size": ("count", "pixels"),
+    "depth": ("max_depth",),
+    "res": ("resolution",),
+    "size": ("resolution",),
+}
+"""What other packages call things, and what they are called here. Only names that are known in a place are suggested there."""
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
     """The words "; did you mean X?" for the nearest known name, "" where none is similar enough.
 
-    A name that differs by case alone is the nearest.
+    A name that differs by case alone is the nearest, then what other packages call it (lr for learning_rate).
 
     Args:
         name: as it was given.
@@ -26,5 +43,6 @@ def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
         return ""
     names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]
-    near = same[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
+    meant = [each for each in _SYNONYMS.get(name.lower(), ()) if each in names]
+    near = same[:1] or meant[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""

@@ -8,6 +8,7 @@ from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.suggestions import did_you_mean
+from unrender.display import notebook_bar
 from unrender.gallery import fields
 from unrender.gallery.fields import Option
 from unrender.gallery.specification import ProblemSource, build_problem
@@ -45,6 +46,8 @@ def problem(name: str, **options: Any) -> Problem:
             reference_spp and max_depth, and those of unknown textures texture_resolution; the defaults take seconds on two CPU
             cores, a GPU wants larger ones.
 
+    References take up to a minute to render, and are kept in the cache folder (`backend.cache`).
+
     Returns:
         the problem. Its references hold noise of their own, which `reference_spp` lowers.
 
@@ -53,10 +56,11 @@ def problem(name: str, **options: Any) -> Problem:
         VariantError: Mitsuba cannot run on this machine.
     """
     specification = fields.fill(name, _specification(name), options)
-    if isinstance(specification, ProblemSource):
-        made = specification.problem(name)
-    else:
-        made = build_problem(name, specification)
+    with notebook_bar.shown():
+        if isinstance(specification, ProblemSource):
+            made = specification.problem(name)
+        else:
+            made = build_problem(name, specification)
     made.origin |= {"gallery": name, "options": options}
     return made
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import mitsuba as mi
 import numpy as np
 
 from unrender.backend.variant import ensure
+from unrender.core import phases
 from unrender.core.random import Key
+from unrender.gallery import reference_cache
 from unrender.losses import Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
@@ -88,8 +91,15 @@ def build_problem(name: str, specification: Specification) -> Problem:
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
     """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    As many passes as memory requires. Equal arguments give equal images.
+    As many passes as memory requires. Equal arguments give equal images. It is kept in the cache folder (`backend.cache`).
     """
+    with phases.phase("reference images") as advance:
+        return reference_cache.recall(
+            scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, advance)
+        )
+
+
+def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable[[float], None]) -> np.ndarray:
     integrator = mi.load_dict({"type": "volpath" if media(scene) else "path", "max_depth": max_depth})
     width, height = scene.sensors()[sensor].film().crop_size()
     per_pass = max(1, _LANES // int(width * height))
@@ -99,4 +109,5 @@ def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
         seed = _REFERENCE.fold(sensor).fold(done).uint32()
         total += take * mi.render(scene, sensor=sensor, integrator=integrator, spp=take, seed=mi.UInt32(seed)).numpy()
         done += take
+        advance(done / spp)
     return (total / spp).astype(np.float32)

@@ -5,12 +5,14 @@ Textures are float32, linear, and stored as they are (`raw`): Mitsuba does not d
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Literal
 
 import mitsuba as mi
 import numpy as np
-import skimage.data
-from skimage.transform import resize
+
+from unrender.core.errors import InputError
 
 __all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp", "to_linear"]
 
@@ -28,15 +30,42 @@ def to_linear(srgb: np.ndarray) -> np.ndarray:
 
 def photograph(name: Photograph, resolution: int) -> np.ndarray:
     """The middle square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
-    picture = np.asarray(getattr(skimage.data, name)())
+    picture = _read(name)
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
     height, width = picture.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     linear = to_linear(picture[top : top + side, left : left + side, :3] / 255.0)
-    small = np.asarray(resize(linear, (resolution, resolution), anti_aliasing=resolution < side))
+    small = _resized(linear, resolution)
     return np.clip(DARKEST + (BRIGHTEST - DARKEST) * small, DARKEST, BRIGHTEST).astype(np.float32)
+
+
+def _read(name: Photograph) -> np.ndarray:
+    """The photograph as its file has it. scikit-image itself takes a second to import."""
+    from PIL import Image
+
+    found = find_spec("skimage")
+    if found is None or not found.submodule_search_locations:
+        raise InputError(
+            "gallery: scikit-image is not installed, whose photographs are needed: pip install scikit-image"
+        )
+    path = Path(found.submodule_search_locations[0]) / "data" / f"{name}.{'jpg' if name == 'rocket' else 'png'}"
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def _resized(picture: np.ndarray, resolution: int) -> np.ndarray:
+    """(side, side, 3) at another resolution, linearly interpolated, and first blurred where it gets smaller: what
+    `skimage.transform.resize` does."""
+    from scipy import ndimage
+
+    factor = picture.shape[0] / resolution
+    blurred = picture
+    if factor > 1:
+        blurred = ndimage.gaussian_filter(picture, ((factor - 1) / 2, (factor - 1) / 2, 0), mode="mirror")
+    small = ndimage.zoom(blurred, (1 / factor, 1 / factor, 1), order=1, mode="mirror", grid_mode=True)
+    return np.clip(np.asarray(small), picture.min(), picture.max())
 
 
 def grid(resolution: int) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,10 @@ class SmoothedMethod(Options):
         0.2,
         description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
     )
-    sigma_schedule: str | None = Field("exponential(25, 0.1)", description="sigma over the steps, as for schedule")
+    sigma_schedule: str | None = Field(
+        "exponential(25, 0.1)",
+        description="factor of sigma by step, such as cosine(300); with adam, of its learning rate, too; cma-es has none",
+    )
     step: PositiveFloat = Field(
         0.5,
         description="as a share of sigma: the longest step; the learning rate, of adam; the first deviation, of cma-es",

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import LbfgsInvHessProduct
 
 from unrender.core import arrays, checks, vectors
 from unrender.core.registry import register
@@ -125,6 +124,8 @@ class LBFGS:
         )
 
     def _direction(self, state: LBFGSState, gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        from scipy.optimize import LbfgsInvHessProduct  # takes long to import
+
         length = float(np.linalg.norm(gradient))
         if not 0.0 < length < math.inf:
             return np.zeros_like(gradient)

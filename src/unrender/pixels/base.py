@@ -13,7 +13,11 @@ from unrender.core.trees import Tree
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["MiniBatch", "PixelSampler", "RepeatableSampler", "check_loss"]
+__all__ = ["MiniBatch", "PixelSampler", "RepeatableSampler", "check_batch"]
+
+_FEWEST_REFUSED = 1 << 16
+_MOST_DRAWS = 4
+"""Draws per pixel of all views beyond which a mini-batch is refused, where it is large at all."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +68,22 @@ class RepeatableSampler(PixelSampler, Protocol):
         ...
 
 
-def check_loss(problem: Problem) -> None:
-    """Raise `InputError` where the loss of a pixel depends on others."""
+def check_batch(owner: str, problem: Problem, count: int) -> None:
+    """Raise `InputError` where the loss of a pixel depends on others, or the mini-batch is far larger than all views together.
+
+    Args:
+        owner: the sampler, for the message.
+        problem: what is rendered.
+        count: pixels a step.
+    """
     if not problem.loss.pixelwise:
         raise InputError(
             f"pixels: {type(problem.loss).__name__} is of whole images, so it takes no pixel mini-batches; "
             "use unrender.pixels.All()"
+        )
+    pixels = sum(np.asarray(view.reference).size // 3 for view in problem.views)
+    if count > max(_MOST_DRAWS * pixels, _FEWEST_REFUSED):
+        raise InputError(
+            f"{owner}: {count} pixels a step, but all views together have {pixels}; give fewer, or take unrender.pixels.All() "
+            "(methods plain and rcv)"
         )

@@ -13,7 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics
-from unrender.pixels.base import MiniBatch, check_loss
+from unrender.pixels.base import MiniBatch, check_batch
 from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_map
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.problem.problem import Problem
@@ -143,7 +143,7 @@ class GuidedSampler:
 
     def init(self, problem: Problem) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
-        check_loss(problem)
+        check_batch(self.owner, problem, self.options.count)
         tiles = self._tiles(problem)
         uniform_table = InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array)
         shares = np.ones(len(tiles.views))

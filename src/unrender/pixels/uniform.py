@@ -8,7 +8,7 @@ from unrender.core import checks
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.pixels.base import MiniBatch, check_loss
+from unrender.pixels.base import MiniBatch, check_batch
 from unrender.pixels.tiles import InverseCdfTable, cut
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
@@ -47,7 +47,7 @@ class Uniform:
     def init(self, problem: Problem, parameters: Tree) -> UniformState:
         """See `PixelSampler.init`."""
         del parameters
-        check_loss(problem)
+        check_batch("Uniform", problem, self.count)
         tiles = cut(problem, 2 * self.count)
         return UniformState(InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array))
 

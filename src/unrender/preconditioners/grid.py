@@ -11,12 +11,12 @@ transform along axes with a border and the Fourier transform along axes that wra
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import scipy.fft
-import scipy.sparse
-from cholespy import CholeskySolverF, MatrixType  # type: ignore  (a compiled module without stubs)
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 __all__ = ["CholeskySolver", "Solver", "TransformSolver", "laplacian", "solver"]
 
@@ -33,6 +33,9 @@ class CholeskySolver:
     """By sparse Cholesky factorisation, once; a solve costs the factor's entries."""
 
     def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]):
+        import scipy.sparse
+        from cholespy import CholeskySolverF, MatrixType  # type: ignore  (a compiled module without stubs)
+
         cells = int(np.prod(grid))
         matrix = (scipy.sparse.identity(cells) + strength * laplacian(grid, wrap)).tocoo()
         rows, columns = matrix.row.astype(np.int32), matrix.col.astype(np.int32)
@@ -62,6 +65,8 @@ class TransformSolver:
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """See `Solver.solve`."""
+        import scipy.fft
+
         y = np.asarray(x, np.float32)
         if self._bordered:
             y = np.asarray(scipy.fft.dctn(y, axes=self._bordered, norm="ortho"))
@@ -89,6 +94,8 @@ def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> So
 
 def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr_matrix:
     """L as a sparse matrix over the cells in row-major order: symmetric, positive semi-definite, rows sum to 0."""
+    import scipy.sparse
+
     cells = int(np.prod(grid))
     index = np.arange(cells).reshape(grid)
     starts, ends = [], []

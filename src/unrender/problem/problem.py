@@ -14,6 +14,7 @@ from unrender.core.arrays import Array
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
+from unrender.problem import notebook
 from unrender.problem.errors import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
@@ -28,6 +29,7 @@ from unrender.problem.validation import (
     check_truth,
     check_view,
     open_renderer,
+    renderer_notices,
 )
 from unrender.problem.view import View
 from unrender.rendering.renderer import Renderer
@@ -61,7 +63,8 @@ class Problem:
         given_views: tuple of `View`, as given.
         origin: where it came from, to make it again: {"scene": path of the XML}, with "file", the path of the problem file, where there is
             one; {"gallery": name, "options": {...}}; empty where only the program that made it can make it again.
-        notices: one line for each change made to the input: conversions, values moved into bounds.
+        notices: one line for each setting of the scene that is not used, and for each change made to the input: conversions, values moved
+            into bounds.
         bounds: {key: (low, high)}, the parameter's own or the physical range that the renderer knows; None is open.
         learning_rates: {key: rate} of the parameters that have their own.
         preconditioners: {key: preconditioner} of the parameters that have one.
@@ -104,7 +107,8 @@ class Problem:
         self.preconditioners = {k: p for k, found in checked.items() if (p := found.preconditioner) is not None}
         self.coarse_to_fine = {k: c for k, found in checked.items() if (c := found.coarse_to_fine) is not None}
         self._initial = {key: found.initial for key, found in checked.items()}
-        self.notices = [notice for found in checked.values() for notice in found.notices]
+        self.notices = list(renderer_notices(self.renderer))
+        self.notices += [notice for found in checked.values() for notice in found.notices]
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
         self.views = tuple(view for view, _ in read)
         self.notices += [notice for _, notices in read for notice in notices]
@@ -123,6 +127,16 @@ class Problem:
         from unrender.problem.toml_file import read
 
         return read(path)
+
+    def __repr__(self) -> str:
+        return notebook.line(self)
+
+    def _repr_html_(self) -> str:
+        return notebook.html(self)
+
+    def initial_values(self) -> dict[str, np.ndarray]:
+        """`initial` as NumPy arrays."""
+        return {key: np.array(value) for key, value in self._initial.items()}
 
     def initial(self) -> Tree:
         """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""

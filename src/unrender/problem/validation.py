@@ -20,6 +20,7 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.problem import coarse_to_fine
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.errors import FieldError
+from unrender.problem.key_hints import instead_of, near_key
 from unrender.problem.parameter import Parameter
 from unrender.problem.view import View
 from unrender.rendering.renderer import ParameterInfo, Renderer
@@ -35,6 +36,7 @@ __all__ = [
     "check_truth",
     "check_view",
     "open_renderer",
+    "renderer_notices",
 ]
 
 Bounds = tuple[float | None, float | None]
@@ -45,6 +47,11 @@ _LONGEST_KEY = 200
 
 @runtime_checkable
 class _Renderer(Renderer, Protocol): ...
+
+
+@runtime_checkable
+class _Noticing(Protocol):
+    notices: Sequence[str]
 
 
 @runtime_checkable
@@ -119,14 +126,16 @@ def check_parameter(
     """
     key = parameter.key
     if not isinstance(key, str) or key not in known:
-        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{_near_key(str(key), known)}")
+        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
     if len(key) > _LONGEST_KEY:  # files are named by it
         raise FieldError(
             ("parameters", index, "key"), f"{key}: expected at most {_LONGEST_KEY} characters, got {len(key)}"
         )
     info = known[key]
     if not info.differentiable and not info.perturbable:
-        raise FieldError(("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}")
+        raise FieldError(
+            ("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}{instead_of(key, known)}"
+        )
 
     def wrong(field: str, what: str | Exception) -> FieldError:
         return FieldError(("parameters", index, field), str(what), f"parameter {key}: {field}")
@@ -276,6 +285,11 @@ def open_renderer(scene: Any, max_depth: int) -> Renderer:
         raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
 
 
+def renderer_notices(renderer: Renderer) -> Sequence[str]:
+    """What a renderer does otherwise than its scene asks for, one line each; a renderer need not tell."""
+    return renderer.notices if isinstance(renderer, _Noticing) else ()
+
+
 def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
     """A tuple of at least one `kind`. Raises `FieldError`."""
     items = (given,) if isinstance(given, kind) else given
@@ -317,12 +331,3 @@ def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> Non
             f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
             f"but the film of sensor {sensor} is {width}x{height}"
         )
-
-
-def _near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
-    able = [name for name, info in known.items() if info.differentiable or info.perturbable]
-    # Mitsuba may call an owner by its shape where people think of its material: the rest of the key tells as much.
-    alike = [name for name in able if name.endswith("." + key.partition(".")[2])] if "." in key else []
-    if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, able) or did_you_mean(key, known):
-        return near
-    return f"; it has {', '.join(able[:6])}{' and others' if len(able) > 6 else ''}" if able else ""

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from unrender.display import plots
+from unrender.display.plots import Chart, Line
 from unrender.io.files import write
-from unrender.report import curves, html, image_metrics, panels, plots
+from unrender.report import curves, html, image_metrics, panels
 from unrender.report import groups as grouping
 from unrender.report.equal_time import Comparison, compare_groups
-from unrender.report.overview_figure import overview_figure
-from unrender.report.plots import Chart, Line
 from unrender.runs.folder.reader import RunFolder, read
 
 __all__ = ["compare", "load_comparison", "write_comparison"]
@@ -51,6 +51,8 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
 
 def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
     """Write the page, its picture and its numbers; returns the page's path. Raises `InputError`."""
+    from unrender.report.overview_figure import overview_figure  # matplotlib takes a second to import
+
     folder = Path(out)
     write(folder / "compare.json", _numbers(comparison, notices))
     with np.errstate(over="ignore", invalid="ignore"):

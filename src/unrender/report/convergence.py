@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from unrender.report import curves, plots
+from unrender.display import plots
+from unrender.display.plots import Chart, Line
+from unrender.report import curves
 from unrender.report.curves import Series
-from unrender.report.plots import Chart, Line
 from unrender.runs.folder.reader import RunFolder
 
 __all__ = ["charts", "charts_of_runs"]

@@ -10,11 +10,11 @@ from statistics import median
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.display.plots import AXES
 from unrender.report import curves, image_metrics
 from unrender.report.curves import Band, Series
 from unrender.report.groups import Group
 from unrender.report.image_metrics import ImageMetric
-from unrender.report.plots import AXES
 from unrender.runs.folder.reader import RunFolder
 
 __all__ = [

@@ -13,7 +13,7 @@ from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from unrender.core.text import visible
-from unrender.report import formatting
+from unrender.display import formatting
 from unrender.runs.folder.schema import RunRecord
 
 __all__ = ["environment", "facts", "flatten", "loader", "render", "source"]
@@ -56,6 +56,7 @@ def facts(record: RunRecord) -> dict[str, str]:
             "method": record.method,
             "settings": record.settings,
             "seed": record.seed,
+            "time": formatting.phases(record.phases),
             "variant": record.variant,
             "hardware": record.hardware,
             "versions": record.versions,

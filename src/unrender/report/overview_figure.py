@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from unrender.report import formatting, panels, plots, tone_mapping
+from unrender.display import formatting, maps, plots
+from unrender.report import panels, tone_mapping
 from unrender.report.curves import Band
 from unrender.report.equal_time import Comparison, Metric
 
@@ -69,7 +70,7 @@ def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     found = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
     found += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
     show = panels.ColourScale(first.truth[key])
-    return [(title, show.colours(plane)) for title, array in found if (plane := panels.plane(array)) is not None]
+    return [(title, show.colours(plane)) for title, array in found if (plane := maps.plane(array)) is not None]
 
 
 def _draw(axes: Axes, metric: Metric, axis: str) -> None:

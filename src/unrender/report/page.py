@@ -5,8 +5,9 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 
+from unrender.display import plots
 from unrender.io.files import write
-from unrender.report import convergence, html, image_metrics, panels, plots, tables
+from unrender.report import convergence, html, image_metrics, panels, tables
 from unrender.runs.folder.reader import read
 
 __all__ = ["page"]

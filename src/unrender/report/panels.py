@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import formatting, tone_mapping
+from unrender.display import formatting, maps
+from unrender.display.maps import is_map
+from unrender.report import tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
 
@@ -19,12 +21,9 @@ __all__ = [
     "is_map",
     "map_of_methods",
     "map_of_run",
-    "plane",
     "view_of_methods",
     "view_of_run",
 ]
-
-_VALUES_IN_A_TABLE = 16
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,6 @@ class Panel:
     stacks: tuple[tuple[Slider | Figure, ...], ...]
     first_is_large: bool
     independent: bool = False
-
-
-def is_map(array: np.ndarray) -> bool:
-    """Whether a parameter is shown as a picture: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
-    if array.size == 0:
-        return False
-    if array.ndim == 2:
-        return array.size > _VALUES_IN_A_TABLE and min(array.shape) > 1
-    return array.ndim in (3, 4) and array.shape[-1] in (1, 3, 4) and sum(n > 1 for n in array.shape[:-1]) >= 2
 
 
 def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
@@ -156,9 +146,9 @@ def map_of_run(
     """A recovered texture or volume against its truth, or against its start where the truth is unknown."""
     scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
-    planes = _planes(result)
+    planes = maps.planes(result)
     for label, plane in planes.items():
-        start, wanted = _planes(initial).get(label), _planes(truth).get(label)
+        start, wanted = maps.planes(initial).get(label), maps.planes(truth).get(label)
         errors = {
             caption: tone_mapping.absolute_error(one, wanted)
             for caption, one in (("Error at the start", start), ("Error", plane))
@@ -188,8 +178,8 @@ def map_of_methods(
 ) -> Panel:
     """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
     scale = ColourScale(truth)
-    label, wanted = next(iter(_planes(truth).items()))
-    found = {name: _planes(result).get(label) for name, result in results.items()}
+    label, wanted = next(iter(maps.planes(truth).items()))
+    found = {name: maps.planes(result).get(label) for name, result in results.items()}
     errors = {
         name: tone_mapping.absolute_error(plane, wanted)
         for name, plane in found.items()
@@ -239,27 +229,6 @@ class ColourScale:
         return (
             tone_mapping.colour_bar(self.low, self.high, tone_mapping.VALUE_COLORMAP, "Value") if self.scalar else None
         )
-
-
-def plane(array: np.ndarray) -> np.ndarray | None:
-    """(H, W, C) of a map: the texture itself or a volume's first middle slice; None for what is no map."""
-    return next(iter(_planes(array).values()), None)
-
-
-def _planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
-    """{label: (H, W, C)}: the texture itself, or a volume's middle slices along its axes."""
-    if array is None or not is_map(array):
-        return {}
-    if array.ndim == 2:
-        return {"": array[..., None]}
-    if array.ndim == 3:
-        return {"": array}
-    found = {}
-    for axis, name in enumerate("zyx"):
-        plane = np.take(array, array.shape[axis] // 2, axis=axis)
-        if min(plane.shape[:2]) > 1:
-            found[f"middle slice along {name}"] = plane
-    return found or {"slice": array.reshape(-1, *array.shape[2:])}
 
 
 def _compare_map(

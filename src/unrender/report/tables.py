@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.report import curves, formatting, image_metrics, tone_mapping
+from unrender.display import formatting
+from unrender.evaluation import debiased
+from unrender.report import curves, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
 __all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "parameter_row", "tiles", "view_rows"]
@@ -71,7 +73,9 @@ def tiles(run: RunFolder) -> list[Tile]:
     elif (relative := curves.relative_error(run, list(run.truth))) is not None:
         found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
     after = curves.image_error(run)
-    if after is not None:
+    if (measured := _image_error(run)) is not None:
+        found.append(measured)
+    elif after is not None:
         views = run.views.values()
         before = [root_mean_square(of.initial, of.reference) for of in views if of.initial is not None]
         known = [error for error in before if error is not None]
@@ -89,6 +93,19 @@ def tiles(run: RunFolder) -> list[Tile]:
         rate = f"{formatting.count(samples / seconds)} per second" if seconds > 0 else ""
         found.append(Tile("Samples", formatting.count(samples), rate))
     return found
+
+
+def _image_error(run: RunFolder) -> Tile | None:
+    """The error of the last pictures without the noise of their rendering; None where it was not measured."""
+    known = run.record.image_errors
+    errors = {
+        which: [known[name] for view in run.views if (name := f"view{view}/{which}") in known]
+        for which in ("initial", "result")
+    }
+    if not run.views or any(len(found) != len(run.views) for found in errors.values()):
+        return None
+    before, after = (formatting.with_error(*debiased.mean(found)) for found in errors.values())
+    return Tile("Image error", after, f"RMSE without the pictures' noise, from {before}")
 
 
 def _tile(label: str, before: float | None, after: float, unit: str) -> Tile:

@@ -7,7 +7,6 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import matplotlib
 import numpy as np
 from PIL import Image
 
@@ -157,6 +156,8 @@ class ColourBar:
 
 def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
     """Values from `low` to `high` through the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
+    import matplotlib
+
     span = high - low
     place = (np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (span if span > 0 else 1.0)
     return matplotlib.colormaps[name](np.clip(place, 0.0, 1.0))[..., :3]
@@ -169,6 +170,8 @@ def error_bar(high: float) -> ColourBar:
 
 def colour_bar(low: float, high: float, name: str, label: str) -> ColourBar:
     """The legend of `PictureEncoder.false_colour` with the same arguments."""
+    import matplotlib
+
     stops = (matplotlib.colormaps[name](np.linspace(0.0, 1.0, 9))[:, :3] * 255 + 0.5).astype(int)
     return ColourBar(tuple(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops), low, (low + high) / 2, high, label)
 

@@ -1,39 +1,117 @@
-"""The final pictures of a run, for its report."""
+"""The final pictures of a run, for its report, and how far they are from the references."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
+from unrender.core import phases
+from unrender.evaluation import debiased
 from unrender.io.thumbnails import resize_nearest
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
 from unrender.runs.result import Result
 
-__all__ = ["render_pictures"]
+__all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"]
 
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
+_SHARE, _LEAST_SECONDS = 0.08, 1.0
+"""Of the time of the steps, what final pictures may take, but a second at least: with the trial and what is written, under a tenth."""
+_TRIAL_PATHS = 1 << 18
+
+_SEEDS = {"initial": 1, "result": 2}
+_SECOND_HALF = 1 << 16
+"""Added to the seed for the second half of a picture's samples."""
+
+
+@dataclass(frozen=True)
+class FinalImages:
+    """Pictures at the end of a run.
+
+    Attributes:
+        pictures: see `Result.pictures`.
+        errors: see `Result.image_errors`.
+        spp: samples per pixel of each.
+    """
+
+    pictures: dict[str, np.ndarray]
+    errors: dict[str, tuple[float, float]]
+    spp: int
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
+    """The pictures of `render_final_images`."""
+    return render_final_images(problem, result, spp).pictures
+
+
+def render_final_images(problem: Problem, result: Result, spp: int | None = None) -> FinalImages:
     """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any.
+
+    Each picture is rendered in two independent halves, which tell its error apart from its noise (`evaluation.debiased`).
 
     Args:
         problem: what was run.
         result: its outcome.
-        spp: samples per pixel, or None for as many as some four million paths per picture allow.
+        spp: samples per pixel. None for as many as a tenth of the time of the run's steps allows, or one second where that is longer, but
+            no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
-    found: dict[str, np.ndarray] = {}
-    for index, view in enumerate(problem.views):
-        reference = np.asarray(view.reference, np.float32)
-        samples = spp or min(max(_PICTURE_PATHS // (reference.size // 3), _FEWEST), _MOST)
-        found[f"view{index}/reference"] = reference
-        found[f"view{index}/initial"] = render(problem, result.initial, index, samples, seed=1)
-        found[f"view{index}/result"] = render(problem, result.parameters, index, samples, seed=2)
-        if index in weights:
-            found[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
-        if index in probabilities:
-            density = np.asarray(probabilities[index], np.float32)
-            found[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
-    return found
+    pictures: dict[str, np.ndarray] = {}
+    errors: dict[str, tuple[float, float]] = {}
+    with phases.phase("final pictures") as advance:
+        samples = spp or _affordable(problem, result)
+        for index, view in enumerate(problem.views):
+            reference = np.asarray(view.reference, np.float32)
+            pictures[f"view{index}/reference"] = reference
+            for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
+                name = image_name(index, which)
+                pictures[name], error = _picture(problem, values, index, samples, _SEEDS[which])
+                if error is not None:
+                    errors[name] = error
+                advance((2 * index + done + 1) / (2 * len(problem.views)))
+            if index in weights:
+                pictures[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
+            if index in probabilities:
+                density = np.asarray(probabilities[index], np.float32)
+                pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
+    return FinalImages(pictures, errors, samples)
+
+
+def image_name(view: int, which: str) -> str:
+    """The name of a view's "initial" or "result" among pictures and their errors."""
+    return f"view{view}/{which}"
+
+
+def _picture(
+    problem: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int
+) -> tuple[np.ndarray, tuple[float, float] | None]:
+    """A view's picture, and its error with the standard error; None for a single sample, which has no halves."""
+    first = spp // 2
+    if first == 0:
+        return render(problem, values, view, spp, seed), None
+    one, other = (render(problem, values, view, first, seed + offset) for offset in (0, _SECOND_HALF))
+    return (one + other) / 2, debiased.rmse(one, other, np.asarray(problem.views[view].reference))
+
+
+def _affordable(problem: Problem, result: Result) -> int:
+    """Samples per pixel that final pictures may have: what they take is measured on a few samples of the first view."""
+    sizes = [np.asarray(view.reference).size // 3 for view in problem.views]
+    most = min(min(max(_PICTURE_PATHS // size, _FEWEST), _MOST) for size in sizes)
+    trial = _power_of_two(min(max(_TRIAL_PATHS // sizes[0], 1), most // 2))
+    seconds = 0.0
+    for seed in (0, 1):  # the first time, kernels are compiled
+        started = time.perf_counter()
+        render(problem, result.parameters, 0, trial, seed)
+        seconds = time.perf_counter() - started
+    allowed = max(_SHARE * result.seconds, _LEAST_SECONDS)
+    paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
+    return max(2, _power_of_two(int(min(most, paths / (2 * sum(sizes))))))
+
+
+def _power_of_two(number: int) -> int:
+    """The greatest that is not above `number`; 1 for less than 1. Few different sample counts mean few different kernels."""
+    return 1 << (max(number, 1).bit_length() - 1)

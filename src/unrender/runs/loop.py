@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, phases, trees
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
@@ -19,6 +19,7 @@ from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
 from unrender.runs.metadata import RunMetadata
 from unrender.runs.noise import GradientNoise
+from unrender.runs.phase_times import COMPILING
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible, snapshot
 
@@ -96,7 +97,8 @@ def descend(descent: Descent) -> Result:
     run, hooks = descent.run, descent.hooks
     try:
         fresh = descent.snapshot()
-        seconds, warm = descent.warm_up()
+        with phases.phase(COMPILING):
+            seconds, warm = descent.warm_up()
         descent.log.warmup_seconds += seconds
         for hook in hooks:
             hook.on_warm_up(descent, fresh, warm)

@@ -29,12 +29,14 @@ class RunAnnotations:
         settings: of the method, as JSON can hold them.
         command: what was typed.
         final_spp: samples per pixel of the final pictures; None chooses.
+        phases: {phase: seconds} of what came before, such as loading.
     """
 
     method: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     command: str = ""
     final_spp: int | None = None
+    phases: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass

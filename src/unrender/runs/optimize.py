@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,13 @@ from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
+from unrender.display.notebook_bar import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.problem.serialization import origin
+from unrender.runs import advice, components
 from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
@@ -25,9 +28,11 @@ from unrender.runs.hooks import CallbackHook, Hook
 from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
+from unrender.runs.notebook_progress import NotebookProgress
+from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run, terminate_if_told
+from unrender.runs.run import Run, RunState, terminate_if_told
 
 __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
 
@@ -35,8 +40,8 @@ __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer
 @exclusive("optimize", long=True)
 def optimize(
     problem: Problem,
-    estimator: Estimator,
-    optimizer: Optimizer,
+    estimator: Estimator | str,
+    optimizer: Optimizer | None = None,
     steps: int | None = None,
     seconds: float | None = None,
     seed: int = 0,
@@ -44,13 +49,14 @@ def optimize(
     run_directory: str | Path | None = None,
     checkpoint_every: int | None = None,
     annotations: RunAnnotations | None = None,
+    progress: bool | None = None,
 ) -> Result:
     """Recover the problem's parameters by descent.
 
     Args:
         problem: what to recover, from which images.
-        estimator: where gradients come from.
-        optimizer: what becomes of them.
+        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along.
+        optimizer: what becomes of them; None for the method's.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
@@ -61,6 +67,7 @@ def optimize(
         checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a fiftieth of the time. There
             is one at the end, too.
         annotations: what else the run folder should say.
+        progress: whether to show a bar; None does so in notebooks.
 
     Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. SIGTERM ends a run that
     has a run folder likewise, without final pictures, and then the process, unless the program handles it itself. Both are left to
@@ -78,26 +85,62 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
             cannot be begun, or cannot be written in the end; a run goes on in another thread.
     """
+    named = estimator
+    estimator, optimizer = components.resolve(estimator, optimizer)
     check(estimator, optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
+    if isinstance(named, str) and not annotations.method:
+        annotations = replace(annotations, method=named)
     run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
+    run.warnings += advice.remarks(problem, optimizer)
     log = RunMetadata(describe_run(run, annotations), run.full())
+    with _progress(progress) as shown:
+        return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)
+
+
+@contextmanager
+def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
+    """The callback that shows a bar, while it is up; none where none is wanted."""
+    if wanted is False or (wanted is None and not in_notebook()):
+        yield []
+        return
+    from unrender.runs.progress import Progress  # rich takes long to import
+
+    with NotebookProgress() if in_notebook() else Progress() as bar:
+        yield [bar]
+
+
+def _descend(
+    run: Run,
+    state: RunState,
+    log: RunMetadata,
+    callbacks: Sequence[Callback],
+    annotations: RunAnnotations,
+    run_directory: str | Path | None,
+    checkpoint_every: int | None,
+) -> Result:
+    """Run, with a run folder or without."""
     if run_directory is None:
-        return descend(Descent(run, state, log, assemble_hooks(callbacks)))
+        return descend(Descent(run, state, log, assemble_hooks(callbacks, earlier=annotations.phases)))
     run.folder = Path(run_directory)
-    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(problem)}
+    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(log.result(run))
-        result = descend(Descent(run, state, log, assemble_hooks(callbacks, writer)))
+        result = descend(Descent(run, state, log, assemble_hooks(callbacks, writer, earlier=annotations.phases)))
     terminate_if_told(run)
     return result
 
 
-def assemble_hooks(callbacks: Sequence[Callback], *folder: Hook) -> list[Hook]:
-    """What takes part in every run, then what keeps its run folder, then the user's callbacks."""
-    return [InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
+def assemble_hooks(
+    callbacks: Sequence[Callback], *folder: Hook, earlier: Mapping[str, float] | None = None
+) -> list[Hook]:
+    """What takes part in every run, then what keeps its run folder, then the user's callbacks.
+
+    `earlier` is the seconds of phases before the run.
+    """
+    return [PhaseTimes(earlier), InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:
@@ -109,16 +152,17 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
 
 @exclusive("estimate")
 def estimate(
-    problem: Problem, estimator: Estimator, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
+    problem: Problem, estimator: Estimator | str, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> Estimate:
     """One estimate from a fresh state, its arrays as NumPy: to look at a gradient.
 
     Args:
         problem: what to recover.
-        estimator: where gradients come from.
+        estimator: where gradients come from, or the name of a method.
         parameters: {key: array} for all parameters of the problem, or None for the initial ones.
         seed: of its random numbers.
     """
+    estimator = components.resolve_estimator(estimator, "estimate")
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))

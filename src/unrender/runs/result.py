@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from unrender.io import files
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines, steps_in
 
+if TYPE_CHECKING:
+    from unrender.runs.figure import ResultFigure
+
 __all__ = ["INTERRUPTED", "NON_FINITE", "TERMINATED", "Result", "deciding_versions", "hardware", "versions"]
 
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
@@ -28,7 +31,7 @@ INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 were not finite."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """The outcome of `optimize`.
 
@@ -50,6 +53,10 @@ class Result:
         name, method, settings, seed, command, problem: what was run.
         resumed: the steps at which it was resumed.
         truth: {key: array} where it is known.
+        image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
+            reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
+        phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
+            and, of the command line, what came before. Of the last session, where the run was resumed.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
     """
 
@@ -71,6 +78,26 @@ class Result:
     resumed: Sequence[int] = ()
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    phases: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        from unrender.runs import notebook
+
+        return notebook.line(self)
+
+    def _repr_html_(self) -> str:
+        from unrender.runs import notebook
+
+        return notebook.html(self)
+
+    def plot(self) -> ResultFigure:
+        """A matplotlib figure: pictures of the views where there are some (`pictures`), recovered maps beside truth and start, curves of
+        parameter error and loss. It belongs to no pyplot session: `result.plot().savefig("result.png")`.
+        """
+        from unrender.runs.figure import plot
+
+        return plot(self)
 
     @property
     def steps(self) -> int:
@@ -132,6 +159,10 @@ class Result:
             "warnings": list(self.warnings),
             "problem": dict(self.problem),
             "resumed": list(self.resumed),
+            "image_errors": {
+                name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
+            },
+            "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:
             fields["error"] = error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,8 +88,9 @@ def resume_run(
     callbacks: Sequence[Callback] = (),
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
+    earlier: Mapping[str, float] | None = None,
 ) -> Result:
-    """Resume the run. See `unrender.resume`."""
+    """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before."""
     folder, method = stored.folder, stored.method
     parts = method_file.parts(method, folder / METHOD, estimator, optimizer)
     check(parts.estimator, parts.optimizer, method.steps, method.seconds)
@@ -107,7 +108,9 @@ def resume_run(
             restoring = _Restore(stored.record, source, changes, writer)
             log = _metadata(run, stored, initial, fingerprint)
             try:
-                result = descend(Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer)]))
+                result = descend(
+                    Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer, earlier=earlier)])
+                )
                 break
             except _UnusableCheckpoint as error:
                 source.passed_over.append(str(error))  # the one before may serve

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy import special
-from scipy.stats import qmc
 
 from unrender.core import checks
 from unrender.core.errors import InputError
@@ -67,6 +65,9 @@ class SmoothedFunction:
             return sampler(
                 rng.random(count), _open_interval(rng.random((count, self.n))), rng.standard_normal((count, self.n))
             )
+        from scipy import special
+        from scipy.stats import qmc  # takes a second to import
+
         parts = []
         for replicate in range(_REPLICATES):
             rng = np.random.default_rng([self.seed, stream, replicate])

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
-from unrender.report import convergence, formatting, html, panels, plots, tables
+from unrender.display import formatting, plots
+from unrender.report import convergence, html, panels, tables
 from unrender.report.tone_mapping import PictureData, PictureEncoder
 from unrender.runs.folder.reader import RunFolder
 from unrender.watch import monitor

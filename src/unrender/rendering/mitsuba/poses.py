@@ -24,7 +24,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ParameterInfo
@@ -233,6 +232,8 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
         scene: as loaded.
         parameters: {key: value} of poses.
     """
+    from scipy.spatial.transform import Rotation
+
     known = keys(scene)
     found = {}
     chosen = {key: known[key] for key in parameters}

@@ -10,7 +10,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba import ignored, poses
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -33,12 +33,16 @@ class MitsubaRenderer:
     vertex positions (3 V,). Geometry moves only through Mitsuba's `prb` kernel, whose gradient leaves out visibility. Poses of
     whole shapes and sensors, see `poses.py`, have no path gradient at all.
 
+    Attributes:
+        notices: one line for each setting of the scene that is not used.
+
     Raises `InputError` where Mitsuba refuses the description.
     """
 
     def __init__(self, description: SceneDescription, max_depth: int = 6):
         self.max_depth = max_depth
         self.pair = ScenePair(description)
+        self.notices = ignored.notices(self.pair.current, self.pair.loaded().source, max_depth)
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = dict(self.pair.info())
@@ -96,6 +100,10 @@ class MitsubaRenderer:
         if key not in self._info:
             raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
         info = self._info[key]
+        if derivatives and not info.differentiable and key in self._poses:
+            raise InputError(
+                f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}: --method smoothed"
+            )
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         if not info.perturbable:

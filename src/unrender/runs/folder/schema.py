@@ -103,6 +103,7 @@ class RunRecord(BaseModel):
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
+        image_errors, phases: see `Result`.
         error: the exception by which the run failed; "" for none.
     """
 
@@ -125,6 +126,8 @@ class RunRecord(BaseModel):
     warnings: list[StrictStr] = []
     problem: ProblemRecord = ProblemRecord()
     resumed: list[_Count] = []
+    image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
+    phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
 
 

@@ -22,7 +22,8 @@ from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
-from unrender.runs.final_images import render_pictures
+from unrender.runs import phase_times
+from unrender.runs.final_images import render_final_images
 from unrender.runs.folder import checkpoint
 from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
@@ -149,7 +150,10 @@ class RunWriter(Hook):
             if result.status != "finished" or self._written_step != result.steps:
                 # What took long is safe, and how it ended is known, before what takes seconds more.
                 self._save(result, "running" if result.status == "finished" else result.status)
-            result = replace(result, pictures=render_pictures(descent.run.problem, result, self.final_spp))
+            started = time.perf_counter()
+            images = render_final_images(descent.run.problem, result, self.final_spp)
+            result = replace(result, pictures=images.pictures, image_errors=images.errors)
+            result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
         return result
 

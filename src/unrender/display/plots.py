@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unrender.report import formatting
+from unrender.display import formatting
 
 __all__ = ["AXES", "Axis", "Chart", "Curve", "Line", "axis_format", "chart", "is_logarithmic"]
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["count", "duration", "number"]
+import math
+from collections.abc import Mapping
+
+__all__ = ["count", "duration", "number", "phases", "with_error"]
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
@@ -41,3 +44,22 @@ def duration(seconds: float | None) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def with_error(value: float, error: float) -> str:
+    """A measured value >= 0 and its standard error: 0.0312 ± 0.0004. Where it is not above twice its error: below 0.012."""
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value)
+    if error <= 0:
+        return number(value)
+    if value <= 2 * error:
+        return f"below {number(math.hypot(value, error))}"
+    places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error
+    if value >= 1e5 or error < 1e-6:
+        return f"{number(value)} ± {number(error)}"
+    return f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def phases(seconds: Mapping[str, float], least: float = 0.05) -> str:
+    """Where time went: "loading 2.1 s, steps 30 s"; phases shorter than `least` seconds are left out."""
+    return ", ".join(f"{name} {duration(float(f'{spent:.2g}'))}" for name, spent in seconds.items() if spent >= least)

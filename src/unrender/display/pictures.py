@@ -1,0 +1,55 @@
+"""Arrays as PNG pictures that a browser shows, within the text of a page."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+
+from unrender.display import maps
+from unrender.evaluation.metrics import exposure, srgb
+from unrender.io.thumbnails import reduced
+
+__all__ = ["data_uri", "png", "shown_image", "shown_map"]
+
+
+def png(colours: np.ndarray, effort: int = 6) -> bytes:
+    """(H, W, 3) in [0, 1], as they are to be seen, as a PNG file; `effort` of compression, 0 to 9."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray((colours * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG", compress_level=effort)
+    return buffer.getvalue()
+
+
+def data_uri(colours: np.ndarray) -> str:
+    """(H, W, 3) in [0, 1] as the `src` of an image."""
+    return f"data:image/png;base64,{base64.b64encode(png(colours)).decode('ascii')}"
+
+
+def shown_image(linear: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray:
+    """Linear RGB (H, W, 3) in sRGB, as bright as suits `like` (by default itself), its sides at most `largest`: values in [0, 1]."""
+    factor = exposure(np.asarray(linear if like is None else like)[..., :3])
+    with np.errstate(over="ignore", invalid="ignore"):
+        return srgb(reduced(np.asarray(linear)[..., :3], largest) * factor)
+
+
+def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray | None:
+    """A texture or the middle slice of a volume, as colours (H, W, 3) in [0, 1]; None for a parameter that is no picture.
+
+    One channel is grey over the range of `like` (by default its own); three are sRGB, exposed only where values pass 1.
+    """
+    plane = maps.plane(np.asarray(values))
+    if plane is None:
+        return None
+    scale = np.asarray(values if like is None else like)
+    finite = scale[np.isfinite(scale)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    small = reduced(plane, largest)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if plane.shape[-1] == 1:
+            span = high - low if high > low else 1.0
+            grey = np.clip(np.nan_to_num((small - low) / span), 0.0, 1.0)
+            return np.repeat(grey, 3, axis=-1)
+        return srgb(small[..., :3] * (1.0 if high <= 1 else 1 / high))

@@ -1,0 +1,35 @@
+"""Remarks on settings that will hardly do what was meant, before the first step."""
+
+from __future__ import annotations
+
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.meta_adam import MetaAdam
+from unrender.problem.problem import Problem
+
+__all__ = ["remarks"]
+
+_LARGEST_STEP = 0.5
+"""Of a bounded parameter's range: a first step that is longer leads from anywhere in it to a bound."""
+
+
+def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
+    """One line for each parameter whose first steps cross at least half of its range.
+
+    The steps of Adam are about as long as the learning rate, in units of the parameter, whatever the scale of the loss.
+    """
+    if not isinstance(optimizer, (Adam, MetaAdam)):
+        return []
+    found = []
+    for key, (low, high) in problem.bounds.items():
+        rate = problem.learning_rates.get(key, optimizer.learning_rate)
+        if low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
+            found.append(
+                f"parameter {key}: a learning_rate of {rate:g} crosses its range, {low:g} to {high:g}, in "
+                f"{_steps((high - low) / rate)}; 0.005 to 0.05 of the range are usual"
+            )
+    return found
+
+
+def _steps(number: float) -> str:
+    return "one step" if number <= 1 else f"{number:.2g} steps"

@@ -1,0 +1,77 @@
+"""Estimator and optimizer as a user gives them: components, or a method's name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.estimators.base import Estimator
+from unrender.methods import method, methods
+from unrender.optimizers.base import Optimizer
+
+__all__ = ["resolve", "resolve_estimator"]
+
+
+def resolve(estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
+    """Both parts.
+
+    Args:
+        estimator: an estimator, or the name of a method, which brings its optimizer along.
+        optimizer: an optimizer; None for the method's.
+
+    Raises:
+        InputError: one of them is missing or something else, such as an optimizer of Mitsuba's or PyTorch's, or a class in place of an
+            object.
+    """
+    chosen = resolve_estimator(estimator)
+    if optimizer is None and isinstance(estimator, str):
+        return method(estimator).start()
+    if optimizer is None:
+        raise InputError(
+            "optimize: give an optimizer, such as unrender.optimizers.Adam(learning_rate=0.01), or a method's name in place of both"
+        )
+    if not _is_component(optimizer, "requires", "init", "update"):
+        raise InputError(f"optimize: optimizer: {_instead_of_optimizer(optimizer)}")
+    return chosen, optimizer
+
+
+def resolve_estimator(estimator: Any, owner: str = "optimize") -> Estimator:
+    """An estimator, from itself or a method's name. Raises `InputError` for anything else."""
+    if isinstance(estimator, str):
+        return method(estimator).start()[0]
+    if not _is_component(estimator, "provides", "init", "estimate"):
+        names = ", ".join(methods())
+        raise InputError(
+            f"{owner}: expected an estimator, such as unrender.PathGradient(spp=4), or the name of a method ({names}), "
+            f"got {_shown(estimator)}"
+        )
+    return estimator
+
+
+def _is_component(given: Any, *members: str) -> bool:
+    return not isinstance(given, type) and all(
+        callable(getattr(type(given), m, None)) or hasattr(given, m) for m in members
+    )
+
+
+def _instead_of_optimizer(given: Any) -> str:
+    """What is wrong with something that is no optimizer, and what would be right."""
+    from unrender import optimizers
+
+    kind = given if isinstance(given, type) else type(given)
+    known = {name: getattr(optimizers, name) for name in optimizers.__all__}
+    package = kind.__module__.partition(".")[0]
+    if isinstance(given, type) and given in known.values():
+        return f"expected an object, got the class {given.__name__}; write {given.__name__}()"
+    if package in ("mitsuba", "drjit", "torch"):
+        owner = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "torch": "PyTorch"}[package]
+        same = kind.__name__ if kind.__name__ in known else "Adam"
+        return f"{owner}'s {kind.__name__} updates parameters of its own; expected unrender.optimizers.{same}(learning_rate=...)"
+    expected = "expected one of unrender.optimizers, such as Adam(learning_rate=0.01)"
+    hint = did_you_mean(given, known) if isinstance(given, str) else ""
+    return f"{expected}, got {_shown(given)}{hint}"
+
+
+def _shown(given: Any) -> str:
+    return f"the class {given.__name__}" if isinstance(given, type) else repr(given)[:80]

@@ -1,0 +1,91 @@
+"""How a result is shown: one line of text, and a block of HTML in a notebook."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unrender.display import formatting, maps, notebook
+from unrender.display.pictures import shown_image, shown_map
+from unrender.display.plots import Line, chart
+from unrender.runs import curves
+
+if TYPE_CHECKING:
+    from unrender.runs.result import Result
+
+__all__ = ["html", "line", "shown_pictures", "start_errors"]
+
+_VIEWS, _MAPS = 2, 3
+
+
+def line(result: Result) -> str:
+    """Result('indirect-room', rcv: 300 steps in 12.3 s, parameter error 0.306 → 0.0283, finished)."""
+    return f"Result({result.name!r}, {_told(result)})"
+
+
+def html(result: Result) -> str:
+    """Pictures, recovered maps beside truth and start, curves, where the time went, warnings."""
+    end = result.seconds or 1.0
+    seconds, loss = curves.loss(result.history)
+    errors = curves.parameter_errors(result.history, start_errors(result))
+    lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
+    drawn = [
+        chart("Parameter error (RMSE)", lines, "seconds", end),
+        chart("Loss, of the steps' samples", [Line("loss", seconds, loss)], "seconds", end) if len(loss) else None,
+    ]
+    rows = {"image error": _image_error(result), "time": formatting.phases(result.phases)}
+    return notebook.block(
+        f"Result of {result.name}, {_told(result)}",
+        notebook.picture_row(shown_pictures(result)),
+        notebook.charts(drawn),
+        notebook.facts({name: text for name, text in rows.items() if text}),
+        notebook.lines(result.warnings, "warning: "),
+    )
+
+
+def shown_pictures(result: Result) -> dict[str, np.ndarray]:
+    """{caption: (H, W, 3) in [0, 1]}: views, where there are pictures, then parameters that are maps."""
+    shown: dict[str, np.ndarray] = {}
+    for view in range(_VIEWS):
+        reference = result.pictures.get(f"view{view}/reference")
+        for what in ("reference", "initial", "result"):
+            picture = result.pictures.get(f"view{view}/{what}")
+            if picture is not None:
+                shown[f"view {view}: {'start' if what == 'initial' else what}"] = shown_image(picture, reference)
+    for key in [key for key, values in result.parameters.items() if maps.is_map(values)][:_MAPS]:
+        truth = result.truth.get(key)
+        like = result.parameters[key] if truth is None else truth
+        for what, values in (("truth", truth), ("start", result.initial[key]), ("recovered", result.parameters[key])):
+            colours = None if values is None else shown_map(values, like)
+            if colours is not None:
+                shown[f"{what}: {key}"] = colours
+    return shown
+
+
+def start_errors(result: Result) -> dict[str, float]:
+    """{key: root mean square error of the start} where the truth is known."""
+    return {
+        key: float(np.sqrt(np.mean(np.square(result.initial[key] - truth, dtype=np.float64))))
+        for key, truth in result.truth.items()
+        if key in result.initial
+    }
+
+
+def _told(result: Result) -> str:
+    words = f"{result.method or 'run'}: {result.steps} steps in {formatting.duration(result.seconds)}"
+    before = start_errors(result)
+    last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
+    if before and last:
+        first, now = np.mean(list(before.values())), np.mean(list(last.values()))
+        words += f", parameter error {formatting.number(float(first))} → {formatting.number(float(now))}"
+    return f"{words}, {result.status}"
+
+
+def _image_error(result: Result) -> str:
+    parts = [
+        formatting.with_error(*result.image_errors[name])
+        for name in ("view0/initial", "view0/result")
+        if name in result.image_errors
+    ]
+    return " → ".join(parts) + " (view 0, root mean square, noise removed)" if parts else ""

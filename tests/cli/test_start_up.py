@@ -1,0 +1,74 @@
+"""What a command imports before it says its first word."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import unrender
+
+PROGRAM = """
+import sys
+from unrender.cli.main import main
+assert main({arguments!r}) == 0
+print(*sorted({{name.partition(".")[0] for name in sys.modules}}))
+"""
+WHEN_NEEDED = """
+import sys
+import unrender.cli.execute, unrender.runs.live
+from unrender import gallery
+from unrender.methods import methods
+gallery.names(), methods()
+print(*sorted(sys.modules))
+"""
+
+
+def imported(code: str) -> set[str]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(unrender.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_the_version_costs_no_imports() -> None:
+    assert not imported(PROGRAM.format(arguments=["--version"])) & {
+        "numpy",
+        "mitsuba",
+        "drjit",
+        "typer",
+        "rich",
+        "pydantic",
+    }
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]])
+def test_help_costs_few_imports(arguments: list[str]) -> None:
+    assert not imported(PROGRAM.format(arguments=arguments)) & {
+        "numpy",
+        "mitsuba",
+        "drjit",
+        "scipy",
+        "matplotlib",
+        "PIL",
+        "jinja2",
+    }
+
+
+def test_a_run_imports_what_its_end_needs_at_its_end() -> None:
+    needed = imported(WHEN_NEEDED)
+    late = {
+        "matplotlib",
+        "scipy.stats",
+        "scipy.optimize",
+        "scipy.fft",
+        "skimage",
+        "jinja2",
+        "uvicorn",
+        "unrender.report",
+    }
+    assert not needed & late

@@ -1,0 +1,87 @@
+"""The user's cache folder: where it lies, how large it grows, and what happens where it cannot be."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from unrender.backend import cache
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def fill(folder: Path, *ages: float) -> None:
+    for number, age in enumerate(ages):
+        path = folder / f"{number}.bin"
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
+
+
+def test_a_part_is_made_for_its_user_alone(place: Path) -> None:
+    assert cache.folder(cache.REFERENCES) == place / "references"
+    assert (place / "references").stat().st_mode & 0o077 == 0
+
+
+def test_the_default_is_the_system_s_place_for_caches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv(cache.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    root = cache.root()
+    assert root is not None
+    assert root.name == "unrender"
+    assert root.is_relative_to(tmp_path)
+
+
+def test_an_empty_variable_or_a_bypass_switches_it_off(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with cache.bypassed():
+        assert cache.folder(cache.REFERENCES) is None
+    assert cache.folder(cache.REFERENCES) is not None
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, "")
+    assert cache.folder(cache.REFERENCES) is None
+    assert cache.size(cache.REFERENCES) == 0
+
+
+def test_a_place_that_cannot_be_made_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, str(tmp_path / "file" / "cache"))
+    monkeypatch.delenv("DRJIT_CACHE_DIR", raising=False)
+    assert cache.folder(cache.KERNELS) is None
+    cache.use_for_kernels()
+    assert "DRJIT_CACHE_DIR" not in os.environ
+
+
+def test_what_was_used_longest_ago_goes_first(place: Path) -> None:
+    folder = cache.folder(cache.KERNELS)
+    assert folder is not None
+    fill(folder, 30, 10, 20)
+    assert cache.size(cache.KERNELS) == 300
+    cache.trim(folder, 200)
+    assert sorted(path.name for path in folder.iterdir()) == ["1.bin", "2.bin"]
+
+
+def test_it_is_tidied_once_a_day(place: Path) -> None:
+    folder = cache.folder(cache.KERNELS)
+    assert folder is not None
+    cache.tidy(folder, 100)
+    fill(folder, 1, 2)
+    cache.tidy(folder, 100)
+    assert (folder / "1.bin").exists()
+    os.utime(folder / cache._STAMP, (1e9, 1e9))
+    cache.tidy(folder, 100)
+    assert not (folder / "1.bin").exists()
+
+
+def test_dr_jit_keeps_its_kernels_there_unless_told_otherwise(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_CACHE_DIR", "elsewhere")
+    cache.use_for_kernels()
+    assert os.environ["DRJIT_CACHE_DIR"] == "elsewhere"
+    monkeypatch.delenv("DRJIT_CACHE_DIR")
+    cache.use_for_kernels()
+    assert os.environ["DRJIT_CACHE_DIR"] == str(place / "kernels")
+    monkeypatch.delenv("DRJIT_CACHE_DIR")

@@ -1,0 +1,84 @@
+"""Errors of noisy pictures without their noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from unrender.core.errors import InputError
+from unrender.display import formatting
+from unrender.evaluation import debiased
+
+RUNS = 400
+
+
+def pictures(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] = (12, 10, 3)) -> list[np.ndarray]:
+    """Two noisy pictures whose channels are correlated, as those of paths are."""
+    shared = rng.gamma(0.5, size=(2, *shape[:2], 1)) - 0.5  # skewed
+    return list(sigma * (shared + 0.3 * rng.standard_normal((2, *shape))))
+
+
+@pytest.mark.parametrize("sigma", [0.05, 1.0])
+def test_the_mean_square_is_unbiased_and_its_standard_error_right(sigma: float) -> None:
+    rng = np.random.default_rng(1)
+    difference = rng.uniform(-0.4, 0.5, (12, 10, 3))
+    truth = float(np.mean(difference**2))
+    squares, errors, naive = [], [], []
+    for _ in range(RUNS):
+        first, second = (difference + noise for noise in pictures(rng, sigma))
+        product = float(np.mean(first * second))
+        value, error = debiased.rmse(first, second, np.zeros_like(first))
+        squares.append(product)
+        naive.append(float(np.mean(((first + second) / 2) ** 2)))
+        if value**2 > 2 * error * 2 * value:
+            assert value == pytest.approx(math.sqrt(product))
+            errors.append(error * 2 * value)
+        else:
+            errors.append(error**2 / 2)
+    spread = np.std(squares) / math.sqrt(RUNS)
+    assert abs(np.mean(squares) - truth) < 4 * spread
+    # The error bar agrees with the spread over runs: its mean square is the variance of the estimate.
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(squares), rel=0.25)
+    assert np.mean(naive) - truth > 0.4 * sigma**2 * 0.5 * 0.5  # the picture's own noise would be called error
+
+
+def test_pure_noise_is_below_a_bound_and_not_a_number() -> None:
+    rng = np.random.default_rng(3)
+    first, second = pictures(rng, 0.5)
+    value, error = debiased.rmse(first, second, np.zeros((12, 10, 3)))
+    assert formatting.with_error(value, error).startswith("below 0.")
+    assert math.hypot(value, error) < 0.35 < math.sqrt(0.5) * 0.5 * 1.1
+
+
+def test_pictures_without_noise_have_their_plain_error() -> None:
+    picture = np.full((2, 3, 3), 0.5)
+    assert debiased.rmse(picture, picture, np.zeros_like(picture)) == (0.5, 0.0)
+    assert debiased.rmse(picture, picture, picture) == (0.0, 0.0)
+
+
+def test_what_is_not_finite_is_infinitely_wrong_and_sizes_must_agree() -> None:
+    picture = np.full((2, 2, 3), np.nan)
+    assert debiased.rmse(picture, picture, np.zeros((2, 2, 3))) == (math.inf, math.inf)
+    with pytest.raises(InputError, match="one size"):
+        debiased.rmse(picture, picture, np.zeros((2, 3, 3)))
+
+
+def test_the_mean_over_views() -> None:
+    assert debiased.mean([(1.0, 0.3), (3.0, 0.4)]) == pytest.approx((2.0, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.21234, 0.00361, "0.2123 ± 0.0036"), (1.5, 0.0, "1.5"), (0.0, 0.02, "below 0.02"), (0.03, 0.04, "below 0.05"),
+        (math.inf, math.inf, "∞"), (123.4, 1.2, "123.4 ± 1.2"),
+    ],
+)  # fmt: skip
+def test_values_with_their_errors_in_words(value: float, error: float, text: str) -> None:
+    assert formatting.with_error(value, error) == text
+
+
+def test_phases_in_words() -> None:
+    assert formatting.phases({"loading": 2.123, "page": 0.01, "steps": 83.0}) == "loading 2.1 s, steps 1 min 23 s"

@@ -1,0 +1,103 @@
+"""Final pictures: how long they take, what is said of their errors, and where the time of a run goes."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unrender import optimizers
+from unrender.core import phases
+from unrender.estimators.path import PathGradient
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import final_images
+from unrender.runs.metadata import RunAnnotations
+from unrender.runs.optimize import optimize
+from unrender.runs.phase_times import RUN_PHASES
+from unrender.runs.result import Result
+
+SHAPE = (16, 16)
+
+
+def problem(noise: float = 0.3, views: int = 1) -> Problem:
+    rng = np.random.default_rng(0)
+    truth = {"wall": np.full(3, 0.5)}
+    renderer = AnalyticRenderer(truth, rng.random((16 * 16 * 3, 3)), 0.1, noise, shape=SHAPE, sensors=views)
+    given = [View(renderer.exact(truth), sensor=view) for view in range(views)]
+    return Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], given, truth=truth)
+
+
+def run(made: Problem, **options: object) -> Result:
+    return optimize(made, PathGradient(), optimizers.Adam(0.02), 5, **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_error_of_a_picture_is_told_without_its_noise() -> None:
+    made = problem(noise=20.0)
+    values = {"wall": np.full(3, 0.45, np.float32)}
+    result = Result(values, {"wall": np.full(3, 0.4, np.float32)}, [], 1.0, 0.0, "steps")
+    found = final_images.render_final_images(made, result, 64)
+    renderer = made.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    for which, point in (("initial", result.initial), ("result", values)):
+        truth = float(np.sqrt(np.mean((renderer.exact(point) - made.views[0].reference) ** 2)))  # pyright: ignore[reportOperatorIssue]
+        value, error = found.errors[f"view0/{which}"]
+        with_noise = float(np.sqrt(np.mean((found.pictures[f"view0/{which}"] - made.views[0].reference) ** 2)))  # pyright: ignore[reportOperatorIssue]
+        assert with_noise > 2 * truth  # what the headline used to say
+        assert value <= truth + 4 * error
+        assert value + 4 * error >= truth
+
+
+def test_one_sample_has_no_halves() -> None:
+    made = problem()
+    found = final_images.render_final_images(made, run(made), 1)
+    assert found.errors == {}
+    assert set(found.pictures) == {"view0/reference", "view0/initial", "view0/result"}
+
+
+@pytest.mark.parametrize(("seconds", "views"), [(30.0, 1), (30.0, 8), (0.1, 8)])
+def test_final_pictures_take_a_tenth_of_the_time(seconds: float, views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, now, per_path, asked = problem(views=views), [0.0], 2e-4, []
+
+    def render(problem, values, view, spp, seed=0):
+        del problem, values, seed
+        now[0] += spp * 256 * per_path + (20.0 if not asked else 0.0)  # the first time, kernels are compiled
+        asked.append((view, spp))
+        return np.zeros((*SHAPE, 3), np.float32)
+
+    monkeypatch.setattr(final_images, "render", render)
+    monkeypatch.setattr(final_images.time, "perf_counter", lambda: now[0])
+    values = {"wall": np.full(3, 0.4, np.float32)}
+    found = final_images.render_final_images(made, Result(values, values, [], seconds, 0.0, "steps"))
+    allowed = max(seconds / 10, 1.0)
+    taken = 2 * views * found.spp * 256 * per_path
+    assert found.spp & (found.spp - 1) == 0
+    assert taken <= allowed or found.spp == 2
+    assert 2 * taken > max(0.08 * seconds, 1.0) or found.spp == 512
+    assert {view for view, _ in asked} == set(range(views))
+
+
+def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:
+    class Slow(phases.Stopwatch):
+        pass
+
+    watch = Slow()
+    annotations = RunAnnotations(phases={"loading": 1.5})
+    with phases.listening(watch):
+        started = time.perf_counter()
+        result = run(problem(), run_directory=tmp_path / "run", annotations=annotations)
+        whole = time.perf_counter() - started
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert list(record["phases"]) == ["loading", *RUN_PHASES]
+    assert record["phases"]["steps"] == pytest.approx(result.seconds, abs=1e-3)
+    own = sum(seconds for name, seconds in result.phases.items() if name != "loading")
+    assert own <= whole
+    assert own > 0.5 * whole
+    assert list(watch.seconds) == ["compiling", "final pictures"]
+    assert set(record["image_errors"]) == {"view0/initial", "view0/result"}
+    assert all(len(pair) == 2 for pair in record["image_errors"].values())
