@@ -10,7 +10,8 @@ Kills: `run`, `resume`, `compare` and `export`, each killed (SIGKILL) at file op
 does, then done again or resumed. Run folders must end with the same bits, exports must be the old or the new one at the
 instant of the kill, and nothing may be left over.
 
-Cost: the time that flushing takes in a run, by method, as a share of the run's wall time from its first step to its end.
+Cost: the time that flushing takes in a run, from its folder's first file to its last, as a share of the time of
+optimization.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ def table(record: Record) -> str:
     ]
     kills = [[name, e["operations"], e["killed"], e["right"]] for name, e in record["kills"].items()]
     cost = [
-        [name, e["problem"], f"{e['wall_seconds']:.1f}", e["flushes"], f"{e['flush_seconds']:.2f}", f"{e['share']:.2%}"]
+        [name, e["problem"], f"{e['seconds']:.1f}", e["flushes"], f"{e['flush_seconds']:.2f}", f"{e['share']:.2%}"]
         for name, e in record["cost"].items()
     ]
     parts = [

@@ -87,6 +87,16 @@ def test_a_folder_that_cannot_be_flushed_is_no_error(tmp_path: Path, monkeypatch
         files.sync_folder(tmp_path)
 
 
+def test_a_folder_below_or_in_place_of_a_file_is_the_system_s_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError):
+        files.make_folder(tmp_path / "file" / "folder")
+    with pytest.raises(FileExistsError):
+        files.make_folder(tmp_path / "file")
+    files.make_folder(tmp_path / "a" / "b" / "c")
+    files.make_folder(tmp_path / "a" / "b" / "c")
+
+
 # ---------------------------------------------------------------------- after a kill
 
 

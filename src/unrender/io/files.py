@@ -123,10 +123,9 @@ def flush(descriptor: int) -> None:
 
 def make_folder(folder: Path, durable: bool = True) -> None:
     """Make a folder, and those above it that are missing, on the disk unless `durable` is false. Raises `OSError`."""
-    missing = []
-    while not folder.is_dir():
-        missing.append(folder)
-        folder = folder.parent
+    missing = [] if folder.is_dir() else [folder]
+    while missing and not os.path.lexists(missing[-1].parent):
+        missing.append(missing[-1].parent)
     for path in reversed(missing):
         path.mkdir(exist_ok=True)
         if durable:

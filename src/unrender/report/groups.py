@@ -99,8 +99,8 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     for run in runs:
         who = f"{run.record.method}, seed {run.record.seed}"
         notices += [f"{who}: {line}" for line in run.record.warnings]
-        if run.record.status in ("interrupted", "failed"):
-            notices.append(f"{who}: {run.record.status} after {run.record.seconds:.3g} s.")
+        ends = {run.record.status, run.record.stopped} & {"interrupted", "failed"}
+        notices += [f"{who}: {end} after {run.record.seconds:.3g} s." for end in sorted(ends)]
     return list(dict.fromkeys(notices))
 
 

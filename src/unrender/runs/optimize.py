@@ -64,8 +64,8 @@ def optimize(
         callbacks: listeners.
         run_directory: the run folder: history and checkpoints as the run goes, the result with final pictures of every view at its end; in
             place of an earlier run's. `resume` continues a run that ended early. None for no run folder.
-        checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a fiftieth of the time. There
-            is one at the end, too.
+        checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a hundredth of the time.
+            There is one at the end, too.
         annotations: what else the run folder should say.
         progress: whether to show a bar; None does so in notebooks.
 

@@ -53,7 +53,7 @@ _FILES = (
     *(REPORT, CONTROL),
 )
 _STEPS, _MOST_SECONDS = 50, 60.0
-_SHARE = 1 / 50
+_SHARE = 1 / 100
 _CHECK_SECONDS = 1.0
 _EXPORT = "scene"
 
@@ -72,7 +72,7 @@ class RunWriter(Hook):
         problem: what is run.
         method: method.toml, see `method_file`.
         checkpoint_every: steps between checkpoints; None for 50 or so: fewer than 50 where they take over a minute, more where writing
-            would cost more than a fiftieth of the run's time.
+            would cost more than a hundredth of the run's time.
         final_spp: samples per pixel of the final pictures; None chooses.
         warn: called with each thing that goes wrong, one line.
     """
