@@ -7,11 +7,11 @@ import math
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from unrender.backend import cache, variant
 from unrender.cli import doctor
 from unrender.core.errors import VariantError
+from unrender.display.terminal import Console
 
 
 @pytest.fixture(autouse=True)

@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 import unrender as ur
 from unrender.cli import arguments
 from unrender.core import phases
+from unrender.display.terminal import Console
 from unrender.gallery import specification
 from unrender.runs.progress import Progress
 
