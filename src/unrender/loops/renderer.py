@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.core import arrays, frameworks
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree, add, numpy
 from unrender.images.base import ImageEstimator
@@ -261,6 +262,7 @@ class Renderer:
 
     # ------------------------------------------------------------------ the two passes
 
+    @exclusive("Renderer")
     def _render(self, values: Any, sensor: int | None) -> tuple[Given, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
         given = self._exchange.read(values)
         parameters = self._exchange.tree(given)
@@ -275,6 +277,7 @@ class Renderer:
         self._last = given.detached(), done
         return given, done, tuple(images)
 
+    @exclusive("Renderer")
     def _backward(self, done: list[tuple[Stream, Rendered]], derivatives: Sequence[Any]) -> Tree:
         total: Tree | None = None
         self._variances = []
