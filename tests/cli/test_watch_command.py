@@ -70,6 +70,7 @@ def status(url: str) -> int:
         return error.code
 
 
+@pytest.mark.slow
 def test_a_browser_sees_a_run_move_pauses_resumes_and_stops_it(problem: Path, mitsuba_variant: str):
     """Also: nothing is loaded from elsewhere, and no script but the page's own runs."""
     folder = problem.parent

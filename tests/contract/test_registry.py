@@ -80,7 +80,8 @@ def test_every_public_component_is_registered(kind: str) -> None:
     if told.in_tables and kind != "estimator":
         exported = vars(importlib.import_module(told.package))
         public = {name for name in exported["__all__"] if hasattr(exported[name], "__dataclass_fields__")}
-        assert public <= set(found)
+        # A function has no table: whoever gives one gives it again when a run is resumed.
+        assert public - {"FunctionLoss"} <= set(found)
     assert {"PathGradient", "MetaEstimator", "SmoothedDerivatives", "LossValues"} <= set(
         registry.components("estimator")
     )

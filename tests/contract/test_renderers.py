@@ -31,6 +31,13 @@ def without_media(names: Iterable[str]) -> list[Any]:
     return quick(names, *(name for name in names if name != "medium"))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def renderers_go() -> Iterator[None]:
+    """See `no_scene_outlives_its_file`."""
+    yield
+    Backend.renderer.cache_clear()
+
+
 SPACES: tuple[Space, ...] = ("path", "primary")
 SPP = 64
 """Of most requests: kernels are compiled for it."""

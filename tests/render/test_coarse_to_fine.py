@@ -186,7 +186,7 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         assert new.parameters is not None
         assert old.parameters is not None
         if name == "coupled":
-            assert new.parameters[KEY] is image.parameters[KEY]
+            np.testing.assert_array_equal(new.parameters[KEY], image.parameters[KEY])
         a, b = new.elements[KEY], old.elements[KEY]
         lengths = [
             float(np.linalg.norm(here - there))

@@ -16,7 +16,6 @@ from unrender.backend import cache, variant
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.io import files
 
 if TYPE_CHECKING:
     from unrender.problem.problem import Problem
@@ -199,6 +198,8 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
                 raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
                 raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
+        from unrender.io import files  # NumPy with it
+
         files.make_folder(given)
     except OSError as error:
         raise InputError(f"--out {given}: {error.strerror or error}") from error
