@@ -82,7 +82,7 @@ class NotebookBar:
             self._put(escape(text))
 
     def _put(self, html: str) -> None:
-        from IPython.display import HTML, display
+        from IPython.display import HTML, display  # pyright: ignore[reportMissingImports]
 
         body = f'<div style="font-family:system-ui,sans-serif;font-size:13px">{html}</div>' if html else ""
         if self._handle is None:
