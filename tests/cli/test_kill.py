@@ -178,6 +178,7 @@ def test_some_are_killed(killer: Killer, tmp_path: Path) -> None:
     kill_analytic(killer, tmp_path, 5, seed=1)
 
 
+@pytest.mark.slow
 def test_one_command_is_killed(tmp_path: Path) -> None:
     kill_commands(tmp_path, 1, seed=2)
 

@@ -107,6 +107,7 @@ def test_a_camera_behind_the_walls_of_a_room_in_a_medium_is_found() -> None:
     assert inside_of(description) == [True]
 
 
+@pytest.mark.slow
 def test_a_camera_inside_renders_the_same_told_or_found() -> None:
     """To the bit, image and gradient; it was black for a medium that emits."""
     images, gradients = [], []
@@ -148,7 +149,8 @@ def test_cameras_in_different_media_share_a_launch(medium: Any) -> None:
         assert image[chosen].mean() == pytest.approx(alone[chosen].mean(), rel=0.1)
 
 
-@pytest.mark.parametrize("part", quick(["emission", "sigma_t"], "sigma_t"))
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["emission", "sigma_t"])
 def test_adaptive_pixels_inside_a_medium_that_emits(part: str) -> None:
     """Without any other emitter, and with cameras inside and outside; forward mode failed on the extinction."""
     cameras = {"inside": camera(INSIDE), "outside": camera(OUTSIDE)}
