@@ -16,7 +16,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -74,11 +73,11 @@ def previous_pages(page: Path) -> Iterator[Path]:
 
 
 class Runner:
-    """Runs the blocks of one page, in the current folder. Python blocks share a namespace."""
+    """Runs the blocks of one page, in the current folder. Python blocks share the namespace of `module`, which whoever runs them adds to
+    `sys.modules`, where checkpoints look for the classes of states."""
 
     def __init__(self, name: str, output: Any):
         self.module = types.ModuleType(f"page_{re.sub(r'[^a-z]', '_', name)}")
-        sys.modules[self.module.__name__] = self.module  # where checkpoints look for the classes of states
         self.output = output
 
     def run(self, block: Block) -> None:

@@ -8,6 +8,7 @@ import importlib
 import itertools
 import pkgutil
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,8 @@ def test_every_block_of_a_page_is_true(
         monkeypatch.setattr(registry, "_state_modules", set(registry._state_modules))
     for each in itertools.chain(previous_pages(page), [page]):  # one after the other: what comes between is done, too
         runner = Runner(each.stem, capsys.readouterr)
+        # What a page makes goes with it: scenes whose parameters have gradients would be seen by the kernels of other tests.
+        monkeypatch.setitem(sys.modules, runner.module.__name__, runner.module)
         for block in blocks(each):
             runner.run(block)
 
