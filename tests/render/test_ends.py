@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from callbacks import At
 
 import unrender as ur
 from unrender.core.errors import InputError
@@ -22,17 +23,6 @@ from unrender.runs.folder.history import HistoryReader, read_records, steps_in, 
 from unrender.runs.folder.state import Packed, not_finite
 
 RATE = "rate"
-
-
-class At(ur.Callback):
-    """Does something after a number of steps."""
-
-    def __init__(self, step: int, what: Any):
-        self.step, self.what = step, what
-
-    def on_step(self, run, record):
-        if run.step == self.step:
-            self.what(run)
 
 
 def start(

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from callbacks import At
 
 import unrender as ur
 from unrender.core.errors import InputError
@@ -34,17 +35,6 @@ def start(folder: Path, steps: int = 12, every: int | None = 2, callbacks: Any =
     return ur.optimize(
         problem, ur.PathGradient(spp=2), optimizer, steps, None, 0, callbacks, folder, checkpoint_every=every, **options
     )
-
-
-class At(ur.Callback):
-    """Does something once, after a number of steps."""
-
-    def __init__(self, step: int, what: Any):
-        self.step, self.what = step, what
-
-    def on_step(self, run, record):
-        if run.step == self.step:
-            self.what(run)
 
 
 def names(folder: Path) -> list[str]:
