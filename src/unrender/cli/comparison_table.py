@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.markup import escape
 from rich.table import Table
 
+from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.evaluation.metrics import has_flip
@@ -37,8 +38,8 @@ def show(console: Console, comparison: Comparison) -> None:
 
 
 def plain(text: str) -> str:
-    """Text of a run folder, without marks for rich and without what a terminal would obey."""
-    return escape("".join(letter if letter.isprintable() else "\ufffd" for letter in text))
+    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
+    return escape(visible(text))
 
 
 def _table(*headings: str) -> Table:

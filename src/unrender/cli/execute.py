@@ -15,6 +15,7 @@ from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.evaluation import debiased
 from unrender.methods import Method
+from unrender.problem.notebook import describe_views
 from unrender.problem.problem import Problem
 from unrender.runs import advice
 from unrender.runs.final_images import image_name
@@ -96,9 +97,7 @@ def image_error(result: Result, which: str = "result") -> str:
 
 def introduce(console: Console, problem: Problem, variant: str) -> None:
     """What is about to be recovered, and what was done to the input."""
-    sizes = {np.asarray(view.reference).shape[1::-1] for view in problem.views}
-    size = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
-    views = f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"
+    views = describe_views(problem)
     keys = ", ".join(parameter.key for parameter in problem.parameters)
     console.print(f"[bold]{escape(problem.name)}[/]: {escape(keys)} from {views}, on {variant}", soft_wrap=True)
     for notice in problem.notices:

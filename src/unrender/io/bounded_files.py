@@ -34,7 +34,6 @@ __all__ = [
     "open_regular",
     "parse_json",
     "parse_object",
-    "printable",
     "read_array",
     "read_arrays",
     "read_bytes",

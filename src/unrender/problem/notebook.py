@@ -12,7 +12,7 @@ from unrender.display.pictures import shown_image, shown_map
 if TYPE_CHECKING:
     from unrender.problem.problem import Problem
 
-__all__ = ["html", "line"]
+__all__ = ["describe_views", "html", "line"]
 
 _VIEWS, _MAPS = 4, 3
 
@@ -22,7 +22,7 @@ def line(problem: Problem) -> str:
     shapes = problem.shapes()
     keys = [f"{key} {shapes[key]}" for key in shapes]
     more = [f"and {len(keys) - 3} more"] if len(keys) > 3 else []
-    return f"Problem({problem.name!r}: {', '.join([*keys[:3], *more])}; {_views(problem)}; {_loss(problem)})"
+    return f"Problem({problem.name!r}: {', '.join([*keys[:3], *more])}; {describe_views(problem)}; {_loss(problem)})"
 
 
 def html(problem: Problem) -> str:
@@ -44,13 +44,14 @@ def html(problem: Problem) -> str:
         about += [f"learning rate {problem.learning_rates[key]:g}"] if key in problem.learning_rates else []
         about += [f"{problem.preconditioners[key]!r:.80}"] if key in problem.preconditioners else []
         rows[key] = ", ".join(about)
-    title = f"Problem {problem.name}: {_views(problem)}, {_loss(problem)}, up to {problem.max_depth} segments"
+    title = f"Problem {problem.name}: {describe_views(problem)}, {_loss(problem)}, up to {problem.max_depth} segments"
     return notebook.block(
         title, notebook.picture_row(shown), notebook.facts(rows), notebook.lines(problem.notices, "note: ")
     )
 
 
-def _views(problem: Problem) -> str:
+def describe_views(problem: Problem) -> str:
+    """How many views there are, and of which sizes: 2 views of 128x128."""
     sizes = sorted({np.asarray(view.reference).shape[1::-1] for view in problem.views})
     size = ", ".join(f"{width}x{height}" for width, height in sizes)
     return f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files
+from unrender.core.text import printable
 from unrender.report.html import flatten
 from unrender.runs.folder.reader import RunFolder
 
@@ -63,7 +63,7 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
             raise InputError(f"{run.path / 'history.jsonl'}: no step was taken, there is nothing to compare")
         for key in run.parameters.keys() ^ first.parameters.keys():
             raise InputError(
-                f"{run.path}: another problem than {first.path}: only one of them recovers {bounded_files.printable(key)}"
+                f"{run.path}: another problem than {first.path}: only one of them recovers {printable(key)}"
             )
         for view in run.views.keys() | first.views.keys():
             sizes = [of.views[view].reference.shape[:2] if view in of.views else None for of in (first, run)]
@@ -81,7 +81,7 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
         for key in run.truth.keys() & first.truth.keys():
             if _relative_difference(run.truth[key], first.truth[key]) > _TOLERANCE:
                 raise InputError(
-                    f"{run.path}: another problem than {first.path}: {bounded_files.printable(key)} has another true value"
+                    f"{run.path}: another problem than {first.path}: {printable(key)} has another true value"
                 )
     records = [run.record for run in runs]
     for what, values in {

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.text import printable
 from unrender.io import bounded_files, files
 from unrender.runs.folder.schema import HISTORY_AXES, HISTORY_COLUMNS
 
@@ -155,7 +156,7 @@ def read_records(path: Path, folder: Path) -> tuple[list[dict[str, Any]], str]:
                 return found, str(error)
             step = record.get("step") if isinstance(record, dict) else None
             if type(step) is not int or step < steps_in(found):
-                shown = bounded_files.printable(line.decode(errors="replace").strip()[:60])
+                shown = printable(line.decode(errors="replace").strip()[:60])
                 return found, f"{where}: expected the record of step {steps_in(found)} or a later one, got {shown}"
             found.append(record)
     if len(line) > LARGEST_LINE:
@@ -280,8 +281,7 @@ class HistoryReader:
         if not isinstance(errors, dict):
             raise InputError(f"{where}: parameter_error: expected an object {{key: number}}, got {_short(errors)}")
         values = {
-            key: _number(value, f"{where}: parameter_error.{bounded_files.printable(key)}", False)
-            for key, value in errors.items()
+            key: _number(value, f"{where}: parameter_error.{printable(key)}", False) for key, value in errors.items()
         }
         for name, column in self._columns.items():
             column.append(found[name])
@@ -314,4 +314,4 @@ def _number(value: Any, where: str, required: bool) -> float:
 
 
 def _short(value: Any) -> str:
-    return bounded_files.printable(repr(value)) if value is not None else "nothing"
+    return printable(repr(value)) if value is not None else "nothing"

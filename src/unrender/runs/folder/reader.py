@@ -13,8 +13,8 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
+from unrender.core.text import printable
 from unrender.io import bounded_files
-from unrender.io.bounded_files import printable
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.schema import RunRecord

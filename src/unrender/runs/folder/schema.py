@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, Validat
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.io.bounded_files import printable
+from unrender.core.text import printable
 
 __all__ = [
     "COMMANDS",
