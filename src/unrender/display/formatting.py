@@ -60,6 +60,7 @@ def with_error(value: float, error: float) -> str:
     return f"{value:.{places}f} ± {error:.{places}f}"
 
 
-def phases(seconds: Mapping[str, float], least: float = 0.05) -> str:
-    """Where time went: "loading 2.1 s, steps 30 s"; phases shorter than `least` seconds are left out."""
+def phases(seconds: Mapping[str, float]) -> str:
+    """Where time went: "loading 2.1 s, steps 30 s"; phases shorter than 0.05 s are left out, unless they are a hundredth of all."""
+    least = min(0.05, 0.01 * sum(seconds.values()))
     return ", ".join(f"{name} {duration(float(f'{spent:.2g}'))}" for name, spent in seconds.items() if spent >= least)
