@@ -67,7 +67,7 @@ CheckpointEvery = Annotated[
 FinalSpp = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Samples per pixel of the final pictures. Default: as many as a tenth of the time allows."
+        min=1, help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows."
     ),
 ]
 

@@ -19,8 +19,8 @@ __all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"
 
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
-_SHARE, _LEAST_SECONDS = 0.08, 1.0
-"""Of the time of the steps, what final pictures may take, but a second at least: with the trial and what is written, under a tenth."""
+_SHARE, _LEAST_SECONDS = 0.05, 1.0
+"""Of the time of the steps, what final pictures may take, but a second at least."""
 _TRIAL_PATHS = 1 << 18
 
 _SEEDS = {"initial": 1, "result": 2}
@@ -56,7 +56,7 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
     Args:
         problem: what was run.
         result: its outcome.
-        spp: samples per pixel. None for as many as a tenth of the time of the run's steps allows, or one second where that is longer, but
+        spp: samples per pixel. None for as many as a twentieth of the time of the run's steps allows, or one second where that is longer, but
             no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
