@@ -57,9 +57,12 @@ class Plan:
 
 def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came."""
-    estimator, optimizer = plan.method.start(plan.settings)
-    options = plan.method.configure(plan.settings).model_dump()
-    settings = {"options": options, "problem_options": dict(plan.problem_settings)}
+    estimator, optimizer = plan.method.start(plan.settings, plan.problem)
+    options = plan.method.configure(plan.settings)
+    reasons = options.reasons(plan.problem)
+    for line in reasons:
+        console.print(f"{plan.method.name}: {escape(line)}", soft_wrap=True)
+    settings = {"options": options.model_dump(), "problem_options": dict(plan.problem_settings), "choices": reasons}
     settings = {name: value for name, value in settings.items() if value}
     for line in advice.remarks(plan.problem, optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)

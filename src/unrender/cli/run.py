@@ -35,7 +35,9 @@ __all__ = ["conclude", "exit_status", "run"]
 def run(
     context: typer.Context,
     problem: ProblemName,
-    method_name: Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")] = "rcv",
+    method_name: Annotated[
+        str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")
+    ] = "auto",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),

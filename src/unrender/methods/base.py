@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
+from unrender.problem.problem import Problem
 from unrender.schedules.functions import Schedule
 
 __all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parse_schedule"]
@@ -32,6 +33,16 @@ class Options(BaseModel):
     def build(self) -> tuple[Estimator, Optimizer]:
         """Estimator and optimizer with these options. Raises `InputError` for options that do not go together."""
         raise NotImplementedError(f"{type(self).__name__} has no build")
+
+    def build_for(self, problem: Problem) -> tuple[Estimator, Optimizer]:
+        """What `build` makes, chosen to suit a problem. Methods that look at no problem make the same for all."""
+        del problem
+        return self.build()
+
+    def reasons(self, problem: Problem) -> list[str]:
+        """What `build_for` has chosen and why, one line each; [] for methods that choose nothing."""
+        del problem
+        return []
 
 
 @dataclass(frozen=True)
@@ -77,11 +88,13 @@ class Method:
         choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
         return " or ".join(choices)
 
-    def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
-        """Estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
+    def start(
+        self, settings: Mapping[str, Any] | None = None, problem: Problem | None = None
+    ) -> tuple[Estimator, Optimizer]:
+        """Estimator and optimizer with `settings` in place of defaults, to suit the problem where it is given. Raises `InputError`."""
         options = self.configure(settings or {})
         try:
-            return options.build()
+            return options.build() if problem is None else options.build_for(problem)
         except InputError as error:
             raise InputError(f"method {self.name}: {error}") from error
 

@@ -8,6 +8,7 @@ from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.optimizers.newton import Newton
 from unrender.optimizers.newton_cg import NewtonCG
+from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.optimizers.sgd import SGD
 
-__all__ = ["CMAES", "LBFGS", "SGD", "Adam", "MetaAdam", "Newton", "NewtonCG", "Optimizer", "schedules"]
+__all__ = ["CMAES", "LBFGS", "SGD", "Adam", "MetaAdam", "Newton", "NewtonCG", "Optimizer", "ScheduleFree", "schedules"]

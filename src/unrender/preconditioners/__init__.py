@@ -2,5 +2,6 @@
 
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.large_steps import LargeSteps
+from unrender.preconditioners.sobolev import Sobolev
 
-__all__ = ["LargeSteps", "Preconditioner"]
+__all__ = ["LargeSteps", "Preconditioner", "Sobolev"]

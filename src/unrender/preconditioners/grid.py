@@ -1,4 +1,4 @@
-"""Solvers of (I + λ L) y = x on a grid, L its graph Laplacian.
+"""Solvers of (I + λ L) y = x on a grid, L its graph Laplacian, and powers of its inverse.
 
 (L x)_i is the sum of x_i − x_j over the neighbours j of cell i, one before and one after along each axis. At the
 border there is no neighbour (zero slope), or with `wrap` the cell at the other end.
@@ -11,14 +11,16 @@ transform along axes with a border and the Fourier transform along axes that wra
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     import scipy.sparse
 
-__all__ = ["CholeskySolver", "Solver", "TransformSolver", "laplacian", "solver"]
+from unrender.core.errors import InputError
+
+__all__ = ["CholeskySolver", "Solver", "TransformSolver", "check", "laplacian", "solver", "square_root_solver", "wraps"]
 
 
 class Solver(Protocol):
@@ -51,9 +53,9 @@ class CholeskySolver:
 
 
 class TransformSolver:
-    """By the transform in which L is diagonal: n log n, nothing to factorise."""
+    """By the transform in which L is diagonal: n log n, nothing to factorise. Solves (I + λ L)^power y = x."""
 
-    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]):
+    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0):
         self._bordered = [axis for axis, wraps in enumerate(wrap) if not wraps]
         self._wrapped = [axis for axis, wraps in enumerate(wrap) if wraps]
         eigenvalues = np.zeros(grid)
@@ -61,7 +63,7 @@ class TransformSolver:
             turn = (2.0 if wraps else 1.0) * np.pi / size
             along = 2.0 - 2.0 * np.cos(turn * np.arange(size))
             eigenvalues += along.reshape([-1 if a == axis else 1 for a in range(len(grid))])
-        self._gain = (1.0 / (1.0 + strength * eigenvalues))[..., None].astype(np.float32)
+        self._gain = ((1.0 + strength * eigenvalues) ** -power)[..., None].astype(np.float32)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """See `Solver.solve`."""
@@ -90,6 +92,35 @@ def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> So
         wrap: per axis, whether its two ends are neighbours.
     """
     return (CholeskySolver if len(grid) <= 2 else TransformSolver)(strength, grid, wrap)
+
+
+@lru_cache(maxsize=16)
+def square_root_solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Solver:
+    """The solver of (I + λ L)^(1/2) y = x; arguments as for `solver`."""
+    return TransformSolver(strength, grid, wrap, 0.5)
+
+
+def check(owner: str, key: str, shape: tuple[int, ...], wrap: bool | tuple[bool, ...]) -> None:
+    """Raise `InputError` unless `shape` is a texture's or a grid's of more than one texel, and `wrap` has as many axes."""
+    if len(shape) not in (3, 4) or int(np.prod(shape[:-1])) < 2 or shape[-1] < 1:
+        raise InputError(
+            f"{key}: preconditioner {owner} needs a texture (H, W, C) or a grid (Z, Y, X, C) of more than one "
+            f"texel, got shape {tuple(shape)}"
+        )
+    if isinstance(wrap, tuple) and len(wrap) != len(shape) - 1:
+        raise InputError(
+            f"{key}: preconditioner {owner}: wrap must have {len(shape) - 1} entries for shape {tuple(shape)}, "
+            f"got {len(wrap)}"
+        )
+
+
+def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
+    """What a preconditioner was given for `wrap`, a list of a problem file as a tuple. Raises `InputError` for anything else."""
+    found = tuple(wrap) if isinstance(wrap, list) else wrap  # TOML gives lists, which have no hash
+    axes = found if isinstance(found, tuple) else (found,)
+    if not axes or not all(isinstance(wraps, bool) for wraps in axes):
+        raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {found!r}")
+    return found
 
 
 def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr_matrix:

@@ -7,11 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.preconditioners import grid
 
@@ -41,24 +38,11 @@ class LargeSteps:
 
     def __post_init__(self):
         checks.number("LargeSteps", "strength", self.strength, above=0.0, inclusive=True)
-        wrap = tuple(self.wrap) if isinstance(self.wrap, list) else self.wrap  # TOML gives lists, which have no hash
-        object.__setattr__(self, "wrap", wrap)
-        axes = wrap if isinstance(wrap, tuple) else (wrap,)
-        if not axes or not all(isinstance(wraps, bool) for wraps in axes):
-            raise InputError(f"LargeSteps: wrap must be true, false, or one of these per axis, got {wrap!r}")
+        object.__setattr__(self, "wrap", grid.wraps("LargeSteps", self.wrap))
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""
-        if len(shape) not in (3, 4) or int(np.prod(shape[:-1])) < 2 or shape[-1] < 1:
-            raise InputError(
-                f"{key}: preconditioner LargeSteps needs a texture (H, W, C) or a grid (Z, Y, X, C) of more than one "
-                f"texel, got shape {tuple(shape)}"
-            )
-        if isinstance(self.wrap, tuple) and len(self.wrap) != len(shape) - 1:
-            raise InputError(
-                f"{key}: preconditioner LargeSteps: wrap must have {len(shape) - 1} entries for shape {tuple(shape)}, "
-                f"got {len(self.wrap)}"
-            )
+        grid.check("LargeSteps", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
         """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""

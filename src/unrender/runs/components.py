@@ -9,14 +9,16 @@ from unrender.core.suggestions import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.methods import method, methods
 from unrender.optimizers.base import Optimizer
+from unrender.problem.problem import Problem
 
 __all__ = ["resolve", "resolve_estimator"]
 
 
-def resolve(estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
+def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
     """Both parts.
 
     Args:
+        problem: what methods choose their parts for.
         estimator: an estimator, or the name of a method, which brings its optimizer along.
         optimizer: an optimizer; None for the method's.
 
@@ -24,9 +26,9 @@ def resolve(estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
         InputError: one of them is missing or something else, such as an optimizer of Mitsuba's or PyTorch's, or a class in place of an
             object.
     """
-    chosen = resolve_estimator(estimator)
+    chosen = resolve_estimator(problem, estimator)
     if optimizer is None and isinstance(estimator, str):
-        return method(estimator).start()
+        return method(estimator).start(problem=problem)
     if optimizer is None:
         raise InputError(
             "optimize: give an optimizer, such as unrender.optimizers.Adam(learning_rate=0.01), or a method's name in place of both"
@@ -36,10 +38,10 @@ def resolve(estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
     return chosen, optimizer
 
 
-def resolve_estimator(estimator: Any, owner: str = "optimize") -> Estimator:
+def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize") -> Estimator:
     """An estimator, from itself or a method's name. Raises `InputError` for anything else."""
     if isinstance(estimator, str):
-        return method(estimator).start()[0]
+        return method(estimator).start(problem=problem)[0]
     if not _is_component(estimator, "provides", "init", "estimate"):
         names = ", ".join(methods())
         raise InputError(

@@ -56,8 +56,8 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
     Args:
         problem: what was run.
         result: its outcome.
-        spp: samples per pixel. None for as many as a twentieth of the time of the run's steps allows, or one second where that is longer, but
-            no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
+        spp: samples per pixel. None for as many as a twentieth of the time of the run's steps allows, or one second where that is longer,
+            but no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}

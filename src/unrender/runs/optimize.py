@@ -40,7 +40,7 @@ __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer
 @exclusive("optimize", long=True)
 def optimize(
     problem: Problem,
-    estimator: Estimator | str,
+    estimator: Estimator | str = "auto",
     optimizer: Optimizer | None = None,
     steps: int | None = None,
     seconds: float | None = None,
@@ -55,7 +55,8 @@ def optimize(
 
     Args:
         problem: what to recover, from which images.
-        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along.
+        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along:
+            by default the one that chooses what suits the problem.
         optimizer: what becomes of them; None for the method's.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
@@ -86,7 +87,7 @@ def optimize(
             cannot be begun, or cannot be written in the end; a run goes on in another thread.
     """
     named = estimator
-    estimator, optimizer = components.resolve(estimator, optimizer)
+    estimator, optimizer = components.resolve(problem, estimator, optimizer)
     check(estimator, optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
@@ -162,7 +163,7 @@ def estimate(
         parameters: {key: array} for all parameters of the problem, or None for the initial ones.
         seed: of its random numbers.
     """
-    estimator = components.resolve_estimator(estimator, "estimate")
+    estimator = components.resolve_estimator(problem, estimator, "estimate")
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))

@@ -1,0 +1,163 @@
+"""`auto`: what suits the problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from unrender import pixels
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.estimators.base import Estimator
+from unrender.estimators.path import PathGradient
+from unrender.images.base import ImageEstimator
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.methods.base import Options
+from unrender.methods.smoothed import SmoothedMethod
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.pixels.base import PixelSampler
+from unrender.preconditioners import Sobolev
+from unrender.problem.problem import Problem
+
+__all__ = ["AutoMethod"]
+
+_RATE = 0.1
+"""Learning rate, as a share of a parameter's range or size."""
+_SPP = {"plain": 4, "rcv": 2}
+_MOST_PIXELS = 1 << 19
+"""Of all views, that a step renders whole; where there are more, it draws half as many of them."""
+
+
+@dataclass(frozen=True)
+class _Image:
+    """What the loss sees, and why."""
+
+    name: str
+    estimator: ImageEstimator
+    reason: str
+
+
+@register(name="auto", position=0)
+class AutoMethod(Options):
+    """what suits the problem: images by its loss, smoothing for textures and grids, schedule-free Adam
+
+    For a loss whose derivative is linear in the image (L2) an independent rendering each step is unbiased, and averaging takes its
+    noise away; other losses are biased by that noise, which a recursive control variate reduces. Textures and grids move along Sobolev
+    gradients, parameters by steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it is
+    `smoothed`. Every choice can be set.
+    """
+
+    image: Literal["plain", "rcv"] | None = Field(
+        None, description="what the loss sees: a fresh rendering, or rcv's; none chooses by the loss"
+    )
+    spp: PositiveInt | None = Field(None, description="samples per pixel; none for 4 of plain images, 2 of rcv's")
+    pixels: PositiveInt | None = Field(
+        None, description="pixels a step, drawn from all views; none for all pixels, or 262144 where views are large"
+    )
+    smooth: bool = Field(True, description="whether textures and grids move along Sobolev gradients")
+    learning_rate: PositiveFloat = Field(
+        _RATE, description="first steps, as a share of a parameter's range, or of its size where the range is open"
+    )
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        """See `Options.build`: what is chosen where nothing is known of the problem."""
+        image = Plain() if self.image == "plain" else RecursiveControlVariate()
+        sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
+        spp = self.spp or _SPP[self.image or "rcv"]
+        return PathGradient(image, sampler, spp), ScheduleFree(self.learning_rate)
+
+    def build_for(self, problem: Problem) -> tuple[Estimator, Optimizer]:
+        """See `Options.build_for`."""
+        if _unreachable(problem):
+            return SmoothedMethod().build()
+        sampler, _ = self._sampler(problem)
+        image = self._image(problem, isinstance(sampler, pixels.All))
+        estimator = PathGradient(image.estimator, sampler, self.spp or _SPP[image.name])
+        keys = self._smoothed(problem)
+        rates = {"*": self.learning_rate, **_rates(problem, self.learning_rate)}
+        return estimator, ScheduleFree(rates, preconditioner=Sobolev() if keys else None, preconditioned=keys)
+
+    def reasons(self, problem: Problem) -> list[str]:
+        """See `Options.reasons`."""
+        if unreachable := _unreachable(problem):
+            return [f"derivatives of a smoothed loss (method smoothed): {unreachable}"]
+        sampler, why = self._sampler(problem)
+        image = self._image(problem, isinstance(sampler, pixels.All))
+        spp = self.spp or _SPP[image.name]
+        kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
+        found = [f"{kind}, {spp} samples per pixel: {image.reason}", *([why] if why else [])]
+        if keys := self._smoothed(problem):
+            found.append(f"Sobolev gradients of {', '.join(keys)}")
+        rates = {**_rates(problem, self.learning_rate), **problem.learning_rates}
+        found.append(
+            "schedule-free Adam, first rate " + ", ".join(f"{rate:.3g} ({key})" for key, rate in rates.items())
+        )
+        return found
+
+    def _image(self, problem: Problem, whole: bool) -> _Image:
+        if self.image == "plain":
+            return _Image("plain", Plain(), "as asked for")
+        if self.image is None and problem.loss.linear:
+            return _Image("plain", Plain(), "the derivative of the loss is linear in the image")
+        if self.image is None and not whole:
+            return _Image("plain", Plain(), "control variates need whole views")
+        space: Literal["path", "primary"] = "path"
+        try:
+            problem.renderer.prepare(list(problem.shapes()), "path")
+        except InputError:
+            space = "primary"
+        reason = "as asked for" if self.image else "noise of the image biases this loss"
+        return _Image("rcv", RecursiveControlVariate(space), reason)
+
+    def _sampler(self, problem: Problem) -> tuple[PixelSampler, str]:
+        """The pixels of a step, and why they are not all."""
+        if self.pixels is not None:
+            return pixels.Uniform(self.pixels), ""
+        count = sum(math.prod(np.shape(view.reference)[:2]) for view in problem.views)
+        if count <= _MOST_PIXELS or not problem.loss.pixelwise:
+            return pixels.All(), ""
+        drawn = _MOST_PIXELS // 2
+        return pixels.Uniform(drawn), f"{drawn} of all {count} pixels a step"
+
+    def _smoothed(self, problem: Problem) -> tuple[str, ...]:
+        """Textures and grids that have no preconditioner of their own."""
+        if not self.smooth:
+            return ()
+        return tuple(
+            key for key, shape in problem.shapes().items() if key not in problem.preconditioners and _is_map(shape)
+        )
+
+
+def _unreachable(problem: Problem) -> str:
+    """Why there are no path gradients of the parameters; "" where there are."""
+    try:
+        problem.renderer.prepare(list(problem.shapes()), None)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _is_map(shape: tuple[int, ...]) -> bool:
+    """Whether a shape is that of a texture (H, W, C) or a grid (Z, Y, X, C) with neighbours to average with."""
+    return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
+
+
+def _rates(problem: Problem, share: float) -> Mapping[str, float]:
+    """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
+    values, or the share itself where they are 0."""
+    found: dict[str, float] = {}
+    for key, value in problem.initial_values().items():
+        low, high = problem.bounds[key]
+        if low is not None and high is not None:
+            size = high - low
+        else:
+            size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
+        found[key] = share * size
+    return found

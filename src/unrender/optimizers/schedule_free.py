@@ -1,0 +1,225 @@
+"""Schedule-free Adam (Defazio et al. 2024, "The Road Less Scheduled"), with a rate that falls as far as gradients are noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from unrender.core import arrays, checks, trees
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
+from unrender.optimizers import rates
+from unrender.preconditioners.base import Preconditioner
+from unrender.problem.upsampling import SQUARES, Upsampler
+from unrender.schedules.functions import Schedule
+
+__all__ = ["ScheduleFree", "ScheduleFreeState"]
+
+_WARMUP = 5
+"""Steps over which the rate rises."""
+_DELAY = 10.0
+"""τ of the docstring, in steps."""
+_MEMORY = 0.9
+"""Decay of the mean correlation of successive gradients."""
+_PROJECTED = 1e-5
+"""Relative difference from which a parameter counts as moved by its bounds; below it, as rounded."""
+
+
+@dataclass(frozen=True)
+class ScheduleFreeState:
+    """State between steps.
+
+    Attributes:
+        step: steps made so far.
+        learning_rates: of each parameter, before schedule and decay.
+        fast: z, the iterate that takes the steps.
+        average: x, the weighted mean of z.
+        second_moment: exponentially weighted mean of the squared gradient, not debiased.
+        gradient: the last one, preconditioned.
+        correlation: {key: ρ, the mean correlation of successive gradients}.
+        log_rate: {key: logarithm of the factor that the rate has fallen by}.
+        begun: the step at which all this began.
+    """
+
+    step: int
+    learning_rates: dict[str, float]
+    fast: Tree
+    average: Tree
+    second_moment: Tree
+    gradient: Tree
+    correlation: dict[str, float]
+    log_rate: dict[str, float]
+    begun: int = 0
+
+    def upsampled(self, upsampler: Upsampler) -> ScheduleFreeState:
+        """See `Upsamplable`: iterates and moments are interpolated."""
+        return replace(
+            self,
+            fast=upsampler.tree(self.fast),
+            average=upsampler.tree(self.average),
+            second_moment=upsampler.tree(self.second_moment, SQUARES),
+            gradient=upsampler.tree(self.gradient, 1.0),
+        )
+
+    def restarted(self, fresh: ScheduleFreeState) -> ScheduleFreeState:
+        """See `Restartable`: the schedule goes on, all else begins at this step."""
+        return replace(fresh, step=self.step, begun=self.step)
+
+
+@register
+@dataclass(frozen=True)
+class ScheduleFree:
+    """Adam's steps without momentum on z, the weighted mean x of z, and gradients at a point between the two.
+
+    At step t, counted from 0, with the gradient g at the parameters y:
+
+        z ← z − η_t g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
+
+    v̂ is the debiased mean square of g, r is `averaging`: x is the mean of z with weights that grow as t^r. The parameters of a run are
+    its y, near x. An average has less noise than an iterate, and parameters that move slowly suit estimators that reuse earlier samples.
+
+    The rate needs no horizon. It rises over five steps, and then falls by
+
+        log η_{t+1} = log η_t − p (1 − ρ) / (t + 10)
+
+    with `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they agree, the
+    rate stays as it is; once they are noise it falls as t^-p.
+
+    Parameters that bounds have moved take their iterates along.
+
+    Args:
+        learning_rate: η_0, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
+        beta: β, in [0, 1).
+        beta_2: decay of the mean square, in [0, 1).
+        epsilon: ε, in units of the gradient, > 0.
+        averaging: r, >= 0.
+        decay: p, >= 0; 0 for a rate that stays.
+        schedule: a further factor of every learning rate by step; see `unrender.schedules.functions`.
+        preconditioner: S, applied to the gradients and to the steps of z of the parameters in `preconditioned`. In place of the
+            preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
+        preconditioned: keys of parameters.
+    """
+
+    learning_rate: float | Mapping[str, float] = 0.1
+    beta: float = 0.9
+    beta_2: float = 0.99
+    epsilon: float = 1e-12
+    averaging: float = 4.0
+    decay: float = 1.5
+    schedule: Schedule | None = None
+    preconditioner: Preconditioner | None = None
+    preconditioned: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        given = self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
+        if "*" not in given:
+            raise InputError('ScheduleFree: learning_rate needs the rate of the others, {"*": rate}')
+        for rate in given.values():
+            rates.check("ScheduleFree", rate, self.schedule)
+        for name in ("beta", "beta_2"):
+            checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
+        checks.number("ScheduleFree", "epsilon", self.epsilon, above=0.0)
+        checks.number("ScheduleFree", "averaging", self.averaging, above=0.0, inclusive=True)
+        checks.number("ScheduleFree", "decay", self.decay, above=0.0, inclusive=True)
+        keys = self.preconditioned
+        if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
+            raise InputError(f"ScheduleFree: preconditioned must be keys of parameters, got {keys!r}")
+        object.__setattr__(self, "preconditioned", tuple(keys))
+
+    @property
+    def requires(self) -> Capabilities:
+        """A gradient."""
+        return Capabilities(Gradient)
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ScheduleFreeState:
+        """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
+        given = self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
+        named = {key: rate for key, rate in given.items() if key != "*"}
+        own = rates.per_parameter("ScheduleFree", parameters, given["*"], {**named, **(learning_rates or {})})
+        for key in self.preconditioned:
+            if key not in parameters:
+                raise InputError(f'ScheduleFree: preconditioned: unknown parameter "{key}"')
+            if self.preconditioner is not None:
+                self.preconditioner.check(key, arrays.shape(parameters[key]))
+        iterate = dict(parameters)
+        zeros = trees.zeros_like(parameters)
+        ones = dict.fromkeys(parameters, 1.0)
+        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, ones, dict.fromkeys(parameters, 0.0))
+
+    def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
+        """See `Optimizer.update`. Waits for the device: the correlation of gradients is read."""
+        made = state.step - state.begun
+        debias = 1.0 / math.sqrt(1.0 - self.beta_2 ** (made + 1))
+        factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
+        weight = (1.0 + self.averaging) / (made + 1.0 + self.averaging)
+
+        gradient = {key: self._precondition(key, g) for key, g in estimate.gradient.items()}
+        correlation, log_rate = dict(state.correlation), dict(state.log_rate)
+        if made > 0:
+            for key, found in _correlations(gradient, state.gradient).items():
+                correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
+                log_rate[key] -= self.decay * (1.0 - max(0.0, correlation[key])) / (made + _DELAY)
+
+        steps: Tree = {}
+        fast: Tree = {}
+        average: Tree = {}
+        second: Tree = {}
+        for key, g in gradient.items():
+            y = parameters[key]
+            second[key] = self.beta_2 * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
+            root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
+            direction = self._precondition(key, g / (root + self.epsilon))
+            rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
+            before, mean = self._within_bounds(state.fast[key], state.average[key], y)
+            fast[key] = before + arrays.scalar(rate, g) * direction
+            average[key] = mean + arrays.scalar(weight, g) * (fast[key] - mean)
+            steps[key] = self._between(fast[key], average[key]) - y
+        following = replace(
+            state,
+            step=state.step + 1,
+            fast=fast,
+            average=average,
+            second_moment=second,
+            gradient=gradient,
+            correlation=correlation,
+            log_rate=log_rate,
+        )
+        return steps, following
+
+    def _precondition(self, key: str, x: Array) -> Array:
+        return x if self.preconditioner is None or key not in self.preconditioned else self.preconditioner.apply(x)
+
+    def _between(self, fast: Array, average: Array) -> Array:
+        """y."""
+        return fast + self.beta * (average - fast)
+
+    def _within_bounds(self, fast: Array, average: Array, y: Array) -> tuple[Array, Array]:
+        """z and x on the same side of a bound as the parameters y, where the bound has moved y."""
+        planned = self._between(fast, average)
+        tolerance = arrays.absolute(planned) * _PROJECTED
+        above, below = planned - y > tolerance, y - planned > tolerance
+
+        def moved(x: Array) -> Array:
+            return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
+
+        return moved(fast), moved(average)
+
+
+def _correlations(current: Tree, previous: Tree) -> dict[str, float]:
+    """{key: cosine of the angle between two gradients}; 0 where one of them is 0."""
+    products = {
+        key: (arrays.total(g * previous[key]), arrays.total(g * g), arrays.total(previous[key] * previous[key]))
+        for key, g in current.items()
+    }
+    arrays.evaluate(products)
+    found: dict[str, float] = {}
+    for key, parts in products.items():
+        product, one, other = (arrays.number(part) for part in parts)
+        lengths = math.sqrt(one) * math.sqrt(other)
+        found[key] = product / lengths if lengths > 0 else 0.0
+    return found
