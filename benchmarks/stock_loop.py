@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,12 @@ def stock_loop(
     steps: int = sys.maxsize,
     seed: int = 0,
     every: int = 5,
+    falling: bool = False,
+    error: Callable[[dict[str, Any]], Any] | None = None,
 ) -> list[dict[str, Any]]:
-    """`mi.render` with `prb`, `dr.backward`, `mi.ad.Adam`, values clipped.
+    """`mi.render` with `prb`, `dr.backward`, `mi.ad.Adam`, values clipped; with `falling`, rates fall over the budget as half a cosine.
+
+    `error` is what the history has under "parameter_error"; None for the problem's own.
 
     Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
     """
@@ -53,6 +59,10 @@ def stock_loop(
                 )
                 loss += problem.loss_value(view, image)
             dr.backward(loss)
+            if falling:
+                done = max(clock / seconds, step / steps)
+                fall = 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+                optimizer.set_learning_rate({key: max(rate * fall, 1e-9) for key, rate in rates.items()})
             optimizer.step()
             for key in start:
                 low, high = problem.bounds[key]
@@ -65,6 +75,11 @@ def stock_loop(
             if not warm and (step % every == 0 or clock >= seconds or step >= steps):
                 now = {key: mi.TensorXf(dr.ravel(dr.detach(optimizer[key])), tuple(start[key].shape)) for key in start}
                 history.append(
-                    {"step": step - 1, "seconds": clock, "loss": value, "parameter_error": problem.parameter_error(now)}
+                    {
+                        "step": step - 1,
+                        "seconds": clock,
+                        "loss": value,
+                        "parameter_error": (error or problem.parameter_error)(now),
+                    }
                 )
     return history

@@ -27,16 +27,16 @@ METHODS = {"plain": ["spp=8", "learning_rate=0.01"], "rcv": ["spp=2", "learning_
 QUICK = {"scene": ("cbox",), "seconds": 0.5, "resolution": 16, "reference_spp": 8}
 
 
-def photograph(path: Path) -> np.ndarray:
-    """A photograph as linear float32 (TEXTURE, TEXTURE, 3)."""
+def photograph(path: Path, size: int = TEXTURE) -> np.ndarray:
+    """A photograph as linear float32 (size, size, 3)."""
     bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    small: Any = resize(np.array(bitmap), (TEXTURE, TEXTURE, 3), anti_aliasing=True)
+    small: Any = resize(np.array(bitmap), (size, size, 3), anti_aliasing=True)
     return np.clip(small, 0.02, 0.95).astype(np.float32)
 
 
-def cbox(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
+def cbox(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
     """The Cornell box, its back wall with texture coordinates and a photograph."""
-    mi.Bitmap(photograph(assets / "tutorials/textures/flower_photo.jpeg")).write(str(folder / "truth.exr"))
+    mi.Bitmap(photograph(assets / "tutorials/textures/flower_photo.jpeg", texture)).write(str(folder / "truth.exr"))
     text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
     wall = (assets / "tutorials/meshes/cbox_back.obj").read_text()
     wall = wall.replace("f 1 2 3 4", "vt 1 0\nvt 1 1\nvt 0 1\nvt 0 0\nf 1/1 2/2 3/3 4/4")
@@ -52,9 +52,9 @@ def cbox(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
     return "back.bsdf.reflectance.data", 1
 
 
-def spot(assets: Path, folder: Path, resolution: int) -> tuple[str, int]:
+def spot(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
     """Spot under an environment map, four cameras around it."""
-    mi.Bitmap(photograph(assets / "spot/spot_texture.png")).write(str(folder / "truth.exr"))
+    mi.Bitmap(photograph(assets / "spot/spot_texture.png", texture)).write(str(folder / "truth.exr"))
     cameras = "".join(
         f'<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
         f'<lookat origin="{3 * np.sin(a):.4f}, 0.7, {3 * np.cos(a):.4f}" target="0, 0.1, 0" up="0, 1, 0"/></transform>'

@@ -46,7 +46,7 @@ def test_every_phase_is_named_in_its_order_and_its_time_told(unrender, problem: 
 
 def test_what_will_hardly_do_is_said_before_the_first_step(unrender, problem: Path, mitsuba_variant: str) -> None:
     words = ["run", "problem.toml", "--steps", 1, "--out", "result", "--variant", mitsuba_variant, *QUICK]
-    answer = unrender(*words, "-s", "learning_rate=2")
+    answer = unrender(*words, "-m", "rcv", "-s", "learning_rate=2")
     assert answer.status == 0
     note = answer.out.index("note: parameter wall.bsdf.reflectance.value: a learning_rate of 2 crosses its range")
     assert note < answer.out.index("compiling")
@@ -56,7 +56,7 @@ def test_what_will_hardly_do_is_said_before_the_first_step(unrender, problem: Pa
     ("settings", "message"),
     [
         (["-m", "adaptive", "-s", "pixels=99999999"], "99999999 pixels a step, but all views together have 24"),
-        (["-s", "lr=0.1"], "method rcv has no option lr; did you mean learning_rate?"),
+        (["-s", "lr=0.1"], "method auto has no option lr; did you mean learning_rate?"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_refused_in_one_line(

@@ -38,7 +38,7 @@ def test_resume_goes_on_and_says_so(unrender, stopped: Path):
     assert f"page: {Path('result', 'report.html')}" in answer.out
     record = json.loads((stopped / "run.json").read_text())
     assert (record["status"], record["steps"], record["seed"], record["resumed"]) == ("finished", 10, 5, [6])
-    assert record["method"] == "rcv"
+    assert record["method"] == "auto"
     assert record["command"].startswith("unrender run problem.toml")
     assert record["settings"]["options"]["learning_rate"] == 0.02
     assert [path.name for path in sorted((stopped / checkpoint.FOLDER).iterdir())] == [

@@ -35,7 +35,7 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     folder = problem.parent / "result"
     assert names(folder) == FILES
     record = json.loads((folder / "run.json").read_text())
-    assert (record["name"], record["method"], record["seed"], record["stopped"]) == ("problem", "rcv", 3, "steps")
+    assert (record["name"], record["method"], record["seed"], record["stopped"]) == ("problem", "auto", 3, "steps")
     assert record["command"].startswith("unrender run problem.toml --steps 90 --set learning_rate=0.02")
     assert record["settings"]["options"]["learning_rate"] == 0.02
     with np.load(folder / "parameters.npz") as found:
@@ -74,7 +74,7 @@ def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_vari
     with np.load(Path("mug", "parameters.npz")) as found:
         assert abs(float(found["mug.rotation.y"])) < 0.15
     assert unrender("report", "mug").status == 0
-    refused = unrender("run", "mug", "--steps", 1, "--variant", mitsuba_variant)
+    refused = unrender("run", "mug", "--method", "rcv", "--steps", 1, "--variant", mitsuba_variant)
     assert refused.status == 2
     assert "parameter mug.rotation.y: it cannot be recovered by path gradients" in refused.error
     assert "smoothed" in refused.error.lower()

@@ -165,7 +165,7 @@ def test_it_is_listed_and_a_broken_one_is_one_line(site: Path) -> None:
     assert len(lines) == 1
     assert "broken_stranger" in lines[0]
     assert "ImportError: this library is missing and more" in lines[0]
-    with pytest.raises(InputError, match="unknown method stranger; there are plain, rcv"):
+    with pytest.raises(InputError, match="unknown method stranger; there are auto, plain, rcv"):
         find_method("stranger")  # this process does not see the package
 
 

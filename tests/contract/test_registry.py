@@ -100,7 +100,7 @@ def test_every_component_comes_back_from_its_table(name: str) -> None:
 
 def test_lists_begin_where_they_should() -> None:
     assert list(registry.components("loss"))[:5] == ["L1", "L2", "RelativeL2", "Huber", "Perceptual"]
-    assert list(methods())[:6] == ["plain", "rcv", "meta", "coupled", "adaptive", "smoothed"]
+    assert list(methods())[:7] == ["auto", "plain", "rcv", "meta", "coupled", "adaptive", "smoothed"]
     assert ur.gallery.names()[0] == "indirect-room"
 
 

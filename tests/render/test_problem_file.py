@@ -179,7 +179,7 @@ MISTAKES = [
         "[[views]]",
         "[parameters.preconditioner]\ntype = 'LargeStep'\n[[views]]",
         5,
-        'parameters[0].preconditioner: expected "LargeSteps", got "LargeStep"; did you mean LargeSteps?',
+        'parameters[0].preconditioner: expected "LargeSteps" or "Sobolev", got "LargeStep"; did you mean LargeSteps?',
     ),
     ("[[views]]", "preconditioner = 'LargeSteps'\ninitial = 'no.png'\n[[views]]", 6, "parameters[0].initial: "),
     (

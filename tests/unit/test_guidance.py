@@ -69,8 +69,8 @@ def test_constructors_still_take_their_own_options() -> None:
 
 
 def test_a_method_s_name_stands_for_its_parts() -> None:
-    assert resolve("rcv", None) == method("rcv").start()
-    estimator, optimizer = resolve("rcv", optimizers.SGD(0.1))
+    assert resolve(problem(), "rcv", None) == method("rcv").start()
+    estimator, optimizer = resolve(problem(), "rcv", optimizers.SGD(0.1))
     assert isinstance(estimator.image, RecursiveControlVariate)  # pyright: ignore[reportAttributeAccessIssue]
     assert optimizer == optimizers.SGD(0.1)
 

@@ -137,7 +137,7 @@ def test_refuses_options(name: str, settings: dict[str, Any], message: str):
 def test_unknown_methods_get_a_suggestion():
     with pytest.raises(InputError, match=r"unknown method rvc; did you mean rcv\?"):
         method("rvc")
-    with pytest.raises(InputError, match=r"unknown method zzz; there are plain, rcv"):
+    with pytest.raises(InputError, match=r"unknown method zzz; there are auto, plain, rcv"):
         method("zzz")
 
 

@@ -11,10 +11,16 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Variance
-from unrender.optimizers import SGD, Adam, MetaAdam
+from unrender.optimizers import SGD, Adam, MetaAdam, ScheduleFree
 from unrender.schedules.functions import Constant, Cosine, Exponential, Steps, Warmup
 
-OPTIMIZERS = [SGD(0.1), SGD(0.1, momentum=0.9), Adam(0.1), Adam(0.1, beta_1=0.5, beta_2=0.9, epsilon=0.01)]
+OPTIMIZERS = [
+    SGD(0.1),
+    SGD(0.1, momentum=0.9),
+    Adam(0.1),
+    Adam(0.1, beta_1=0.5, beta_2=0.9, epsilon=0.01),
+]
+EVERY = [*OPTIMIZERS, ScheduleFree(0.1)]
 
 
 def take(optimizer, gradients, parameters=None, learning_rates=None):
@@ -101,7 +107,7 @@ def test_adam_goes_down_the_valley_of_rosenbrock():
     np.testing.assert_allclose(parameters["x"], [1.0, 1.0], atol=1e-2)
 
 
-@pytest.mark.parametrize("optimizer", OPTIMIZERS, ids=repr)
+@pytest.mark.parametrize("optimizer", EVERY, ids=repr)
 def test_pure_and_of_the_parameters_kind(optimizer, gradients):
     gradients = [{key: g.astype(np.float32) for key, g in gradient.items()} for gradient in gradients[:2]]
     state = optimizer.init(gradients[0])
@@ -136,7 +142,7 @@ def kernels_per_step(optimizer, gradients):
 
 
 @pytest.mark.mitsuba
-@pytest.mark.parametrize("optimizer", OPTIMIZERS, ids=repr)
+@pytest.mark.parametrize("optimizer", EVERY, ids=repr)
 def test_device_agrees_with_numpy_and_compiles_nothing_after_warm_up(optimizer, gradients):
     optimizer = dataclasses.replace(optimizer, schedule=Warmup(5, Cosine(20)))
     assert not any(kernels_per_step(optimizer, gradients)[3:])

@@ -67,7 +67,7 @@ def export(
 ) -> Exported:
     """Write a scene with its recovered parameters as a folder that plain Mitsuba loads.
 
-        ur.export("out/indirect-room-rcv", "out/room")
+        ur.export("out/indirect-room-auto", "out/room")
         ur.export((problem, result.parameters), "out/room-2")
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,

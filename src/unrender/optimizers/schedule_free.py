@@ -85,10 +85,10 @@ class ScheduleFree:
 
     The rate needs no horizon. It rises over five steps, and then falls by
 
-        log η_{t+1} = log η_t − p (1 − ρ) / (t + 10)
+        log η_{t+1} = log η_t − min(p (1 − ρ), 1) / (t + 10)
 
     with `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they agree, the
-    rate stays as it is; once they are noise it falls as t^-p.
+    rate stays as it is; once they are noise it falls as 1/t. Never faster: the sum of all further steps has to stay without bound.
 
     Parameters that bounds have moved take their iterates along.
 
@@ -163,7 +163,8 @@ class ScheduleFree:
         if made > 0:
             for key, found in _correlations(gradient, state.gradient).items():
                 correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
-                log_rate[key] -= self.decay * (1.0 - max(0.0, correlation[key])) / (made + _DELAY)
+                power = min(self.decay * (1.0 - max(0.0, correlation[key])), 1.0)
+                log_rate[key] -= power / (made + _DELAY)
 
         steps: Tree = {}
         fast: Tree = {}

@@ -55,9 +55,8 @@ def optimize(
 
     Args:
         problem: what to recover, from which images.
-        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along:
-            by default the one that chooses what suits the problem.
-        optimizer: what becomes of them; None for the method's.
+        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along.
+        optimizer: what becomes of them; None for the method's. The default method chooses both to suit the problem.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the

@@ -1,0 +1,224 @@
+"""What someone gets who sets nothing, against Mitsuba's own loop as a good user tunes it, over problems of the gallery and of others.
+
+Each problem gets the same time from both. `auto` has no option given. The loop of `mi.render`, `dr.backward` and `mi.ad.Adam` is tuned on
+a seed of its own for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time;
+its best setting is then run on the other seeds. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
+
+Errors are of the elements that the views see: those whose influence on the images at the start is at least a twentieth of the median
+influence. Compilation is left out of the time on both sides, and told apart. Problems of poses are in
+higher_order.table2, since the loop has no gradients of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import SampleRequest, dr, prepare
+from benchmarks.races import total_error
+from benchmarks.stock_loop import stock_loop
+from benchmarks.suite import scenes
+
+GALLERY = (
+    "indirect-room", "glossy-room", "sunlit-vase", "lamp", "spiral", "ajar", "chalice", "mirror-trio", "sun-glossy",
+    "plain-and-textured", "two-planets", "caustic", "poster", "three-bodies", "tea", "smoke",
+)  # fmt: skip
+FOREIGN = tuple(f"{scene}, {loss}" for scene in scenes.SCENES for loss in scenes.LOSSES)
+TUNING_SEED = 1000
+QUICK = {
+    "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "spp": (4,), "rates": (0.02,), "gallery_reference_spp": 1, "every": 1,
+}  # fmt: skip
+SEEN = 0.05
+Points = list[tuple[float, float]]
+
+
+def visible(problem: ur.Problem) -> dict[str, np.ndarray]:
+    """{key: mask of the elements that the images depend on}, from adjoints of ones at the initial parameters."""
+    keys, start = list(problem.shapes()), problem.initial()
+    session = prepare(problem, keys)
+    influence = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    for view in range(len(problem.views)):
+        rendering = session.image(start, SampleRequest(view, 64, 5, 1))
+        ones = problem.renderer.array(np.ones(rendering.images.shape, np.float32))
+        for key, value in session.adjoint(start, rendering.paths, ones).items():
+            influence[key] += np.abs(np.array(value, np.float64).reshape(influence[key].shape))
+    found = {}
+    for key, value in influence.items():
+        whole = value.mean(axis=-1, keepdims=True) if value.ndim > 1 else value
+        median = np.median(whole[whole > 0]) if (whole > 0).any() else 0.0
+        found[key] = (
+            np.broadcast_to(whole > SEEN * median, value.shape) if value.size > 3 else np.ones(value.shape, bool)
+        )
+    return found
+
+
+def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
+    """The error of given parameters where they are seen: each one's RMSE over its RMSE at the start, averaged."""
+    seen = visible(problem)
+
+    def errors(values: dict[str, Any]) -> dict[str, float]:
+        full = problem.full(values)
+        return {
+            key: float(np.sqrt(np.mean((full[key].reshape(truth.shape) - truth)[seen[key].reshape(truth.shape)] ** 2)))
+            for key, truth in problem.truth.items()
+        }
+
+    start = errors(problem.initial())
+    return lambda values: total_error(errors(values), start)
+
+
+class Curve(ur.Callback):
+    """(seconds, error) along a run, as often as the loop's."""
+
+    def __init__(self, error: Callable[[dict[str, Any]], float], every: float):
+        self.points: Points = []
+        self._error, self._every = error, every
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """A point."""
+        if not self.points or run.clock >= self.points[-1][0] + self._every:
+            self.points.append((run.clock, self._error(run.parameters)))
+
+    def on_end(self, run: Any, result: Any) -> None:
+        """The last point."""
+        self.points.append((run.clock, self._error(run.parameters)))
+
+
+def ours(
+    problem: ur.Problem, error: Callable[[dict[str, Any]], float], seconds: float, seed: int
+) -> tuple[Points, dict[str, Any]]:
+    """A run with no option given; its curve, and how many steps and seconds of compilation it took."""
+    curve = Curve(error, seconds / 100)
+    result = ur.optimize(problem, seconds=seconds, seed=seed, callbacks=[curve])
+    return curve.points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
+
+
+def loop(
+    problem: ur.Problem,
+    error: Callable[[dict[str, Any]], float],
+    seconds: float,
+    seed: int,
+    every: int,
+    setting: dict[str, Any],
+) -> Points:
+    """A run of the stock loop."""
+    history = stock_loop(
+        problem,
+        setting["spp"],
+        setting["rate"],
+        seconds,
+        seed=seed,
+        every=every,
+        falling=setting["falling"],
+        error=error,
+    )
+    return [(h["seconds"], h["parameter_error"]) for h in history]
+
+
+def tune(
+    problem: ur.Problem, error: Any, seconds: float, every: int, spp: Any, rates: Any
+) -> tuple[dict[str, Any], list[Any]]:
+    """The loop's setting of least error at the end, and all that were tried."""
+    tried = []
+    for samples, rate, falling in itertools.product(spp, rates, (False, True)):
+        setting = {"spp": samples, "rate": rate, "falling": falling}
+        end = loop(problem, error, seconds, TUNING_SEED, every, setting)[-1][1]
+        tried.append({**setting, "error": end if math.isfinite(end) else 1e9})
+        print(
+            f"  {problem.name}: loop {samples} spp, rate {rate:g}{' falling' if falling else ''}: {end:.4f}", flush=True
+        )
+    best = min(tried, key=lambda found: found["error"])
+    return {key: best[key] for key in ("spp", "rate", "falling")}, tried
+
+
+def middle(runs: list[Points], seconds: float, count: int = 200) -> np.ndarray:
+    """The median over runs of the error at equal steps of the time, (count,), 1 before the first point."""
+    grid = seconds * np.arange(1, count + 1) / count
+
+    def at(points: Points) -> np.ndarray:
+        clock, errors = np.array([(0.0, 1.0), *points]).T
+        return np.asarray(errors[np.searchsorted(clock, grid, side="right") - 1])
+
+    return np.median([at(points) for points in runs], axis=0)
+
+
+def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[str, Any]:
+    """Both curves at tenths of the time; when the loop is at its best, and when we are as good; None for never."""
+    loop_curve, our_curve = middle(theirs, seconds), middle(found, seconds)
+    best = float(loop_curve.min())
+    when = (int(np.argmin(loop_curve)) + 1) / len(loop_curve) * seconds
+    reached = np.nonzero(our_curve <= best)[0]
+    first = (int(reached[0]) + 1) / len(our_curve) * seconds if len(reached) else None
+    tenth = len(loop_curve) // 10
+    return {
+        "loop": loop_curve[tenth - 1 :: tenth].tolist(),
+        "auto": our_curve[tenth - 1 :: tenth].tolist(),
+        "best_of_loop": best,
+        "seconds_of_loop": when,
+        "seconds_of_auto": first,
+        "speed": when / first if first else None,
+    }
+
+
+def run(
+    problem: tuple[str, ...] = GALLERY,
+    foreign: tuple[str, ...] = (),
+    assets: Path | None = None,
+    seconds: float = 10.0,
+    seeds: int = 3,
+    spp: tuple[int, ...] = (4, 16, 64),
+    rates: tuple[float, ...] = (0.005, 0.02, 0.05),
+    resolution: int = 64,
+    texture: int = 64,
+    reference_spp: int = 4096,
+    gallery_reference_spp: int | None = None,
+    every: int = 2,
+) -> Iterator[dict[str, Any]]:
+    """Every problem.
+
+    Args:
+        problem: of the gallery
+        foreign: of others, such as "cbox, L2"; none for all of them where assets are given
+        assets: folder of the scenes of others
+        seconds: budget of a run
+        seeds: runs of each side
+        spp: of the loop, to try
+        rates: of the loop, to try
+        resolution: of pictures of the scenes of others
+        texture: side of their textures
+        reference_spp: of their references
+        gallery_reference_spp: of the gallery's references, none for its own
+        every: steps of the loop between errors
+    """
+    made: dict[str, Callable[[], ur.Problem]] = {}
+    options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
+    for name in problem:
+        made[name] = lambda name=name: ur.gallery.problem(name, **options)
+    if assets is not None:
+        for name in foreign or FOREIGN:
+            made[name] = lambda name=name: scenes.problem(name, assets, resolution, texture, reference_spp)
+    found: dict[str, Any] = {"problems": {}}
+    for name, make in made.items():
+        opened = make()
+        error = error_of(opened)
+        setting, tried = tune(opened, error, seconds, every, spp, rates)
+        theirs, mine, details = [], [], {}
+        for seed in range(seeds):
+            theirs.append(loop(opened, error, seconds, seed, every, setting))
+            points, details = ours(opened, error, seconds, seed)
+            mine.append(points)
+            print(f"{name} seed {seed}: loop {theirs[-1][-1][1]:.4f}, auto {mine[-1][-1][1]:.4f}", flush=True)
+        entry = compare(theirs, mine, seconds)
+        entry |= {"setting": setting, "tried": tried, **details}
+        entry["final"] = {"loop": [p[-1][1] for p in theirs], "auto": [p[-1][1] for p in mine]}
+        found["problems"][name] = entry
+        print(f"{name}: speed {entry['speed']}", flush=True)
+        del opened, error
+        dr.sync_thread()
+        yield found

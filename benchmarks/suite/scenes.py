@@ -1,0 +1,88 @@
+"""Inverse problems of others, at sizes for a processor: scenes under ASSETS, references rendered here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from skimage.transform import resize
+
+import unrender as ur
+from benchmarks.internals import mi
+from benchmarks.real_input import run as real_input
+from benchmarks.runner.records import scratch
+
+TRAY = "bsdf_tray.base_color.data"
+_BASE = "01_default_BaseColor.png"
+
+
+def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
+    """The lacquered tray of Gu and Moon 2025, its base colour unknown; no normal map and another environment, since theirs is not here."""
+    tray = assets / "problems/tray"
+    bitmap = mi.Bitmap(str(tray / "textures" / _BASE)).convert(
+        mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False
+    )
+    small = np.clip(np.asarray(resize(np.array(bitmap), (texture, texture, 3), anti_aliasing=True)), 0.02, 0.95)
+    mi.Bitmap(small.astype(np.float32)).write(str(folder / "truth.exr"))
+    text = (tray / "scene.xml").read_text()
+    opening = r'<bsdf type="normalmap" id="bsdf_tray">.*?<bsdf type="principled">'
+    text = re.sub(opening, '<bsdf type="principled" id="bsdf_tray">', text, flags=re.DOTALL)
+    text = text.replace("</bsdf>\n</bsdf>", "</bsdf>", 1)
+    text = text.replace("textures/warm_bar_2k.exr", str(assets / "problems/plates/textures/envmap.exr"))
+    text = text.replace('"textures/', f'"{tray}/textures/').replace('"meshes/', f'"{tray}/meshes/')
+    for side in ("resx", "resy"):
+        text = text.replace(f'name="{side}" value="1024"', f'name="{side}" value="{resolution}"')
+    text = text.replace("</film>", '<rfilter type="box"/></film>')
+    text = text.replace(f"{tray}/textures/{_BASE}", str(folder / "truth.exr"))
+    text = re.sub(r'(truth\.exr" />.*?<boolean name="raw" value=)"false"', r'\1"true"', text, count=1, flags=re.DOTALL)
+    (folder / "scene.xml").write_text(text)
+    return TRAY, 1
+
+
+def _of_real_input(name: str) -> Callable[[Path, Path, int, int], tuple[str, int]]:
+    def make(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
+        return real_input.SCENES[name](assets, folder, resolution, texture)
+
+    return make
+
+
+SCENES = {"cbox": _of_real_input("cbox"), "spot": _of_real_input("spot"), "tray": _tray}
+LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
+DEPTH = 6
+
+
+def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) -> ur.Problem:
+    """The problem of a name such as "cbox, L2"; references of `spp` samples per pixel are rendered by Mitsuba's `path` and kept."""
+    scene, loss = name.split(", ")
+    folder = scratch(f"suite/{scene}-{resolution}-{texture}")
+    folder.mkdir(parents=True, exist_ok=True)
+    key, views = SCENES[scene](assets.resolve(), folder, resolution, texture)
+    kept = folder / f"references-{spp}.npz"
+    if not kept.exists():
+        loaded, path = mi.load_file(str(folder / "scene.xml")), mi.load_dict({"type": "path", "max_depth": DEPTH})
+        parts = max(1, spp // 256)
+        images = [
+            np.mean(
+                [
+                    np.array(mi.render(loaded, sensor=view, integrator=path, spp=spp // parts, seed=n))
+                    for n in range(parts)
+                ],
+                0,
+            )
+            for view in range(views)
+        ]
+        np.savez(kept, *images)
+    with np.load(kept) as found:
+        references = [found[f"arr_{view}"].astype(np.float32) for view in range(views)]
+    truth = np.array(mi.Bitmap(str(folder / "truth.exr")))[..., :3]
+    return ur.Problem(
+        folder / "scene.xml",
+        [ur.Parameter(key, initial=0.5)],
+        [ur.View(reference, sensor=view) for view, reference in enumerate(references)],
+        loss=LOSSES[loss],
+        max_depth=DEPTH,
+        truth={key: truth},
+        name=name,
+    )

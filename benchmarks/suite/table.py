@@ -1,0 +1,39 @@
+"""Table."""
+
+from __future__ import annotations
+
+import math
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """Error at the end, and the time to the tuned loop's best error."""
+    settings, problems = record["settings"], record["problems"]
+    rows = []
+    for name, entry in problems.items():
+        setting, never = entry["setting"], entry["speed"] is None
+        words = f"{setting['spp']} spp, {setting['rate']:g}{', falling' if setting['falling'] else ''}"
+        first = "never" if never else f"{entry['seconds_of_auto']:.2g} s"
+        rows.append(
+            [
+                name, words, f"{entry['loop'][4]:.3f}, {entry['loop'][-1]:.3f}", f"{entry['auto'][4]:.3f}, {entry['auto'][-1]:.3f}",
+                f"{entry['seconds_of_loop']:.2g} s", first, "below 1" if never else f"**{entry['speed']:.2g}**",
+                f"{entry['compile_seconds']:.1f} s",
+            ]
+        )  # fmt: skip
+    head = ["problem", "the loop's best setting", "loop, half and end", "auto, half and end"]
+    head += ["loop at its best", "auto there", "faster", "compile"]
+    reached = [entry["speed"] for entry in problems.values() if entry["speed"]]
+    mean = math.exp(sum(map(math.log, reached)) / len(reached)) if reached else math.nan
+    tuned = len(settings["spp"]) * len(settings["rates"]) * 2
+    return "\n\n".join(
+        [
+            f"{settings['seconds']:g} s, {settings['seeds']} seeds, medians; errors where seen, relative to the "
+            f"start. The loop is the best of {tuned} settings, `auto` has none.",
+            markdown.table(head, rows),
+            f"Geometric mean of the {len(reached)} problems of {len(problems)} where `auto` gets there: **{mean:.2f}** times as fast; "
+            f"ahead at the end on {sum(e['auto'][-1] < e['loop'][-1] for e in problems.values())}.",
+        ]
+    )

@@ -1,0 +1,167 @@
+"""What `auto` chooses, that it can be set, and that it copes with problems that have next to nothing to recover."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unrender import images, losses, optimizers, pixels
+from unrender.core import tables
+from unrender.core.errors import InputError
+from unrender.estimators.path import PathGradient
+from unrender.methods import auto as module
+from unrender.methods import method
+from unrender.preconditioners import LargeSteps, Sobolev
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.optimize import optimize
+from unrender.runs.reopen import resume
+
+SHAPE = (4, 4)
+TRUTH = {"map": np.random.default_rng(0).uniform(0.2, 0.8, (3, 3, 1)), "gain": np.full(1, 200.0)}
+
+
+def problem(loss: Any = None, shares_paths: bool = True, noise: float = 0.3, **options: Any) -> Problem:
+    """A texture within bounds and a number without an upper one."""
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 10))
+    matrix[:, -1] *= 1e-3
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, noise, shape=SHAPE, shares_paths=shares_paths)
+    unknown = [
+        Parameter("map", initial=0.5, bounds=(0, 1), **options),
+        Parameter("gain", initial=100.0, bounds=(0, None)),
+    ]
+    return Problem(renderer, unknown, [View(renderer.exact(TRUTH))], loss=loss or losses.L2(), truth=TRUTH)
+
+
+def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
+    return method("auto").start(settings, made)
+
+
+@pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
+def test_images_have_a_memory(loss: Any) -> None:
+    estimator, _ = chosen(problem(loss))
+    assert estimator == PathGradient(images.RecursiveControlVariate("path"), spp=module._SPP["rcv"])
+    estimator, _ = chosen(problem(loss, shares_paths=False))
+    assert estimator.image == images.RecursiveControlVariate("primary")
+    assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6)
+
+
+def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem(losses.L2())
+    assert module._firefly_share(made) == 0.0  # too few pixels to tell
+    rng = np.random.default_rng(0)
+
+    def pilot(fireflies: bool) -> float:
+        noise = rng.normal(size=(2, 64, 64, 3))
+        if fireflies:
+            noise[:, :2, :10] *= 300.0
+
+        class Session:
+            def image(self, *given: Any) -> Any:
+                return type("Rendering", (), {"images": noise})
+
+        with monkeypatch.context() as patch:
+            patch.setattr(made.renderer, "prepare", lambda *given, **options: Session())
+            return module._firefly_share(made)
+
+    assert 0.02 < pilot(False) < 0.06  # a hundredth of the pixels, those at the end of a chi-square of three channels
+    assert pilot(True) > 0.95
+    monkeypatch.setattr(module, "_firefly_share", lambda problem: 0.9)
+    assert chosen(made)[0] == PathGradient(spp=module._SPP["plain"])
+    assert "90% of the noise" in method("auto").configure({}).reasons(made)[0]
+    assert chosen(made, image="rcv")[0].image == images.RecursiveControlVariate("path")
+    assert chosen(problem(losses.L1()))[0].image == images.RecursiveControlVariate("path")
+
+
+def test_textures_are_smoothed_unless_they_have_a_preconditioner() -> None:
+    _, optimizer = chosen(problem())
+    assert (optimizer.preconditioner, optimizer.preconditioned) == (Sobolev(), ("map",))
+    for made, settings in ((problem(preconditioner=LargeSteps(1.0)), {}), (problem(), {"smooth": False})):
+        _, optimizer = chosen(made, **settings)
+        assert (optimizer.preconditioner, optimizer.preconditioned) == (None, ())
+
+
+def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
+    _, optimizer = chosen(problem())
+    assert optimizer.learning_rate == pytest.approx({"*": 0.1, "map": 0.1, "gain": 10.0})
+    _, optimizer = chosen(problem(), learning_rate=0.02)
+    assert optimizer.learning_rate == pytest.approx({"*": 0.02, "map": 0.02, "gain": 2.0})
+    state = optimizer.init(problem(learning_rate=0.5).initial(), problem(learning_rate=0.5).learning_rates)
+    assert state.learning_rates == pytest.approx({"map": 0.5, "gain": 2.0})
+
+
+def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_PIXELS", 10)
+    estimator, _ = chosen(problem(losses.L1()))
+    assert estimator.pixels == pixels.Uniform(5)
+    assert estimator.image == images.Plain()
+    assert chosen(problem(), pixels=7)[0].pixels == pixels.Uniform(7)
+
+
+def test_it_says_what_it_has_chosen_and_why() -> None:
+    said = method("auto").configure({}).reasons(problem(losses.L1()))
+    assert said[0].startswith("recursive control variates, 4 samples per pixel: earlier")
+    assert said[1] == "Sobolev gradients of map"
+    assert said[2] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
+    assert method("rcv").configure({}).reasons(problem()) == []
+
+
+def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem()
+
+    def prepare(*given: Any) -> None:
+        raise InputError("no path gradients of map")
+
+    monkeypatch.setattr(made.renderer, "prepare", prepare)
+    assert chosen(made) == method("smoothed").start()
+    (line,) = method("auto").configure({}).reasons(made)
+    assert line == "derivatives of a smoothed loss (method smoothed): no path gradients of map"
+
+
+def test_it_is_what_runs_where_nothing_is_said(tmp_path: Path) -> None:
+    made = problem(losses.L1())
+    result = optimize(made, steps=400)
+    assert result.method == "auto"
+    before, after = (made.parameter_error(values) for values in (result.initial, result.parameters))
+    assert after["map"] < 0.5 * before["map"]
+    assert after["gain"] < 0.5 * before["gain"]
+    whole = optimize(problem(losses.L1()), steps=30, run_directory=tmp_path / "whole")
+    optimize(problem(losses.L1()), steps=17, run_directory=tmp_path / "part")
+    ended = resume(tmp_path / "part", problem(losses.L1()), steps=30)
+    for key, value in whole.parameters.items():
+        np.testing.assert_array_equal(ended.parameters[key], value)
+    assert isinstance(optimize(problem(), optimizer=optimizers.Adam(), steps=1).steps, int)
+
+
+def test_it_is_stored_and_made_again() -> None:
+    estimator, optimizer = chosen(problem(losses.L1()))
+    assert tables.component(tables.table(estimator)) == estimator
+    assert tables.component(tables.table(optimizer)) == optimizer
+
+
+@pytest.mark.parametrize("loss", [losses.L1(), losses.L2(), losses.RelativeL2()])
+@pytest.mark.parametrize("reference", [0.0, 1.0])
+def test_pictures_without_anything_in_them(loss: Any, reference: float) -> None:
+    """A black reference pulls all to the lower bound; nothing ceases to be finite."""
+    made = problem(loss)
+    made = Problem(
+        made.renderer,
+        made.parameters,
+        [View(np.full((*SHAPE, 3), reference, np.float32))],
+        loss=loss,
+    )
+    result = optimize(made, steps=60)
+    assert result.skipped == 0
+    assert all(np.isfinite(value).all() for value in result.parameters.values())
+
+
+def test_one_unknown_number() -> None:
+    renderer = AnalyticRenderer({"x": np.zeros(1)}, np.ones((3, 1)), 0.0, 0.05, shape=(1, 1))
+    made = Problem(renderer, [Parameter("x", initial=0.0)], [View(renderer.exact({"x": np.full(1, 0.7)}))])
+    result = optimize(made, steps=300)
+    assert abs(float(result.parameters["x"][0]) - 0.7) < 0.02

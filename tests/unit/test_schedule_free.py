@@ -1,0 +1,162 @@
+"""ScheduleFree against closed forms: the weighted mean, the rate's fall, bounds, preconditioning."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unrender.core import tables
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimate
+from unrender.optimizers import Adam, ScheduleFree
+from unrender.preconditioners import Sobolev
+from unrender.schedules import Cosine
+
+
+def descend(
+    optimizer: Any, start: Any, gradient: Any, steps: int, low: float = -math.inf
+) -> tuple[list[Any], list[Any]]:
+    """Parameters before each step and states after it; `gradient` is a function of step and parameters."""
+    x = {"x": np.array(start, float)}
+    state = optimizer.init(x)
+    seen, states = [], []
+    for step in range(steps):
+        seen.append(x["x"])
+        found, state = optimizer.update(Estimate(0.0, {"x": np.asarray(gradient(step, x["x"]), float)}), state, x)
+        x = {"x": np.maximum(x["x"] + found["x"], low)}
+        states.append(state)
+    return [*seen, x["x"]], states
+
+
+def noise(step: int, x: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(step).normal(size=x.shape)
+
+
+@pytest.mark.parametrize("power", [0, 1, 4])
+def test_the_average_has_weights_that_grow_as_a_power_of_the_step(power: int):
+    optimizer = ScheduleFree(0.1, averaging=power)
+    _, states = descend(optimizer, np.zeros(5), noise, 40)
+    iterates = np.array([state.fast["x"] for state in states])
+    weights = np.array([math.comb(step + power, power) for step in range(40)], float)
+    for count in (1, 2, 17, 40):
+        expected = np.tensordot(weights[:count] / weights[:count].sum(), iterates[:count], 1)
+        np.testing.assert_allclose(states[count - 1].average["x"], expected, rtol=1e-10, atol=1e-14)
+
+
+def test_the_parameters_lie_between_iterate_and_average():
+    seen, states = descend(ScheduleFree(0.1, beta=0.8), np.zeros(5), noise, 20)
+    for x, state in zip(seen[1:], states, strict=True):
+        np.testing.assert_allclose(x, 0.2 * state.fast["x"] + 0.8 * state.average["x"], rtol=1e-12)
+
+
+def test_a_constant_gradient_keeps_its_rate():
+    _, states = descend(ScheduleFree(0.1), np.zeros(3), lambda step, x: np.array([1.0, -2.0, 0.5]), 30)
+    assert states[-1].log_rate["x"] == pytest.approx(0.0, abs=1e-12)
+    moved = states[-1].fast["x"] - states[-2].fast["x"]
+    np.testing.assert_allclose(moved, [-0.1, 0.1, -0.1], rtol=1e-9)
+    rises = [states[0].fast["x"][1], states[1].fast["x"][1] - states[0].fast["x"][1]]
+    np.testing.assert_allclose(rises, [0.02, 0.04], rtol=1e-9)
+
+
+def test_the_rate_of_uncorrelated_gradients_falls_by_its_power():
+    """Gradients that alternate between two axes have no correlation at all: the mean correlation is then 0.9^t."""
+    _, states = descend(ScheduleFree(0.1, decay=0.7), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200)
+    expected = -0.7 * sum((1 - 0.9**step) / (step + 10) for step in range(1, 200))
+    assert states[-1].log_rate["x"] == pytest.approx(expected, rel=1e-9)
+    _, states = descend(ScheduleFree(0.1, decay=0.0), np.zeros(2), noise, 50)
+    assert states[-1].log_rate["x"] == 0.0
+
+
+def test_the_schedule_is_a_further_factor():
+    def along(step: int, x: np.ndarray) -> np.ndarray:
+        return np.ones_like(x)
+
+    _, plain = descend(ScheduleFree(0.1), np.zeros(1), along, 12)
+    _, scheduled = descend(ScheduleFree(0.1, schedule=Cosine(10, 0.25)), np.zeros(1), along, 12)
+    for step in range(1, 12):
+        moved, as_scheduled = (found[step].fast["x"] - found[step - 1].fast["x"] for found in (plain, scheduled))
+        np.testing.assert_allclose(as_scheduled, Cosine(10, 0.25)(step) * moved, rtol=1e-9)
+
+
+def test_noise_is_averaged_where_a_constant_rate_leaves_it():
+    """A bowl under noise: more steps come closer, at a rate with which Adam stays where it is."""
+
+    def bowl(step: int, x: np.ndarray) -> np.ndarray:
+        return x - 0.3 + 2.0 * np.random.default_rng(1000 + step).normal(size=x.shape)
+
+    def error(optimizer: Any, steps: int) -> float:
+        seen, _ = descend(optimizer, np.zeros(2000), bowl, steps)
+        return float(np.sqrt(np.mean((seen[-1] - 0.3) ** 2)))
+
+    early, late = (error(ScheduleFree(0.1), steps) for steps in (100, 1600))
+    constant = error(Adam(0.1), 1600)
+    assert late < 0.5 * early
+    assert late < 0.2 * constant
+
+
+def test_parameters_at_a_bound_leave_it_as_soon_as_the_gradient_turns():
+    """50 steps into the bound are no debt: 5 back lead as far from it as 5 from a start there."""
+
+    def gradient(step: int, x: np.ndarray) -> np.ndarray:
+        return np.full_like(x, 1.0 if step < 50 else -1.0)
+
+    seen, _ = descend(ScheduleFree(0.05), np.full(2, 0.1), gradient, 56, low=0.0)
+    assert (seen[50] == 0.0).all()
+    assert (seen[56] > 0.02).all()
+
+
+def test_the_preconditioner_acts_on_gradient_and_direction():
+    smooth = Sobolev(3.0)
+    optimizer = ScheduleFree(0.1, preconditioner=smooth, preconditioned=("x",))
+    g = np.random.default_rng(0).normal(size=(6, 5, 1))
+    _, states = descend(optimizer, np.zeros((6, 5, 1)), lambda step, x: g, 1)
+    inner = smooth.apply(g.astype(np.float32))
+    expected = -0.02 * smooth.apply(inner / (np.abs(inner) + 1e-12))
+    np.testing.assert_allclose(states[0].fast["x"], expected, rtol=1e-4, atol=1e-7)
+    plain = ScheduleFree(0.1, preconditioner=smooth)
+    _, states = descend(plain, np.zeros((6, 5, 1)), lambda step, x: g, 1)
+    np.testing.assert_allclose(states[0].fast["x"], -0.02 * np.sign(g), rtol=1e-6)
+
+
+def test_rates_of_their_own():
+    optimizer = ScheduleFree({"*": 0.1, "b": 3.0, "c": 5.0})
+    state = optimizer.init({"a": np.zeros(2), "b": np.zeros(2), "c": np.zeros(2)}, {"c": 7.0})
+    assert state.learning_rates == {"a": 0.1, "b": 3.0, "c": 7.0}
+
+
+def test_it_is_stored_and_made_again():
+    optimizer = ScheduleFree(
+        {"*": 0.1, "a.b": 3.0}, decay=1.0, schedule=Cosine(10), preconditioner=Sobolev(), preconditioned=("a.b",)
+    )
+    assert tables.component(tables.table(optimizer)) == optimizer
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learning_rate": 0.0}, "learning_rate"),
+        ({"learning_rate": {"a": 0.1}}, "needs the rate of the others"),
+        ({"learning_rate": {"*": -1.0}}, "learning_rate"),
+        ({"beta": 1.0}, "beta"),
+        ({"beta_2": -0.1}, "beta_2"),
+        ({"decay": -1.0}, "decay"),
+        ({"averaging": float("nan")}, "averaging"),
+        ({"preconditioned": "key"}, "preconditioned must be keys"),
+    ],
+)
+def test_refuses_options(options: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message):
+        ScheduleFree(**options)
+
+
+def test_refuses_parameters_that_do_not_suit():
+    x = {"x": np.zeros(3)}
+    with pytest.raises(InputError, match='unknown parameter "y"'):
+        ScheduleFree(preconditioner=Sobolev(), preconditioned=("y",)).init(x)
+    with pytest.raises(InputError, match="needs a texture"):
+        ScheduleFree(preconditioner=Sobolev(), preconditioned=("x",)).init(x)
+    with pytest.raises(InputError, match='unknown parameter "y"'):
+        ScheduleFree({"*": 0.1, "y": 0.2}).init(x)
