@@ -24,6 +24,8 @@ _WARMUP = 5
 """Steps over which the rate rises."""
 _DELAY = 10.0
 """τ of the docstring, in steps."""
+_STEEPEST = 0.6
+"""The greatest power of 1/t that the rate falls by: between 1/2 and 1, with averages, as in Polyak and Juditsky 1992."""
 _MEMORY = 0.9
 """Decay of the mean correlation of successive gradients."""
 _PROJECTED = 1e-5
@@ -85,10 +87,11 @@ class ScheduleFree:
 
     The rate needs no horizon. It rises over five steps, and then falls by
 
-        log η_{t+1} = log η_t − min(p (1 − ρ), 1) / (t + 10)
+        log η_{t+1} = log η_t − min(p (1 − ρ), 0.6) / (t + 10)
 
     with `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they agree, the
-    rate stays as it is; once they are noise it falls as 1/t. Never faster: the sum of all further steps has to stay without bound.
+    rate stays as it is; once they are noise it falls as t^-0.6. No faster: what is left of the signal has to arrive, and averages of
+    iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
 
     Parameters that bounds have moved take their iterates along.
 
@@ -107,7 +110,7 @@ class ScheduleFree:
 
     learning_rate: float | Mapping[str, float] = 0.1
     beta: float = 0.9
-    beta_2: float = 0.99
+    beta_2: float = 0.95
     epsilon: float = 1e-12
     averaging: float = 4.0
     decay: float = 1.5
@@ -163,7 +166,7 @@ class ScheduleFree:
         if made > 0:
             for key, found in _correlations(gradient, state.gradient).items():
                 correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
-                power = min(self.decay * (1.0 - max(0.0, correlation[key])), 1.0)
+                power = min(self.decay * (1.0 - max(0.0, correlation[key])), _STEEPEST)
                 log_rate[key] -= power / (made + _DELAY)
 
         steps: Tree = {}
