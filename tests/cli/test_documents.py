@@ -32,6 +32,7 @@ SLOW = {
     "quickstart.md",
     "pixels.md",
     "own-loop.md",
+    "own-estimator.md",
     "poses.md",
     "runs.md",
     "watching.md",

@@ -169,6 +169,7 @@ def test_it_is_listed_and_a_broken_one_is_one_line(site: Path) -> None:
         find_method("stranger")  # this process does not see the package
 
 
+@pytest.mark.slow
 def test_it_is_killed_and_ends_as_if_undisturbed(site: Path, tmp_path: Path) -> None:
     whole, folder = tmp_path / "whole", tmp_path / "run"
     status, _, error = answer(start(site, *RUN, "--out", whole, "--checkpoint-every", 50))

@@ -118,7 +118,13 @@ def test_weights_have_the_derivatives_of_the_closed_form(case: Any, kind: str) -
 
 @pytest.mark.parametrize(
     "options",
-    [{"aggregate": False}, {"antithetic": False}, {"low_discrepancy": True}, {"epsilon": 0.5}, {"joint": True}],
+    [
+        {"aggregate": False},
+        {"antithetic": False},
+        pytest.param({"low_discrepancy": True}, marks=pytest.mark.slow),
+        {"epsilon": 0.5},
+        {"joint": True},
+    ],
     ids=str,
 )
 def test_so_do_they_with_every_option(options: dict[str, Any]) -> None:

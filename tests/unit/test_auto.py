@@ -45,7 +45,7 @@ def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
 def test_images_have_a_memory(loss: Any) -> None:
     estimator, _ = chosen(problem(loss))
-    assert estimator == PathGradient(images.RecursiveControlVariate("path"), spp=module._SPP["rcv"])
+    assert estimator == PathGradient(images.RecursiveControlVariate("path"), spp=module._MOST)
     estimator, _ = chosen(problem(loss, shares_paths=False))
     assert estimator.image == images.RecursiveControlVariate("primary")
     assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6)
@@ -72,7 +72,7 @@ def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeyp
     assert 0.02 < pilot(False) < 0.06  # a hundredth of the pixels, those at the end of a chi-square of three channels
     assert pilot(True) > 0.95
     monkeypatch.setattr(module, "_firefly_share", lambda problem: 0.9)
-    assert chosen(made)[0] == PathGradient(spp=module._SPP["plain"])
+    assert chosen(made)[0] == PathGradient(spp=module._MOST)
     assert "90% of the noise" in method("auto").configure({}).reasons(made)[0]
     assert chosen(made, image="rcv")[0].image == images.RecursiveControlVariate("path")
     assert chosen(problem(losses.L1()))[0].image == images.RecursiveControlVariate("path")
@@ -95,6 +95,13 @@ def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
     assert state.learning_rates == pytest.approx({"map": 0.5, "gain": 2.0})
 
 
+def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    for paths, spp in ((1, 2), (16, 2), (63, 2), (64, 4), (200, 8), (1 << 15, 16)):
+        monkeypatch.setattr(module, "_PATHS", paths)
+        assert chosen(problem())[0].spp == spp, paths
+    assert chosen(problem(), spp=5)[0].spp == 5
+
+
 def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MOST_PIXELS", 10)
     estimator, _ = chosen(problem(losses.L1()))
@@ -105,7 +112,7 @@ def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_it_says_what_it_has_chosen_and_why() -> None:
     said = method("auto").configure({}).reasons(problem(losses.L1()))
-    assert said[0].startswith("recursive control variates, 4 samples per pixel: earlier")
+    assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
     assert said[1] == "Sobolev gradients of map"
     assert said[2] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
     assert method("rcv").configure({}).reasons(problem()) == []

@@ -52,23 +52,30 @@ def test_the_parameters_lie_between_iterate_and_average():
         np.testing.assert_allclose(x, 0.2 * state.fast["x"] + 0.8 * state.average["x"], rtol=1e-12)
 
 
-def test_a_constant_gradient_keeps_its_rate():
-    _, states = descend(ScheduleFree(0.1), np.zeros(3), lambda step, x: np.array([1.0, -2.0, 0.5]), 30)
+def test_the_rate_of_a_constant_gradient_stays_or_grows():
+    def along(step: int, x: np.ndarray) -> np.ndarray:
+        return np.array([1.0, -2.0, 0.5])
+
+    _, states = descend(ScheduleFree(0.1, growth=0.0), np.zeros(3), along, 30)
     assert states[-1].log_rate["x"] == pytest.approx(0.0, abs=1e-12)
     moved = states[-1].fast["x"] - states[-2].fast["x"]
     np.testing.assert_allclose(moved, [-0.1, 0.1, -0.1], rtol=1e-9)
     rises = [states[0].fast["x"][1], states[1].fast["x"][1] - states[0].fast["x"][1]]
-    np.testing.assert_allclose(rises, [0.02, 0.04], rtol=1e-9)
+    np.testing.assert_allclose(rises, [0.05, 0.1], rtol=1e-9)
+    _, states = descend(ScheduleFree(0.1, growth=0.2), np.zeros(3), along, 30)
+    assert states[-1].log_rate["x"] == pytest.approx(29 * 0.2)
 
 
 def test_the_rate_of_uncorrelated_gradients_falls_by_its_power():
     """Gradients that alternate between two axes have no correlation at all: the mean correlation is then 0.9^t."""
-    _, states = descend(ScheduleFree(0.1, decay=0.4), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200)
+    _, states = descend(ScheduleFree(0.1, decay=0.4, growth=0.0), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200)
     expected = -0.4 * sum((1 - 0.9**step) / (step + 10) for step in range(1, 200))
     assert states[-1].log_rate["x"] == pytest.approx(expected, rel=1e-9)
-    _, states = descend(ScheduleFree(0.1, decay=50.0), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200)
+    _, states = descend(
+        ScheduleFree(0.1, decay=50.0, growth=0.0), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200
+    )
     assert states[-1].log_rate["x"] == pytest.approx(-0.6 * sum(1 / (step + 10) for step in range(1, 200)), rel=1e-9)
-    _, states = descend(ScheduleFree(0.1, decay=0.0), np.zeros(2), noise, 50)
+    _, states = descend(ScheduleFree(0.1, decay=0.0, growth=0.0), np.zeros(2), noise, 50)
     assert states[-1].log_rate["x"] == 0.0
 
 
@@ -76,8 +83,8 @@ def test_the_schedule_is_a_further_factor():
     def along(step: int, x: np.ndarray) -> np.ndarray:
         return np.ones_like(x)
 
-    _, plain = descend(ScheduleFree(0.1), np.zeros(1), along, 12)
-    _, scheduled = descend(ScheduleFree(0.1, schedule=Cosine(10, 0.25)), np.zeros(1), along, 12)
+    _, plain = descend(ScheduleFree(0.1, growth=0.0), np.zeros(1), along, 12)
+    _, scheduled = descend(ScheduleFree(0.1, growth=0.0, schedule=Cosine(10, 0.25)), np.zeros(1), along, 12)
     for step in range(1, 12):
         moved, as_scheduled = (found[step].fast["x"] - found[step - 1].fast["x"] for found in (plain, scheduled))
         np.testing.assert_allclose(as_scheduled, Cosine(10, 0.25)(step) * moved, rtol=1e-9)
@@ -96,7 +103,7 @@ def test_noise_is_averaged_where_a_constant_rate_leaves_it():
     early, late = (error(ScheduleFree(0.1), steps) for steps in (100, 1600))
     constant = error(Adam(0.1), 1600)
     assert late < 0.5 * early
-    assert late < 0.2 * constant
+    assert late < 0.35 * constant
 
 
 def test_parameters_at_a_bound_leave_it_as_soon_as_the_gradient_turns():
@@ -105,7 +112,7 @@ def test_parameters_at_a_bound_leave_it_as_soon_as_the_gradient_turns():
     def gradient(step: int, x: np.ndarray) -> np.ndarray:
         return np.full_like(x, 1.0 if step < 50 else -1.0)
 
-    seen, _ = descend(ScheduleFree(0.05), np.full(2, 0.1), gradient, 56, low=0.0)
+    seen, _ = descend(ScheduleFree(0.05, growth=0.0), np.full(2, 0.1), gradient, 56, low=0.0)
     assert (seen[50] == 0.0).all()
     assert (seen[56] > 0.02).all()
 
@@ -116,11 +123,11 @@ def test_the_preconditioner_acts_on_gradient_and_direction():
     g = np.random.default_rng(0).normal(size=(6, 5, 1))
     _, states = descend(optimizer, np.zeros((6, 5, 1)), lambda step, x: g, 1)
     inner = smooth.apply(g.astype(np.float32))
-    expected = -0.02 * smooth.apply(inner / (np.abs(inner) + 1e-12))
+    expected = -0.05 * smooth.apply(inner / (np.abs(inner) + 1e-12))
     np.testing.assert_allclose(states[0].fast["x"], expected, rtol=1e-4, atol=1e-7)
     plain = ScheduleFree(0.1, preconditioner=smooth)
     _, states = descend(plain, np.zeros((6, 5, 1)), lambda step, x: g, 1)
-    np.testing.assert_allclose(states[0].fast["x"], -0.02 * np.sign(g), rtol=1e-6)
+    np.testing.assert_allclose(states[0].fast["x"], -0.05 * np.sign(g), rtol=1e-6)
 
 
 def test_rates_of_their_own():
@@ -145,6 +152,7 @@ def test_it_is_stored_and_made_again():
         ({"beta": 1.0}, "beta"),
         ({"beta_2": -0.1}, "beta_2"),
         ({"decay": -1.0}, "decay"),
+        ({"growth": -1.0}, "growth"),
         ({"averaging": float("nan")}, "averaging"),
         ({"preconditioned": "key"}, "preconditioned must be keys"),
     ],

@@ -31,7 +31,8 @@ __all__ = ["AutoMethod"]
 
 _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
-_SPP = {"plain": 16, "rcv": 4}
+_PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
+"""Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
 _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
@@ -62,7 +63,9 @@ class AutoMethod(Options):
     image: Literal["plain", "rcv"] | None = Field(
         None, description="what the loss sees: a fresh rendering, or rcv's; none chooses by their noise"
     )
-    spp: PositiveInt | None = Field(None, description="samples per pixel; none for 16 of plain images, 4 of rcv's")
+    spp: PositiveInt | None = Field(
+        None, description="samples per pixel; none for some 32768 paths a step, from 2 to 16"
+    )
     pixels: PositiveInt | None = Field(
         None, description="pixels a step, drawn from all views; none for all pixels, or 262144 where views are large"
     )
@@ -77,8 +80,7 @@ class AutoMethod(Options):
         """See `Options.build`: what is chosen where nothing is known of the problem."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate()
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
-        spp = self.spp or _SPP[self.image or "rcv"]
-        return PathGradient(image, sampler, spp), ScheduleFree(self.learning_rate)
+        return PathGradient(image, sampler, self.spp or _FEWEST), ScheduleFree(self.learning_rate)
 
     def build_for(self, problem: Problem) -> tuple[Estimator, Optimizer]:
         """See `Options.build_for`."""
@@ -86,7 +88,7 @@ class AutoMethod(Options):
             return method("smoothed").start()
         sampler, _ = self._sampler(problem)
         image = self._image(problem, isinstance(sampler, pixels.All))
-        estimator = PathGradient(image.estimator, sampler, self.spp or _SPP[image.name])
+        estimator = PathGradient(image.estimator, sampler, self._samples(problem, sampler))
         keys = self._smoothed(problem)
         rates = {"*": self.learning_rate, **_rates(problem, self.learning_rate)}
         return estimator, ScheduleFree(rates, preconditioner=Sobolev() if keys else None, preconditioned=keys)
@@ -97,7 +99,7 @@ class AutoMethod(Options):
             return [f"derivatives of a smoothed loss (method smoothed): {unreachable}"]
         sampler, why = self._sampler(problem)
         image = self._image(problem, isinstance(sampler, pixels.All))
-        spp = self.spp or _SPP[image.name]
+        spp = self._samples(problem, sampler)
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         found = [f"{kind}, {spp} samples per pixel: {image.reason}", *([why] if why else [])]
         if keys := self._smoothed(problem):
@@ -128,11 +130,16 @@ class AutoMethod(Options):
         """The pixels of a step, and why they are not all."""
         if self.pixels is not None:
             return pixels.Uniform(self.pixels), ""
-        count = sum(math.prod(np.asarray(view.reference).shape[:2]) for view in problem.views)
+        count = _pixels_of(problem)
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
         drawn = _MOST_PIXELS // 2
         return pixels.Uniform(drawn), f"{drawn} of all {count} pixels a step"
+
+    def _samples(self, problem: Problem, sampler: PixelSampler) -> int:
+        """Per pixel: the power of two that comes nearest to the paths of a step from below."""
+        count = sampler.count if isinstance(sampler, pixels.Uniform) else _pixels_of(problem)
+        return self.spp or min(max(1 << ((_PATHS // count).bit_length() - 1 if count <= _PATHS else 0), _FEWEST), _MOST)
 
     def _smoothed(self, problem: Problem) -> tuple[str, ...]:
         """Textures and grids that have no preconditioner of their own."""
@@ -167,6 +174,11 @@ def _firefly_share(problem: Problem) -> float:
     found = np.sort(np.concatenate(noise))[::-1]
     whole = found.sum()
     return float(found[: max(1, len(found) // 100)].sum() / whole) if len(found) >= 1000 and whole > 0 else 0.0
+
+
+def _pixels_of(problem: Problem) -> int:
+    """Of all views together."""
+    return sum(math.prod(np.asarray(view.reference).shape[:2]) for view in problem.views)
 
 
 def _is_map(shape: tuple[int, ...]) -> bool:

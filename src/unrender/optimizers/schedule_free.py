@@ -20,7 +20,7 @@ from unrender.schedules.functions import Schedule
 
 __all__ = ["ScheduleFree", "ScheduleFreeState"]
 
-_WARMUP = 5
+_WARMUP = 2
 """Steps over which the rate rises."""
 _DELAY = 10.0
 """τ of the docstring, in steps."""
@@ -85,12 +85,12 @@ class ScheduleFree:
     v̂ is the debiased mean square of g, r is `averaging`: x is the mean of z with weights that grow as t^r. The parameters of a run are
     its y, near x. An average has less noise than an iterate, and parameters that move slowly suit estimators that reuse earlier samples.
 
-    The rate needs no horizon. It rises over five steps, and then falls by
+    The rate needs no horizon. It is halved at the first step, and then changes by
 
-        log η_{t+1} = log η_t − min(p (1 − ρ), 0.6) / (t + 10)
+        log η_{t+1} = log η_t + q max(0, 2 ρ − 1) − min(p (1 − ρ), 0.6) / (t + 10)
 
-    with `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they agree, the
-    rate stays as it is; once they are noise it falls as t^-0.6. No faster: what is left of the signal has to arrive, and averages of
+    with `growth` q, `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they
+    agree, the rate grows; once they are noise it falls as t^-0.6. No faster: what is left of the signal has to arrive, and averages of
     iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
 
     Parameters that bounds have moved take their iterates along.
@@ -101,7 +101,8 @@ class ScheduleFree:
         beta_2: decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         averaging: r, >= 0.
-        decay: p, >= 0; 0 for a rate that stays.
+        growth: q, >= 0; 0 for a rate that never grows.
+        decay: p, >= 0; 0 for a rate that never falls.
         schedule: a further factor of every learning rate by step; see `unrender.schedules.functions`.
         preconditioner: S, applied to the gradients and to the steps of z of the parameters in `preconditioned`. In place of the
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
@@ -113,6 +114,7 @@ class ScheduleFree:
     beta_2: float = 0.95
     epsilon: float = 1e-12
     averaging: float = 4.0
+    growth: float = 0.1
     decay: float = 1.5
     schedule: Schedule | None = None
     preconditioner: Preconditioner | None = None
@@ -128,6 +130,7 @@ class ScheduleFree:
             checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         checks.number("ScheduleFree", "epsilon", self.epsilon, above=0.0)
         checks.number("ScheduleFree", "averaging", self.averaging, above=0.0, inclusive=True)
+        checks.number("ScheduleFree", "growth", self.growth, above=0.0, inclusive=True)
         checks.number("ScheduleFree", "decay", self.decay, above=0.0, inclusive=True)
         keys = self.preconditioned
         if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
@@ -166,8 +169,7 @@ class ScheduleFree:
         if made > 0:
             for key, found in _correlations(gradient, state.gradient).items():
                 correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
-                power = min(self.decay * (1.0 - max(0.0, correlation[key])), _STEEPEST)
-                log_rate[key] -= power / (made + _DELAY)
+                log_rate[key] += self._change(correlation[key], made)
 
         steps: Tree = {}
         fast: Tree = {}
@@ -194,6 +196,11 @@ class ScheduleFree:
             log_rate=log_rate,
         )
         return steps, following
+
+    def _change(self, correlation: float, made: int) -> float:
+        """Of the logarithm of the rate, in one step."""
+        power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
+        return self.growth * max(0.0, 2.0 * correlation - 1.0) - power / (made + _DELAY)
 
     def _precondition(self, key: str, x: Array) -> Array:
         return x if self.preconditioner is None or key not in self.preconditioned else self.preconditioner.apply(x)
