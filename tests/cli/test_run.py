@@ -36,6 +36,8 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     assert names(folder) == FILES
     record = json.loads((folder / "run.json").read_text())
     assert (record["name"], record["method"], record["seed"], record["stopped"]) == ("problem", "auto", 3, "steps")
+    assert record["settings"]["choices"][0].startswith("recursive control variates, 16 samples per pixel")
+    assert f"auto: {record['settings']['choices'][-1]}" in answer.out
     assert record["command"].startswith("unrender run problem.toml --steps 90 --set learning_rate=0.02")
     assert record["settings"]["options"]["learning_rate"] == 0.02
     with np.load(folder / "parameters.npz") as found:
@@ -78,6 +80,10 @@ def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_vari
     assert refused.status == 2
     assert "parameter mug.rotation.y: it cannot be recovered by path gradients" in refused.error
     assert "smoothed" in refused.error.lower()
+    if not settings:
+        chosen = unrender("run", "mug", "--steps", 1, "--out", "auto", "--variant", mitsuba_variant, *QUICK)
+        assert chosen.status == 0, chosen.error
+        assert "auto: derivatives of a smoothed loss (method smoothed): parameter mug.rotation.y" in chosen.out
 
 
 def test_run_of_the_gallery_s_problem_without_a_renderer(unrender, problem: Path, mitsuba_variant: str):

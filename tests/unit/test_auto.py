@@ -39,7 +39,8 @@ def problem(loss: Any = None, shares_paths: bool = True, noise: float = 0.3, **o
 
 
 def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
-    return method("auto").start(settings, made)
+    choice = method("auto").choose(made, settings)
+    return choice.estimator, choice.optimizer
 
 
 @pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
@@ -73,7 +74,7 @@ def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeyp
     assert pilot(True) > 0.95
     monkeypatch.setattr(module, "_firefly_share", lambda problem: 0.9)
     assert chosen(made)[0] == PathGradient(spp=module._MOST)
-    assert "90% of the noise" in method("auto").configure({}).reasons(made)[0]
+    assert "90% of the noise" in method("auto").choose(made).reasons[0]
     assert chosen(made, image="rcv")[0].image == images.RecursiveControlVariate("path")
     assert chosen(problem(losses.L1()))[0].image == images.RecursiveControlVariate("path")
 
@@ -111,11 +112,11 @@ def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_says_what_it_has_chosen_and_why() -> None:
-    said = method("auto").configure({}).reasons(problem(losses.L1()))
+    said = method("auto").choose(problem(losses.L1())).reasons
     assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
     assert said[1] == "Sobolev gradients of map"
     assert said[2] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
-    assert method("rcv").configure({}).reasons(problem()) == []
+    assert method("rcv").choose(problem()).reasons == ()
 
 
 def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +127,7 @@ def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(made.renderer, "prepare", prepare)
     assert chosen(made) == method("smoothed").start()
-    (line,) = method("auto").configure({}).reasons(made)
+    (line,) = method("auto").choose(made).reasons
     assert line == "derivatives of a smoothed loss (method smoothed): no path gradients of map"
 
 

@@ -57,22 +57,21 @@ class Plan:
 
 def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came."""
-    estimator, optimizer = plan.method.start(plan.settings, plan.problem)
-    options = plan.method.configure(plan.settings)
-    reasons = options.reasons(plan.problem)
-    for line in reasons:
+    choice = plan.method.choose(plan.problem, plan.settings)
+    for line in choice.reasons:
         console.print(f"{plan.method.name}: {escape(line)}", soft_wrap=True)
-    settings = {"options": options.model_dump(), "problem_options": dict(plan.problem_settings), "choices": reasons}
+    options = plan.method.configure(plan.settings).model_dump()
+    settings = {"options": options, "problem_options": dict(plan.problem_settings), "choices": list(choice.reasons)}
     settings = {name: value for name, value in settings.items() if value}
-    for line in advice.remarks(plan.problem, optimizer):
+    for line in advice.remarks(plan.problem, choice.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
     annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, earlier)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
     result = optimize(
         plan.problem,
-        estimator,
-        optimizer,
+        choice.estimator,
+        choice.optimizer,
         plan.steps,
         plan.seconds,
         plan.seed,

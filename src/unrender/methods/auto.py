@@ -19,7 +19,7 @@ from unrender.estimators.path import PathGradient
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.base import Options, method
+from unrender.methods.base import Choice, Options, method
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
@@ -33,6 +33,8 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
+_VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
+"""Positions are as large as the mesh, but a mesh does not survive steps of a tenth of that."""
 _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
@@ -82,33 +84,29 @@ class AutoMethod(Options):
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
         return PathGradient(image, sampler, self.spp or _FEWEST), ScheduleFree(self.learning_rate)
 
-    def build_for(self, problem: Problem) -> tuple[Estimator, Optimizer]:
-        """See `Options.build_for`."""
-        if _unreachable(problem):
-            return method("smoothed").start()
-        sampler, _ = self._sampler(problem)
-        image = self._image(problem, isinstance(sampler, pixels.All))
-        estimator = PathGradient(image.estimator, sampler, self._samples(problem, sampler))
-        keys = self._smoothed(problem)
-        rates = {"*": self.learning_rate, **_rates(problem, self.learning_rate)}
-        return estimator, ScheduleFree(rates, preconditioner=Sobolev() if keys else None, preconditioned=keys)
-
-    def reasons(self, problem: Problem) -> list[str]:
-        """See `Options.reasons`."""
+    def choose(self, problem: Problem) -> Choice:
+        """See `Options.choose`."""
         if unreachable := _unreachable(problem):
-            return [f"derivatives of a smoothed loss (method smoothed): {unreachable}"]
-        sampler, why = self._sampler(problem)
+            reason = f"derivatives of a smoothed loss (method smoothed): {unreachable}"
+            return Choice(*method("smoothed").start(), (reason,))
+        sampler, drawn = self._sampler(problem)
         image = self._image(problem, isinstance(sampler, pixels.All))
-        spp = self._samples(problem, sampler)
-        kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
-        found = [f"{kind}, {spp} samples per pixel: {image.reason}", *([why] if why else [])]
-        if keys := self._smoothed(problem):
-            found.append(f"Sobolev gradients of {', '.join(keys)}")
-        rates = {**_rates(problem, self.learning_rate), **problem.learning_rates}
-        found.append(
-            "schedule-free Adam, first rate " + ", ".join(f"{rate:.3g} ({key})" for key, rate in rates.items())
+        spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
+        rates = _rates(problem, self.learning_rate)
+        optimizer = ScheduleFree(
+            {"*": self.learning_rate, **rates},
+            preconditioner=Sobolev() if smoothed else None,
+            preconditioned=smoothed,
         )
-        return found
+        kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
+        first = ", ".join(f"{rate:.3g} ({key})" for key, rate in {**rates, **problem.learning_rates}.items())
+        reasons = (
+            f"{kind}, {spp} samples per pixel: {image.reason}",
+            drawn,
+            f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
+            f"schedule-free Adam, first rate {first}",
+        )
+        return Choice(PathGradient(image.estimator, sampler, spp), optimizer, tuple(filter(None, reasons)))
 
     def _image(self, problem: Problem, whole: bool) -> _Image:
         if self.image == "plain":
@@ -196,5 +194,7 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = high - low
         else:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
+        if key.endswith(_VERTICES):
+            size *= _VERTEX_SHARE
         found[key] = share * size
     return found

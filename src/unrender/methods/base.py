@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +18,23 @@ from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.schedules.functions import Schedule
 
-__all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parse_schedule"]
+__all__ = ["SCHEDULE_HELP", "Choice", "Method", "Options", "method", "methods", "parse_schedule"]
 
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a method takes for a problem.
+
+    Attributes:
+        estimator, optimizer: the two parts.
+        reasons: what was chosen and why, one line each; none where there was nothing to choose.
+    """
+
+    estimator: Estimator
+    optimizer: Optimizer
+    reasons: tuple[str, ...] = ()
 
 
 class Options(BaseModel):
@@ -34,15 +49,10 @@ class Options(BaseModel):
         """Estimator and optimizer with these options. Raises `InputError` for options that do not go together."""
         raise NotImplementedError(f"{type(self).__name__} has no build")
 
-    def build_for(self, problem: Problem) -> tuple[Estimator, Optimizer]:
-        """What `build` makes, chosen to suit a problem. Methods that look at no problem make the same for all."""
+    def choose(self, problem: Problem) -> Choice:
+        """The two parts that suit a problem. Methods that look at no problem choose what `build` makes."""
         del problem
-        return self.build()
-
-    def reasons(self, problem: Problem) -> list[str]:
-        """What `build_for` has chosen and why, one line each; [] for methods that choose nothing."""
-        del problem
-        return []
+        return Choice(*self.build())
 
 
 @dataclass(frozen=True)
@@ -88,13 +98,23 @@ class Method:
         choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
         return " or ".join(choices)
 
-    def start(
-        self, settings: Mapping[str, Any] | None = None, problem: Problem | None = None
-    ) -> tuple[Estimator, Optimizer]:
-        """Estimator and optimizer with `settings` in place of defaults, to suit the problem where it is given. Raises `InputError`."""
+    def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
+        """Estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
         options = self.configure(settings or {})
+        with self._named():
+            return options.build()
+
+    def choose(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Choice:
+        """Likewise, chosen to suit a problem. Raises `InputError`."""
+        options = self.configure(settings or {})
+        with self._named():
+            return options.choose(problem)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Errors begin with the method's name."""
         try:
-            return options.build() if problem is None else options.build_for(problem)
+            yield
         except InputError as error:
             raise InputError(f"method {self.name}: {error}") from error
 

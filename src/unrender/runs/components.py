@@ -26,9 +26,10 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator
         InputError: one of them is missing or something else, such as an optimizer of Mitsuba's or PyTorch's, or a class in place of an
             object.
     """
-    chosen = resolve_estimator(problem, estimator)
     if optimizer is None and isinstance(estimator, str):
-        return method(estimator).start(problem=problem)
+        choice = method(estimator).choose(problem)
+        return choice.estimator, choice.optimizer
+    chosen = resolve_estimator(problem, estimator)
     if optimizer is None:
         raise InputError(
             "optimize: give an optimizer, such as unrender.optimizers.Adam(learning_rate=0.01), or a method's name in place of both"
@@ -41,7 +42,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator
 def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize") -> Estimator:
     """An estimator, from itself or a method's name. Raises `InputError` for anything else."""
     if isinstance(estimator, str):
-        return method(estimator).start(problem=problem)[0]
+        return method(estimator).choose(problem).estimator
     if not _is_component(estimator, "provides", "init", "estimate"):
         names = ", ".join(methods())
         raise InputError(
