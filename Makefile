@@ -25,6 +25,14 @@ SECONDS := 30
 # LLVM compiles a kernel on one core, so a process for each. The tests of a file stay in one process, since they share kernels.
 WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
 PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile
+# Types take a minute of one core: they are checked beside the tests, and told after them.
+define WITH_LINT
+	$(BIN)/ruff check .
+	@mkdir -p .pytest_cache
+	@$(BIN)/pyright --pythonpath $(BIN)/python > .pytest_cache/types.txt 2>&1 & types=$$!; \
+	$(PYTEST) $(1); tests=$$?; \
+	wait $$types; types=$$?; cat .pytest_cache/types.txt; exit $$((tests + types))
+endef
 # What does best on this problem in this time, for each: benchmarks/rcv/fig9_reconstruction.
 TUNED := --set plain.spp=32 --set plain.learning_rate=0.03 --set rcv.spp=4 --set rcv.learning_rate=0.02
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
@@ -36,11 +44,11 @@ demo: .venv/ready
 	$(BIN)/unrender compare indirect-room --methods plain,rcv --seconds $(SECONDS) --out out/demo --overwrite $(TUNED)
 	@echo "the result, to open in a browser: file://$(CURDIR)/out/demo/compare.html"
 
-test: lint
-	$(PYTEST) -m "not slow"
+test: .venv/ready
+	$(call WITH_LINT,-m "not slow")
 
-test-all: lint
-	$(PYTEST)
+test-all: .venv/ready
+	$(call WITH_LINT,)
 
 test-slow: .venv/ready
 	$(PYTEST) -m slow

@@ -498,6 +498,7 @@ def test_a_control_variate_found_at_whole_views_now_and_then() -> None:
     np.testing.assert_array_equal(state.image.snapshot.image, rendered)
 
 
+@pytest.mark.slow
 def test_a_snapshot_makes_batches_quieter() -> None:
     asked = problem(noise=0.9)
     renderer = asked.renderer

@@ -96,6 +96,7 @@ def test_slabs_that_glow_are_what_their_closed_form_says(voxels: int) -> None:
         assert (np.abs(images.mean(axis=0) - wrong) > 4 * error).any(), "5 % more extinction goes unseen"
 
 
+@pytest.mark.slow
 def test_gradients_of_glowing_voxels_agree_with_finite_differences() -> None:
     """Emission where it is zero, and extinction where that is."""
     light = np.where(DARK, 0, np.random.default_rng(1).uniform(0.3, 2, (*KIND.shape[:3], 3)))

@@ -106,7 +106,7 @@ def agrees(found: np.ndarray, truth: np.ndarray, bias: float = 0.0) -> bool:
     return bool((excess <= stats.t.isf(1e-3 / (2 * truth.size), len(found) - 1) * error + 1e-9).all())
 
 
-@pytest.mark.parametrize("kind", ["linear", "tanh"])
+@pytest.mark.parametrize("kind", [pytest.param("linear", marks=pytest.mark.slow), "tanh"])
 @pytest.mark.parametrize("case", [Quadratic(), Sine(), Step()], ids=lambda case: type(case).__name__)
 def test_weights_have_the_derivatives_of_the_closed_form(case: Any, kind: str) -> None:
     net = network(kind)

@@ -536,6 +536,7 @@ def test_a_plateau_moves_nothing_and_ends_nothing(value):
     assert len(np.unique(np.concatenate(seen), axis=0)) == 100 * len(seen[0])
 
 
+@pytest.mark.slow
 def test_a_long_search_survives_its_own_success():
     """Until losses underflow, and on an ellipsoid that is as flat as numbers allow."""
     start = {"x": np.ones(3)}

@@ -304,6 +304,7 @@ def hostile_run(path: Path, method: str) -> Path:
     return write_run(path, method + HOSTILE, truth=truth, **fields, **told)
 
 
+@pytest.mark.slow
 def test_text_that_wants_to_be_a_script_is_shown_and_does_not_run(tmp_path):
     """In Chromium, in the page as it is loaded and in what it takes over later; a run's name and a parameter's among it."""
     runs = [hostile_run(tmp_path / ("a" + HOSTILE[:8]), "a"), go_on(hostile_run(tmp_path / "b", "b"))]
