@@ -48,7 +48,7 @@ GIVEN = {
     "unrender.exporting.scene_folder.export": """
         import unrender as ur
         problem = ur.gallery.problem("indirect-room", resolution=16, texture_resolution=8)
-        result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), 2, run_directory="out/indirect-room-rcv")
+        result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), 2, run_directory="out/indirect-room-auto")
     """,
     "unrender.gallery.registry.problem": "from unrender.gallery import problem",
     "unrender.gallery.catalogue.problem": "from unrender.gallery import problem",

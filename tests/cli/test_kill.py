@@ -24,9 +24,20 @@ SOURCE = str(Path(package.__file__).parents[1])
 ENVIRONMENT = {**os.environ, "PYTHONPATH": SOURCE}
 TINY = ["-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8"]
 COMMANDS = {
+    "auto": ["indirect-room", *TINY],
     "plain": ["indirect-room", *TINY, "--method", "plain", "--set", "spp=2"],
     "rcv": ["indirect-room", *TINY, "--method", "rcv"],
-    "rcv, primary": ["lamp", "-p", "resolution=8", "-p", "reference_spp=8", "--set", "space=primary"],
+    "rcv, primary": [
+        "lamp",
+        "--method",
+        "rcv",
+        "-p",
+        "resolution=8",
+        "-p",
+        "reference_spp=8",
+        "--set",
+        "space=primary",
+    ],
     "adaptive": ["indirect-room", *TINY, "--method", "adaptive", "--set", "pixels=32", "--set", "refresh=7"],
     "meta": ["indirect-room", *TINY, "--method", "meta"],
     "coupled, rcv": ["indirect-room", *TINY, "--method", "coupled", "--set", "image=rcv"],
