@@ -25,11 +25,12 @@ SECONDS := 30
 # LLVM compiles a kernel on one core, so a process for each. The tests of a file stay in one process, since they share kernels.
 WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
 PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile
+TYPES = $(BIN)/pyright --pythonpath $(BIN)/python
 # Types take a minute of one core: they are checked beside the tests, and told after them.
 define WITH_LINT
 	$(BIN)/ruff check .
 	@mkdir -p .pytest_cache
-	@$(BIN)/pyright --pythonpath $(BIN)/python > .pytest_cache/types.txt 2>&1 & types=$$!; \
+	@$(TYPES) > .pytest_cache/types.txt 2>&1 & types=$$!; \
 	$(PYTEST) $(1); tests=$$?; \
 	wait $$types; types=$$?; cat .pytest_cache/types.txt; exit $$((tests + types))
 endef
@@ -58,7 +59,7 @@ test-unit: .venv/ready
 
 lint: .venv/ready
 	$(BIN)/ruff check .
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(TYPES)
 
 docs: .venv/docs-ready
 	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs build/site

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Callable
@@ -61,7 +60,7 @@ def stock_loop(
             dr.backward(loss)
             if falling:
                 done = max(clock / seconds, step / steps)
-                fall = 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+                fall = ur.schedules.Cosine(1)(done)
                 optimizer.set_learning_rate({key: max(rate * fall, 1e-9) for key, rate in rates.items()})
             optimizer.step()
             for key in start:

@@ -54,6 +54,17 @@ def mitsuba_variant() -> str:
     return name
 
 
+@pytest.fixture
+def one_thread(mitsuba_variant: str) -> Iterator[None]:
+    """Threads add up gradients in whatever order they come (with three or more, seen often): bits repeat with one."""
+    import drjit as dr
+
+    count = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(count)
+
+
 @pytest.fixture(autouse=True)
 def no_mitsuba_unless_marked(request: pytest.FixtureRequest) -> Iterator[None]:
     """A test without the mark must not be the one that imports Mitsuba. Seen where tests with the mark are not collected beside it."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from skimage.transform import resize
 
 import unrender as ur
 from benchmarks.internals import mi
@@ -21,11 +20,7 @@ _BASE = "01_default_BaseColor.png"
 def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
     """The lacquered tray of Gu and Moon 2025, its base colour unknown; no normal map and another environment, since theirs is not here."""
     tray = assets / "problems/tray"
-    bitmap = mi.Bitmap(str(tray / "textures" / _BASE)).convert(
-        mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False
-    )
-    small = np.clip(np.asarray(resize(np.array(bitmap), (texture, texture, 3), anti_aliasing=True)), 0.02, 0.95)
-    mi.Bitmap(small.astype(np.float32)).write(str(folder / "truth.exr"))
+    mi.Bitmap(real_input.photograph(tray / "textures" / _BASE, texture)).write(str(folder / "truth.exr"))
     text = (tray / "scene.xml").read_text()
     opening = r'<bsdf type="normalmap" id="bsdf_tray">.*?<bsdf type="principled">'
     text = re.sub(opening, '<bsdf type="principled" id="bsdf_tray">', text, flags=re.DOTALL)
@@ -41,14 +36,7 @@ def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[st
     return TRAY, 1
 
 
-def _of_real_input(name: str) -> Callable[[Path, Path, int, int], tuple[str, int]]:
-    def make(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
-        return real_input.SCENES[name](assets, folder, resolution, texture)
-
-    return make
-
-
-SCENES = {"cbox": _of_real_input("cbox"), "spot": _of_real_input("spot"), "tray": _tray}
+SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray}
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 DEPTH = 6
 

@@ -139,6 +139,7 @@ def test_the_tutorials_loop_with_three_lines_changed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
 def test_coupled_gradients_and_saved_states(tmp_path: Path) -> None:
     """In a Dr.Jit loop too; a renderer that loads the state goes on as the first."""
 

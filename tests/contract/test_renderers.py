@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-import drjit as dr
 import numpy as np
 import pytest
 from backends import BACKENDS, LAMP, TEXTURE, Backend, problem, surface
@@ -386,15 +385,6 @@ def test_a_parameter_that_a_session_was_not_prepared_for_is_refused() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------- purity
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Threads add up gradients in whatever order they come: bits repeat with one."""
-    count = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(count)
 
 
 def everything(backend: Backend, renderer: Renderer, disturb: Callable[[], None] = lambda: None) -> list[np.ndarray]:

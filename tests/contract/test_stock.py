@@ -64,6 +64,7 @@ def test_its_steps_are_those_of_mitsubas_adam() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
 def test_it_resumes_as_if_nothing_had_been(tmp_path: Path) -> None:
     estimator, optimizer = method("stock").start({"spp": "2", "learning_rate": "0.05"})
     assert (estimator, optimizer) == (StockGradient(2), ur.optimizers.Adam(0.05))

@@ -1,10 +1,10 @@
 """Connections to a live page: its owner's, idle ones, and ones that ask without the token again and again.
 
-    python clients.py ADDRESS IDLE BUSY SECONDS
+    python clients.py ADDRESS IDLE BUSY SECONDS [OWNERS]
 
 Idle connections say nothing and come back when they are cut off. Busy ones ask for a page without the token, wait for the answer, and ask
-again. The owner asks once a second, on a new connection each time, for the whole page. Prints, as JSON, the owner's seconds per answer,
-how many idle and busy ones are connected in the mean, and how often a busy one was answered.
+again. The owner, who is there unless OWNERS is 0, asks once a second, on a new connection each time, for the whole page. Prints, as JSON,
+the owner's seconds per answer, how many idle and busy ones are connected in the mean, and how often a busy one was answered.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ async def busy(host: str, port: int) -> None:
             counts["busy"] -= 1
 
 
-async def main(address: str, idle_count: int, busy_count: int, seconds: float) -> None:
+async def main(address: str, idle_count: int, busy_count: int, seconds: float, owners: int) -> None:
     """All of them at once."""
     where = urlsplit(address)
     host, port = where.hostname or "", where.port or 0
@@ -72,6 +72,8 @@ async def main(address: str, idle_count: int, busy_count: int, seconds: float) -
     while time.monotonic() < end:
         await asyncio.sleep(1.0)
         connected.append((counts["idle"], counts["busy"]))
+        if not owners:
+            continue
         try:
             status, took = await asyncio.wait_for(ask(host, port, where.path), 30)
         except (OSError, IndexError, ValueError, TimeoutError):
@@ -84,4 +86,4 @@ async def main(address: str, idle_count: int, busy_count: int, seconds: float) -
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])))
+    asyncio.run(main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]), int((*sys.argv, "1")[5])))

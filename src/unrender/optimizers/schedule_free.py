@@ -121,7 +121,7 @@ class ScheduleFree:
     preconditioned: tuple[str, ...] = ()
 
     def __post_init__(self):
-        given = self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
+        given = self._given_rates
         if "*" not in given:
             raise InputError('ScheduleFree: learning_rate needs the rate of the others, {"*": rate}')
         for rate in given.values():
@@ -144,7 +144,7 @@ class ScheduleFree:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ScheduleFreeState:
         """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
-        given = self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
+        given = self._given_rates
         named = {key: rate for key, rate in given.items() if key != "*"}
         own = rates.per_parameter("ScheduleFree", parameters, given["*"], {**named, **(learning_rates or {})})
         for key in self.preconditioned:
@@ -196,6 +196,11 @@ class ScheduleFree:
             log_rate=log_rate,
         )
         return steps, following
+
+    @property
+    def _given_rates(self) -> Mapping[str, float]:
+        """`learning_rate` as {key: rate, "*": of the others}."""
+        return self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
 
     def _change(self, correlation: float, made: int) -> float:
         """Of the logarithm of the rate, in one step."""

@@ -20,7 +20,17 @@ if TYPE_CHECKING:
 
 from unrender.core.errors import InputError
 
-__all__ = ["CholeskySolver", "Solver", "TransformSolver", "check", "laplacian", "solver", "square_root_solver", "wraps"]
+__all__ = [
+    "CholeskySolver",
+    "Solver",
+    "TransformSolver",
+    "check",
+    "laplacian",
+    "per_axis",
+    "solver",
+    "square_root_solver",
+    "wraps",
+]
 
 
 class Solver(Protocol):
@@ -121,6 +131,11 @@ def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
     if not axes or not all(isinstance(wraps, bool) for wraps in axes):
         raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {found!r}")
     return found
+
+
+def per_axis(wrap: bool | tuple[bool, ...], axes: int) -> tuple[bool, ...]:
+    """`wrap` as one truth value per axis."""
+    return wrap if isinstance(wrap, tuple) else (wrap,) * axes
 
 
 def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr_matrix:

@@ -48,6 +48,5 @@ class LargeSteps:
         """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
         shape = arrays.shape(x)
         self.check("parameter", shape)
-        wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (len(shape) - 1)
-        result = grid.solver(float(self.strength), shape[:-1], wrap).solve(arrays.numpy(x))
-        return arrays.like(result, x)
+        solver = grid.solver(float(self.strength), shape[:-1], grid.per_axis(self.wrap, len(shape) - 1))
+        return arrays.like(solver.solve(arrays.numpy(x)), x)

@@ -60,5 +60,5 @@ class Sobolev:
         strength = self.strength
         if strength is None:
             strength = (_CORRELATION * math.prod(cells) ** (1 / len(cells))) ** 2
-        wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * len(cells)
-        return arrays.like(grid.square_root_solver(float(strength), cells, wrap).solve(arrays.numpy(x)), x)
+        solver = grid.square_root_solver(float(strength), cells, grid.per_axis(self.wrap, len(cells)))
+        return arrays.like(solver.solve(arrays.numpy(x)), x)
