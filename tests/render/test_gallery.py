@@ -43,6 +43,7 @@ UNKNOWN = {
     },
     "chalice": {"chalice.bsdf.brdf_0.roughness.data": (8, 8, 1)},
     "poster": {"poster.bsdf.reflectance.data": (8, 8, 1)},
+    "wall": {"back.bsdf.reflectance.data": (8, 8, 3)},
 }
 RENDERED = list(UNKNOWN)
 
