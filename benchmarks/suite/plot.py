@@ -19,6 +19,8 @@ def plot(record: Record) -> Figure:
     for axis, (name, entry) in zip(axes.flat, problems.items(), strict=False):
         axis.plot(time, [1.0, *entry["loop"]], color="0.5", label="stock loop, tuned")
         axis.plot(time, [1.0, *entry["auto"]], color="C1", label="auto, no option")
+        if "fixed_point" in entry:
+            axis.plot(time, [1.0, *entry["fixed_point"]], color="C0", ls=":", label="reference / rendering")
         axis.set(title=name, yscale="log", xlabel="seconds", ylabel="error / start")
     for axis in list(axes.flat)[len(problems) :]:
         axis.set_visible(False)

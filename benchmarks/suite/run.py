@@ -5,7 +5,8 @@ a seed of its own for the whole time, over samples per pixel, learning rate, and
 its best setting is then run on the other seeds. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
 
 Errors are of the elements that the views see: those whose influence on the images at the start is at least a twentieth of the median
-influence. Compilation is left out of the time on both sides, and told apart. Problems of poses are in
+influence. Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
+(benchmarks/fixed_point.py). Compilation is left out of the time on both sides, and told apart. Problems of poses are in
 higher_order.table2, since the loop has no gradients of them.
 """
 
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import SampleRequest, dr, prepare
 from benchmarks.races import total_error
 from benchmarks.stock_loop import stock_loop
@@ -27,7 +29,7 @@ from benchmarks.suite import scenes
 
 GALLERY = (
     "indirect-room", "glossy-room", "sunlit-vase", "lamp", "spiral", "ajar", "chalice", "mirror-trio", "sun-glossy",
-    "plain-and-textured", "two-planets", "caustic", "poster", "three-bodies", "tea", "smoke",
+    "plain-and-textured", "two-planets", "caustic", "poster", "three-bodies", "tea", "smoke", "wall",
 )  # fmt: skip
 FOREIGN = tuple(f"{scene}, {loss}" for scene in scenes.SCENES for loss in scenes.LOSSES)
 TUNING_SEED = 1000
@@ -35,6 +37,7 @@ QUICK = {
     "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "spp": (4,), "rates": (0.02,), "gallery_reference_spp": 1, "every": 1,
 }  # fmt: skip
 SEEN = 0.05
+FIXED_POINT_SPP = 16
 Points = list[tuple[float, float]]
 
 
@@ -148,6 +151,12 @@ def middle(runs: list[Points], seconds: float, count: int = 200) -> np.ndarray:
     return np.median([at(points) for points in runs], axis=0)
 
 
+def tenths(curve: np.ndarray) -> list[float]:
+    """A curve of `middle` at tenths of the time."""
+    tenth = len(curve) // 10
+    return curve[tenth - 1 :: tenth].tolist()
+
+
 def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[str, Any]:
     """Both curves at tenths of the time; when the loop is at its best, and when we are as good; None for never."""
     loop_curve, our_curve = middle(theirs, seconds), middle(found, seconds)
@@ -155,10 +164,9 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
     when = (int(np.argmin(loop_curve)) + 1) / len(loop_curve) * seconds
     reached = np.nonzero(our_curve <= best)[0]
     first = (int(reached[0]) + 1) / len(our_curve) * seconds if len(reached) else None
-    tenth = len(loop_curve) // 10
     return {
-        "loop": loop_curve[tenth - 1 :: tenth].tolist(),
-        "auto": our_curve[tenth - 1 :: tenth].tolist(),
+        "loop": tenths(loop_curve),
+        "auto": tenths(our_curve),
         "best_of_loop": best,
         "seconds_of_loop": when,
         "seconds_of_auto": first,
@@ -216,6 +224,9 @@ def run(
             print(f"{name} seed {seed}: loop {theirs[-1][-1][1]:.4f}, auto {mine[-1][-1][1]:.4f}", flush=True)
         entry = compare(theirs, mine, seconds)
         entry |= {"setting": setting, "tried": tried, **details}
+        if applies(opened):
+            hands = [fixed_point(opened, FIXED_POINT_SPP, seconds, seed, error) for seed in range(seeds)]
+            entry["fixed_point"] = tenths(middle(hands, seconds))
         entry["final"] = {"loop": [p[-1][1] for p in theirs], "auto": [p[-1][1] for p in mine]}
         found["problems"][name] = entry
         print(f"{name}: speed {entry['speed']}", flush=True)

@@ -15,15 +15,17 @@ def table(record: Record) -> str:
     for name, entry in problems.items():
         setting, never = entry["setting"], entry["speed"] is None
         words = f"{setting['spp']} spp, {setting['rate']:g}{', falling' if setting['falling'] else ''}"
+        hand = entry.get("fixed_point")
         first = "never" if never else f"{entry['seconds_of_auto']:.2g} s"
         rows.append(
             [
                 name, words, f"{entry['loop'][4]:.3f}, {entry['loop'][-1]:.3f}", f"{entry['auto'][4]:.3f}, {entry['auto'][-1]:.3f}",
+                f"{hand[4]:.3f}, {hand[-1]:.3f}" if hand else "",
                 f"{entry['seconds_of_loop']:.2g} s", first, "below 1" if never else f"**{entry['speed']:.2g}**",
                 f"{entry['compile_seconds']:.1f} s",
             ]
         )  # fmt: skip
-    head = ["problem", "the loop's best setting", "loop, half and end", "auto, half and end"]
+    head = ["problem", "the loop's best setting", "loop, half and end", "auto, half and end", "fixed point"]
     head += ["loop at its best", "auto there", "faster", "compile"]
     reached = [entry["speed"] for entry in problems.values() if entry["speed"]]
     mean = math.exp(sum(map(math.log, reached)) / len(reached)) if reached else math.nan

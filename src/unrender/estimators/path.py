@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -64,14 +64,21 @@ class PathGradient:
         spp: samples per pixel and view of the image, or per pixel of the mini-batch, >= 1.
         adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for leave-one-out groups, and for `spp` paths of
             its own where `spp` cannot be divided into groups: 1, and primes above 16.
+        tolerance: κ >= 0. Where it is above 0, the loss's derivative not linear, as of L1, and the variance σ² of the image known (of
+            a whole view, of several samples), the derivative at the residual r is multiplied by |r| / √(r² + κ² σ²), with σ² averaged
+            over neighbouring pixels. Of L1 that makes Charbonnier's loss √(r² + δ²) with δ = κ σ: where the sign of r is the noise's,
+            r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls, it is the loss
+            itself again.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
     pixels: PixelSampler = field(default_factory=All)
     spp: int = 4
     adjoint_spp: int | None = None
+    tolerance: float = 0.0
 
     def __post_init__(self):
+        checks.number("PathGradient", "tolerance", self.tolerance, above=0.0, inclusive=True)
         for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise InputError(f"PathGradient: {name} must be a whole number of at least 1, got {value!r}")
@@ -100,7 +107,17 @@ class PathGradient:
         batch, pixels = MiniBatch(None), state.pixels
         if not self.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
-        step = gather(problem, parameters, self.image, state.image, self.spp, key, self.adjoint_spp, batch=batch)
+        step = gather(
+            problem,
+            parameters,
+            self.image,
+            state.image,
+            self.spp,
+            key,
+            self.adjoint_spp,
+            batch=batch,
+            tolerance=self.tolerance,
+        )
         pixels = self.pixels.observe(problem, pixels, step.gradient)
         whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):

@@ -3,7 +3,7 @@ two on one set of paths."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any, Protocol, runtime_checkable
@@ -13,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.estimators.damping import damping, smoothed_variance
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
@@ -78,18 +79,21 @@ def gather(
     adjoint_spp: int | None = None,
     pair_request: PairRequest | None = None,
     batch: MiniBatch | None = None,
+    tolerance: float = 0.0,
 ) -> GradientSample:
     """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
 
     A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, also the gradient
     of the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space
     allows, and their difference is a finite difference of gradients. With a pixel mini-batch, of its pixels alone, in one launch for
-    all views; the image estimator's state advances where whole views are rendered.
+    all views; the image estimator's state advances where whole views are rendered. For `tolerance` see `PathGradient`.
     """
     sample = batch.sample if batch else None
     frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
     parts = [
-        _gather_frame(problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request)
+        _gather_frame(
+            problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request, tolerance
+        )
         for index, frame in enumerate(frames)
     ]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
@@ -133,6 +137,7 @@ def _gather_frame(
     key: Key,
     adjoint_spp: int | None,
     pair_request: PairRequest | None,
+    tolerance: float,
 ) -> _FrameGradient:
     groups = leave_one_out_groups(spp, adjoint_spp)
     session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
@@ -144,14 +149,24 @@ def _gather_frame(
         request = frame.request(adjoint_spp or spp, key.fold(1).uint32())
         paths = _paths(session, parameters, request, pair_request)
         traced += request.spp
-    weights = frame.loss_derivative(found.others())
+    derivative = _derivative(problem, frame, found.variance, tolerance)
+    weights = derivative(found.others())
     previous: Tree = {}
     if pair_request is None:
         gradient = session.adjoint(parameters, paths, weights)
     else:
-        weights_previous = frame.loss_derivative(found.previous_others())
+        weights_previous = derivative(found.previous_others())
         gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
     return _FrameGradient(gradient, previous, loss, mean, traced * frame.pixels, found.info, kept)
+
+
+def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:
+    """The loss derivative of a frame's images; damped where the variance of its image is known, and the loss biased by it."""
+    loss = problem.loss
+    if not isinstance(frame, WholeView) or variance is None or not tolerance or loss.linear or not loss.pixelwise:
+        return frame.loss_derivative
+    around, reference = smoothed_variance(variance), problem.reference(frame.view)
+    return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
 
 
 def _paths(session: RenderSession, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:

@@ -14,7 +14,7 @@ from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
-__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest"]
+__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "variance_of_mean"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class ImageEstimate:
         paths: the renderer's record of the samples, for their replay.
         info: for people, e.g. {"control_weight": array}.
         previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
+        variance: of `mean()`, (H, W, 3), as far as it is known; None where it is not.
         filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
     """
 
@@ -33,6 +34,7 @@ class ImageEstimate:
     paths: Any
     info: Mapping[str, Any] = field(default_factory=dict)
     previous: Array | None = None
+    variance: Array | None = None
     filter: Callable[[Array], Array] | None = None
 
     def mean(self) -> Array:
@@ -53,6 +55,15 @@ class ImageEstimate:
             return images
         filtered = [self.filter(images[group]) for group in range(images.shape[0])]
         return arrays.concatenate([arrays.add_first_axis(image) for image in filtered])
+
+
+def variance_of_mean(images: Array) -> Array | None:
+    """The variance of the mean of independent images (groups, H, W, 3), from what they differ by; None for a single one."""
+    groups = images.shape[0]
+    if groups == 1:
+        return None
+    mean, square = arrays.mean_over_first(images), arrays.mean_over_first(images * images)
+    return arrays.maximum(square - mean * mean, 0.0) / (groups - 1)
 
 
 def _leave_one_out(images: Array) -> Array:

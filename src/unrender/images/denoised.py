@@ -87,7 +87,7 @@ class Denoised:
         found, kept = self.inner.estimate(
             problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
         )
-        return replace(found, filter=self._filter(problem)), kept
+        return replace(found, filter=self._filter(problem), variance=None), kept
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Always."""

@@ -8,7 +8,7 @@ from typing import Any
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, PairRequest
+from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
 from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
@@ -66,7 +66,8 @@ class Plain:
         else:
             session = problem.renderer.prepare(list(parameters), pair_request.space)
             rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
-        return ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous), None
+        variance = variance_of_mean(rendering.images)
+        return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance), None
 
     def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Never."""

@@ -15,7 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, PairRequest
+from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
 from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
@@ -179,7 +179,8 @@ class RecursiveControlVariate:
                 return self._combine_pixels(problem, state.snapshot, frame, rendering), None
             case WholeView():
                 if first:
-                    estimate = ImageEstimate(rendering.images, rendering.paths, previous=rendering.previous)
+                    variance = variance_of_mean(rendering.images)
+                    estimate = ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance)
                     return estimate, self._start(estimate.mean())
                 return self._combine_view(state.views[frame.view], rendering)
         raise InputError(f"RecursiveControlVariate: expected a whole view or a pixel mini-batch, got {frame!r}")
@@ -207,7 +208,9 @@ class RecursiveControlVariate:
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
         info = {"control_weight": weight, "variance": variance}
         previous = advance(memory.image, rendering.previous, rendering.previous, weight)
-        estimate = ImageEstimate(current, rendering.paths, info, previous)
+        if (within := variance_of_mean(rendering.images)) is not None:
+            variance = arrays.where(known, variance, relative * within)
+        estimate = ImageEstimate(current, rendering.paths, info, previous, variance)
         return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
 
     def advance(

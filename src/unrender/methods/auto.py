@@ -35,6 +35,8 @@ _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
 _VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
 """Positions are as large as the mesh, but a mesh does not survive steps of a tenth of that."""
+_TOLERANCE = 2.0
+"""See `PathGradient`."""
 _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
@@ -106,7 +108,9 @@ class AutoMethod(Options):
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             f"schedule-free Adam, first rate {first}",
         )
-        return Choice(PathGradient(image.estimator, sampler, spp), optimizer, tuple(filter(None, reasons)))
+        tolerance = _TOLERANCE if image.name == "rcv" and not problem.loss.linear else 0.0
+        estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance)
+        return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
     def _image(self, problem: Problem, whole: bool) -> _Image:
         if self.image == "plain":

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
@@ -26,8 +28,10 @@ _DELAY = 10.0
 """τ of the docstring, in steps."""
 _STEEPEST = 0.6
 """The greatest power of 1/t that the rate falls by: between 1/2 and 1, with averages, as in Polyak and Juditsky 1992."""
-_MEMORY = 0.9
+_MEMORY = 0.8
 """Decay of the mean correlation of successive gradients."""
+_LEAST_SIGNAL = 0.02
+"""The least factor of a step: gradients that were noise may come to tell something."""
 _PROJECTED = 1e-5
 """Relative difference from which a parameter counts as moved by its bounds; below it, as rounded."""
 
@@ -43,6 +47,8 @@ class ScheduleFreeState:
         average: x, the weighted mean of z.
         second_moment: exponentially weighted mean of the squared gradient, not debiased.
         gradient: the last one, preconditioned.
+        product, square: exponentially weighted sums of g_t g_{t-1}, and of the mean of the squares of both, per element of the
+            preconditioned parameters.
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor that the rate has fallen by}.
         begun: the step at which all this began.
@@ -54,6 +60,8 @@ class ScheduleFreeState:
     average: Tree
     second_moment: Tree
     gradient: Tree
+    product: Tree
+    square: Tree
     correlation: dict[str, float]
     log_rate: dict[str, float]
     begun: int = 0
@@ -66,6 +74,8 @@ class ScheduleFreeState:
             average=upsampler.tree(self.average),
             second_moment=upsampler.tree(self.second_moment, SQUARES),
             gradient=upsampler.tree(self.gradient, 1.0),
+            product=upsampler.tree(self.product, SQUARES),
+            square=upsampler.tree(self.square, SQUARES),
         )
 
     def restarted(self, fresh: ScheduleFreeState) -> ScheduleFreeState:
@@ -92,6 +102,14 @@ class ScheduleFree:
     with `growth` q, `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they
     agree, the rate grows; once they are noise it falls as t^-0.6. No faster: what is left of the signal has to arrive, and averages of
     iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
+
+    Each element's step is shortened by the share of its gradient that is signal, as Wiener's filter does,
+
+        max(s, 0.02),   s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩
+
+    with means ⟨·⟩ over the last steps and the channels of a cell, and S² over its neighbours: two gradients share the signal, not the
+    noise. Adam's division lets all elements walk alike, and those that the images tell little of would walk at random. Parameters that
+    are not in `preconditioned` have no neighbours, and whole steps.
 
     Parameters that bounds have moved take their iterates along.
 
@@ -155,7 +173,9 @@ class ScheduleFree:
         iterate = dict(parameters)
         zeros = trees.zeros_like(parameters)
         ones = dict.fromkeys(parameters, 1.0)
-        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, ones, dict.fromkeys(parameters, 0.0))
+        none = dict.fromkeys(parameters, 0.0)
+        near = {} if self.preconditioner is None else {key: zeros[key] for key in self.preconditioned}
+        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
         """See `Optimizer.update`. Waits for the device: the correlation of gradients is read."""
@@ -166,10 +186,12 @@ class ScheduleFree:
 
         gradient = {key: self._precondition(key, g) for key, g in estimate.gradient.items()}
         correlation, log_rate = dict(state.correlation), dict(state.log_rate)
+        product, square = state.product, state.square
         if made > 0:
             for key, found in _correlations(gradient, state.gradient).items():
                 correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
                 log_rate[key] += self._change(correlation[key], made)
+            product, square = _remember(product, square, gradient, state.gradient)
 
         steps: Tree = {}
         fast: Tree = {}
@@ -180,6 +202,8 @@ class ScheduleFree:
             second[key] = self.beta_2 * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = self._precondition(key, g / (root + self.epsilon))
+            if key in product:
+                direction = direction * arrays.like(self._signal(key, product[key], square[key], _MEMORY**made), g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             before, mean = self._within_bounds(state.fast[key], state.average[key], y)
             fast[key] = before + arrays.scalar(rate, g) * direction
@@ -192,6 +216,8 @@ class ScheduleFree:
             average=average,
             second_moment=second,
             gradient=gradient,
+            product=product,
+            square=square,
             correlation=correlation,
             log_rate=log_rate,
         )
@@ -210,6 +236,17 @@ class ScheduleFree:
     def _precondition(self, key: str, x: Array) -> Array:
         return x if self.preconditioner is None or key not in self.preconditioned else self.preconditioner.apply(x)
 
+    def _signal(self, key: str, product: Array, square: Array, unknown: float) -> np.ndarray:
+        """The share of signal per element, 1 as far as it is `unknown` yet."""
+        parts = [arrays.numpy(x).astype(np.float64) for x in (product, square)]
+        smooth = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
+        for _ in range(2):
+            smooth = np.asarray(self._precondition(key, smooth))
+        whole, squares = smooth[..., :1], smooth[..., 1:]
+        share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
+        share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
+        return np.broadcast_to(share, parts[0].shape).astype(np.float32)
+
     def _between(self, fast: Array, average: Array) -> Array:
         """y."""
         return fast + self.beta * (average - fast)
@@ -224,6 +261,14 @@ class ScheduleFree:
             return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
 
         return moved(fast), moved(average)
+
+
+def _remember(product: Tree, square: Tree, current: Tree, previous: Tree) -> tuple[Tree, Tree]:
+    """The sums of `ScheduleFreeState.product` and `square` after another step."""
+    pairs = {key: (current[key], previous[key]) for key in product}
+    products = {key: _MEMORY * product[key] + g * h for key, (g, h) in pairs.items()}
+    squares = {key: _MEMORY * square[key] + 0.5 * (g * g + h * h) for key, (g, h) in pairs.items()}
+    return products, squares
 
 
 def _correlations(current: Tree, previous: Tree) -> dict[str, float]:
