@@ -14,6 +14,7 @@ from benchmarks.real_input import run as real_input
 from benchmarks.runner.records import scratch
 
 TRAY = "bsdf_tray.base_color.data"
+_ALPHA = 0.1
 _BASE = "01_default_BaseColor.png"
 
 
@@ -36,7 +37,29 @@ def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[st
     return TRAY, 1
 
 
-SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray}
+def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """The tutorials' cbox.xml as it is, but for its mirror, which is rough: two walls' reflectances and the roughness unknown."""
+    del texture
+    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    rough = f'<bsdf type="roughconductor" id="mirror"><float name="alpha" value="{_ALPHA}"/></bsdf>'
+    text = text.replace('<bsdf type="conductor" id="mirror"/>', rough)
+    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
+    (folder / "scene.xml").write_text(text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>'))
+    red, green = (
+        re.search(rf'id="{name}">\s*<rgb name="reflectance" value="(.*?)"', text) for name in ("red", "green")
+    )
+    if red is None or green is None:
+        raise ur.InputError("cbox.xml: no walls red and green")
+    found = {
+        f"{name}.reflectance.value": (0.5, [float(x) for x in match[1].split(",")])
+        for name, match in (("red", red), ("green", green))
+    }
+    return {**found, "mirror.alpha.value": (0.3, [_ALPHA])}, 1
+
+
+SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray, "numbers": _numbers}
+"""Each writes scene.xml, and returns the key of a texture, whose truth it wrote as truth.exr, or {key: (initial, truth)}; and the number of
+views."""
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 DEPTH = 6
 
@@ -46,7 +69,7 @@ def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) ->
     scene, loss = name.split(", ")
     folder = scratch(f"suite/{scene}-{resolution}-{texture}")
     folder.mkdir(parents=True, exist_ok=True)
-    key, views = SCENES[scene](assets.resolve(), folder, resolution, texture)
+    unknown, views = SCENES[scene](assets.resolve(), folder, resolution, texture)
     kept = folder / f"references-{spp}.npz"
     if not kept.exists():
         loaded, path = mi.load_file(str(folder / "scene.xml")), mi.load_dict({"type": "path", "max_depth": DEPTH})
@@ -64,13 +87,14 @@ def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) ->
         np.savez(kept, *images)
     with np.load(kept) as found:
         references = [found[f"arr_{view}"].astype(np.float32) for view in range(views)]
-    truth = np.array(mi.Bitmap(str(folder / "truth.exr")))[..., :3]
+    if isinstance(unknown, str):
+        unknown = {unknown: (0.5, np.array(mi.Bitmap(str(folder / "truth.exr")))[..., :3])}
     return ur.Problem(
         folder / "scene.xml",
-        [ur.Parameter(key, initial=0.5)],
+        [ur.Parameter(key, initial=initial) for key, (initial, _) in unknown.items()],
         [ur.View(reference, sensor=view) for view, reference in enumerate(references)],
         loss=LOSSES[loss],
         max_depth=DEPTH,
-        truth={key: truth},
+        truth={key: np.array(truth, np.float32) for key, (_, truth) in unknown.items()},
         name=name,
     )

@@ -8,6 +8,16 @@ from benchmarks import markdown
 from benchmarks.runner.records import Record
 
 
+def readme_rows(record: Record) -> list[str]:
+    """The rows of README's table: errors at the end, and how much earlier `auto` is at the loop's best."""
+    return [
+        f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | {entry['speed']:.2g} |"
+        if entry["speed"]
+        else f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | never |"
+        for name, entry in record["problems"].items()
+    ]
+
+
 def table(record: Record) -> str:
     """Error at the end, and the time to the tuned loop's best error."""
     settings, problems = record["settings"], record["problems"]

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["DEFAULT_SECONDS", "compare"]
 
 DEFAULT_SECONDS = 20.0
+_DEFAULT = ("stock", "auto")
+"""What people have, and what they get here without an option."""
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
@@ -35,7 +37,10 @@ def compare(
         typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run here, or run folders made earlier."),
     ],
     methods: Annotated[
-        str | None, typer.Option(metavar="NAME,NAME", help="Methods to run; the first is the measure of the others.")
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME", help="Methods to run; the first is the measure of the others. [default: stock,auto]"
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -167,7 +172,7 @@ def _parse_methods(names: str | None) -> list[Method]:
     from unrender.methods import method
 
     if names is None:
-        return [method("plain"), method("rcv")]
+        return [method(name) for name in _DEFAULT]
     chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
     if not chosen:
         raise InputError("--methods: expected at least one name")
