@@ -47,5 +47,7 @@ def test_variances_are_averaged_over_neighbours():
 
 def test_the_variance_of_a_mean_is_that_of_numpy():
     images = np.random.default_rng(0).normal(3.0, 1.0, (7, 5, 4, 3))
-    np.testing.assert_allclose(variance_of_mean(images), images.var(axis=0, ddof=1) / 7, rtol=1e-9)
+    found = variance_of_mean(images)
+    assert found is not None
+    np.testing.assert_allclose(found, images.var(axis=0, ddof=1) / 7, rtol=1e-9)
     assert variance_of_mean(images[:1]) is None

@@ -37,10 +37,7 @@ def compare(
         typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run here, or run folders made earlier."),
     ],
     methods: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,NAME", help="Methods to run; the first is the measure of the others. [default: stock,auto]"
-        ),
+        str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
     ] = None,
     settings: Annotated[
         list[str] | None,
