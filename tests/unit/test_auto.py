@@ -50,7 +50,10 @@ def test_images_have_a_memory(loss: Any) -> None:
     assert estimator == PathGradient(images.RecursiveControlVariate("path"), spp=module._MOST, tolerance=tolerance)
     estimator, _ = chosen(problem(loss, shares_paths=False))
     assert estimator.image == images.RecursiveControlVariate("primary")
-    assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6)
+    assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6, tolerance=tolerance)
+    assert chosen(problem(loss), tolerance=0)[0].tolerance == 0
+    reasons = method("auto").choose(problem(loss), {}).reasons
+    assert any("damped where noise exceeds the residual" in line for line in reasons) == (not loss.linear)
 
 
 def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,8 +118,9 @@ def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_says_what_it_has_chosen_and_why() -> None:
     said = method("auto").choose(problem(losses.L1())).reasons
     assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
-    assert said[1] == "Sobolev gradients of map"
-    assert said[2] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
+    assert said[1] == "L1 damped where noise exceeds the residual"
+    assert said[2] == "Sobolev gradients of map"
+    assert said[3] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
     assert method("rcv").choose(problem()).reasons == ()
 
 

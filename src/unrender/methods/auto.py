@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from unrender import pixels
 from unrender.core import arrays
@@ -36,7 +36,7 @@ _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 _VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
 """Positions are as large as the mesh, but a mesh does not survive steps of a tenth of that."""
 _TOLERANCE = 2.0
-"""See `PathGradient`."""
+"""κ of `PathGradient`."""
 _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
@@ -73,6 +73,9 @@ class AutoMethod(Options):
     pixels: PositiveInt | None = Field(
         None, description="pixels a step, drawn from all views; none for all pixels, or 262144 where views are large"
     )
+    tolerance: NonNegativeFloat = Field(
+        _TOLERANCE, description="times its noise, within which L1 and Huber count a residual by its size, not its sign"
+    )
     smooth: bool = Field(True, description="whether textures and grids move along Sobolev gradients")
     learning_rate: PositiveFloat = Field(
         _RATE,
@@ -100,15 +103,17 @@ class AutoMethod(Options):
             preconditioner=Sobolev() if smoothed else None,
             preconditioned=smoothed,
         )
+        biased = problem.loss.pixelwise and not problem.loss.linear
+        tolerance = self.tolerance if biased and isinstance(sampler, pixels.All) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         first = ", ".join(f"{rate:.3g} ({key})" for key, rate in {**rates, **problem.learning_rates}.items())
         reasons = (
             f"{kind}, {spp} samples per pixel: {image.reason}",
             drawn,
+            f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             f"schedule-free Adam, first rate {first}",
         )
-        tolerance = _TOLERANCE if image.name == "rcv" and not problem.loss.linear else 0.0
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance)
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
