@@ -10,6 +10,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import SampleRequest, mi, prepare
+from benchmarks.stock_loop import step_seed
 
 _WHOLE = 3
 """Steps that are made whole; later ones are made in part, as noise has to be averaged."""
@@ -41,7 +42,7 @@ def fixed_point(
             values = {key: mi.TensorXf(value) for key, value in x.items()}
             above, below = ({key: np.zeros(value.shape) for key, value in x.items()} for _ in range(2))
             for view, reference in enumerate(references):
-                sensor, number = problem.views[view].sensor, (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
+                sensor, number = problem.views[view].sensor, step_seed(seed, step, view)
                 image = session.image(values, SampleRequest(sensor, spp, number)).images
                 paths = session.image(values, SampleRequest(sensor, spp, number + 1)).paths
                 for weights, sums in ((reference, above), (image, below)):

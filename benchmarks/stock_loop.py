@@ -13,6 +13,11 @@ import unrender as ur
 from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 
 
+def step_seed(seed: int, step: int, view: int) -> int:
+    """The first of two seeds of a view at a step, which no other step of the run has."""
+    return (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
+
+
 def stock_loop(
     problem: ur.Problem,
     spp: int,
@@ -46,7 +51,7 @@ def stock_loop(
             began = time.perf_counter()
             loss: Any = 0.0
             for view in range(len(problem.views)):
-                number = (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
+                number = step_seed(seed, step, view)
                 image = mi.render(
                     scene,
                     parameters,

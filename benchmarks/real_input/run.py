@@ -34,10 +34,16 @@ def photograph(path: Path, size: int = TEXTURE) -> np.ndarray:
     return np.clip(small, 0.02, 0.95).astype(np.float32)
 
 
+def cornell_box(assets: Path, resolution: int) -> str:
+    """The tutorials' cbox.xml, with pixels whose samples are their own."""
+    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
+    return text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>')
+
+
 def cbox(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
     """The Cornell box, its back wall with texture coordinates and a photograph."""
     mi.Bitmap(photograph(assets / "tutorials/textures/flower_photo.jpeg", texture)).write(str(folder / "truth.exr"))
-    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
     wall = (assets / "tutorials/meshes/cbox_back.obj").read_text()
     wall = wall.replace("f 1 2 3 4", "vt 1 0\nvt 1 1\nvt 0 1\nvt 0 0\nf 1/1 2/2 3/3 4/4")
     (folder / "back.obj").write_text(wall)
@@ -46,9 +52,8 @@ def cbox(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) ->
         '<boolean name="raw" value="true"/></texture></bsdf>'
     )
     back = f'<shape type="obj" id="back"><string name="filename" value="back.obj"/>{paper}</shape>'
-    text = re.sub(r'<shape type="obj" id="back">.*?</shape>', back, text, flags=re.DOTALL)
-    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
-    (folder / "scene.xml").write_text(text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>'))
+    box = cornell_box(assets, resolution)
+    (folder / "scene.xml").write_text(re.sub(r'<shape type="obj" id="back">.*?</shape>', back, box, flags=re.DOTALL))
     return "back.bsdf.reflectance.data", 1
 
 

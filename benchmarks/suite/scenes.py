@@ -40,11 +40,9 @@ def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[st
 def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """The tutorials' cbox.xml as it is, but for its mirror, which is rough: two walls' reflectances and the roughness unknown."""
     del texture
-    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
     rough = f'<bsdf type="roughconductor" id="mirror"><float name="alpha" value="{_ALPHA}"/></bsdf>'
-    text = text.replace('<bsdf type="conductor" id="mirror"/>', rough)
-    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
-    (folder / "scene.xml").write_text(text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>'))
+    text = real_input.cornell_box(assets, resolution).replace('<bsdf type="conductor" id="mirror"/>', rough)
+    (folder / "scene.xml").write_text(text)
     red, green = (
         re.search(rf'id="{name}">\s*<rgb name="reflectance" value="(.*?)"', text) for name in ("red", "green")
     )

@@ -10,12 +10,11 @@ from benchmarks.runner.records import Record
 
 def readme_rows(record: Record) -> list[str]:
     """The rows of README's table: errors at the end, and how much earlier `auto` is at the loop's best."""
-    return [
-        f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | {entry['speed']:.2g} |"
-        if entry["speed"]
-        else f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | never |"
-        for name, entry in record["problems"].items()
-    ]
+    rows = []
+    for name, entry in record["problems"].items():
+        speed = f"{entry['speed']:.2g}" if entry["speed"] else "never"
+        rows.append(f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | {speed} |")
+    return rows
 
 
 def table(record: Record) -> str:

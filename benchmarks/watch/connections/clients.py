@@ -86,4 +86,5 @@ async def main(address: str, idle_count: int, busy_count: int, seconds: float, o
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]), int((*sys.argv, "1")[5])))
+    owners = int(sys.argv[5]) if len(sys.argv) > 5 else 1
+    asyncio.run(main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]), owners))
