@@ -36,8 +36,9 @@ def test_run_recovers_the_wall_and_leaves_a_run_folder(unrender, problem: Path, 
     assert names(folder) == FILES
     record = json.loads((folder / "run.json").read_text())
     assert (record["name"], record["method"], record["seed"], record["stopped"]) == ("problem", "auto", 3, "steps")
-    assert record["settings"]["choices"][0].startswith("recursive control variates, 16 samples per pixel")
-    assert f"auto: {record['settings']['choices'][-1]}" in answer.out
+    assert record["choices"][0].startswith("recursive control variates, 16 samples per pixel")
+    assert f"auto: {record['choices'][-1]}" in answer.out
+    assert record["adapted"][0].startswith(f"learning rate, over the first: {KEY} ")
     assert record["command"].startswith("unrender run problem.toml --steps 90 --set learning_rate=0.02")
     assert record["settings"]["options"]["learning_rate"] == 0.02
     with np.load(folder / "parameters.npz") as found:

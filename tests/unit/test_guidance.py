@@ -69,15 +69,22 @@ def test_constructors_still_take_their_own_options() -> None:
 
 
 def test_a_method_s_name_stands_for_its_parts() -> None:
-    assert resolve(problem(), "rcv", None) == method("rcv").start()
-    estimator, optimizer = resolve(problem(), "rcv", optimizers.SGD(0.1))
-    assert isinstance(estimator.image, RecursiveControlVariate)  # pyright: ignore[reportAttributeAccessIssue]
-    assert optimizer == optimizers.SGD(0.1)
+    chosen = resolve(problem(), "rcv", None)
+    assert (chosen.estimator, chosen.optimizer) == method("rcv").start()
+    chosen = resolve(problem(), "rcv", optimizers.SGD(0.1))
+    assert isinstance(chosen.estimator.image, RecursiveControlVariate)  # pyright: ignore[reportAttributeAccessIssue]
+    assert chosen.optimizer == optimizers.SGD(0.1)
 
 
 def test_a_run_by_a_method_s_name() -> None:
     result = optimize(problem(), "plain", steps=3)
-    assert (result.method, result.steps) == ("plain", 3)
+    assert (result.method, result.steps, result.choices, result.adapted) == ("plain", 3, [], [])
+
+
+def test_a_run_says_what_was_chosen_and_found() -> None:
+    result = optimize(problem(), steps=3)
+    assert result.choices[-1].startswith("schedule-free Adam, first rate 0.05 (wall)")
+    assert result.adapted[-1].startswith("learning rate, over the first: ")
     assert estimate(problem(), "plain").gradient["wall"].shape == (3,)
 
 

@@ -61,12 +61,12 @@ def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -
     for line in choice.reasons:
         console.print(f"{plan.method.name}: {escape(line)}", soft_wrap=True)
     options = plan.method.configure(plan.settings).model_dump()
-    settings = {"options": options, "problem_options": dict(plan.problem_settings), "choices": list(choice.reasons)}
+    settings = {"options": options, "problem_options": dict(plan.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
     for line in advice.remarks(plan.problem, choice.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
-    annotations = RunAnnotations(plan.method.name, settings, plan.command, plan.final_spp, earlier)
+    annotations = RunAnnotations(plan.method.name, settings, choice.reasons, plan.command, plan.final_spp, earlier)
     live = Live(directory, plan.problem.name, plan.method.name, plan.command)
     result = optimize(
         plan.problem,

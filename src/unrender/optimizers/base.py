@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 
-__all__ = ["Optimizer"]
+__all__ = ["Choosing", "Optimizer"]
 
 
 class Optimizer(Protocol):
@@ -29,4 +29,13 @@ class Optimizer(Protocol):
 
     def update(self, estimate: Estimate, state: Any, parameters: Tree) -> tuple[Tree, Any]:
         """The steps to add to the parameters, and the next state."""
+        ...
+
+
+@runtime_checkable
+class Choosing(Protocol):
+    """An optimizer that finds settings of its own as it goes."""
+
+    def choices(self, state: Any) -> tuple[str, ...]:
+        """What it has chosen so far, a line each, for people."""
         ...

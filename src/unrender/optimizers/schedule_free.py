@@ -16,6 +16,8 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
+from unrender.optimizers.strength import StrengthFit
+from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
@@ -51,6 +53,7 @@ class ScheduleFreeState:
             preconditioned parameters.
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor that the rate has fallen by}.
+        strengths: {key: how strongly the gradient is smoothed}, where that is fitted.
         begun: the step at which all this began.
     """
 
@@ -64,6 +67,7 @@ class ScheduleFreeState:
     square: Tree
     correlation: dict[str, float]
     log_rate: dict[str, float]
+    strengths: dict[str, StrengthFit]
     begun: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> ScheduleFreeState:
@@ -124,6 +128,7 @@ class ScheduleFree:
         schedule: a further factor of every learning rate by step; see `unrender.schedules.functions`.
         preconditioner: S, applied to the gradients and to the steps of z of the parameters in `preconditioned`. In place of the
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
+            The strength of `Sobolev` is the greatest that is of use: it is fitted to the first gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
     """
 
@@ -175,7 +180,11 @@ class ScheduleFree:
         ones = dict.fromkeys(parameters, 1.0)
         none = dict.fromkeys(parameters, 0.0)
         near = {} if self.preconditioner is None else {key: zeros[key] for key in self.preconditioned}
-        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none)
+        smooth = self.preconditioner
+        fits = {
+            key: StrengthFit.begun(smooth, arrays.shape(x)) for key, x in near.items() if isinstance(smooth, Sobolev)
+        }
+        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
         """See `Optimizer.update`. Waits for the device: the correlation of gradients is read."""
@@ -184,7 +193,9 @@ class ScheduleFree:
         factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
         weight = (1.0 + self.averaging) / (made + 1.0 + self.averaging)
 
-        gradient = {key: self._precondition(key, g) for key, g in estimate.gradient.items()}
+        strengths = self._fitted(state, estimate.gradient) if made > 0 else state.strengths
+        maps = self._preconditioners(strengths)
+        gradient = {key: maps[key].apply(g) if key in maps else g for key, g in estimate.gradient.items()}
         correlation, log_rate = dict(state.correlation), dict(state.log_rate)
         product, square = state.product, state.square
         if made > 0:
@@ -201,9 +212,10 @@ class ScheduleFree:
             y = parameters[key]
             second[key] = self.beta_2 * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
-            direction = self._precondition(key, g / (root + self.epsilon))
-            if key in product:
-                direction = direction * arrays.like(self._signal(key, product[key], square[key], _MEMORY**made), g)
+            direction = g / (root + self.epsilon)
+            if key in maps:
+                share = _signal(maps[key], product[key], square[key], _MEMORY**made)
+                direction = maps[key].apply(direction) * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             before, mean = self._within_bounds(state.fast[key], state.average[key], y)
             fast[key] = before + arrays.scalar(rate, g) * direction
@@ -220,8 +232,16 @@ class ScheduleFree:
             square=square,
             correlation=correlation,
             log_rate=log_rate,
+            strengths=strengths,
         )
         return steps, following
+
+    def choices(self, state: ScheduleFreeState) -> tuple[str, ...]:
+        """See `Choosing`: how strongly gradients are smoothed, and how far the rate has come."""
+        fitted = (f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count)
+        changed = (f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items() if state.step > state.begun)
+        lines = {"smoothing, as a share of the strongest": fitted, "learning rate, over the first": changed}
+        return tuple(f"{what}: {found}" for what, parts in lines.items() if (found := ", ".join(parts)))
 
     @property
     def _given_rates(self) -> Mapping[str, float]:
@@ -233,19 +253,21 @@ class ScheduleFree:
         power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
         return self.growth * max(0.0, 2.0 * correlation - 1.0) - power / (made + _DELAY)
 
-    def _precondition(self, key: str, x: Array) -> Array:
-        return x if self.preconditioner is None or key not in self.preconditioned else self.preconditioner.apply(x)
+    def _fitted(self, state: ScheduleFreeState, gradient: Tree) -> dict[str, StrengthFit]:
+        """The strengths after another gradient."""
+        smooth = self.preconditioner
+        if not isinstance(smooth, Sobolev):
+            return state.strengths
+        return {key: fit.after(smooth, state.gradient[key], gradient[key]) for key, fit in state.strengths.items()}
 
-    def _signal(self, key: str, product: Array, square: Array, unknown: float) -> np.ndarray:
-        """The share of signal per element, 1 as far as it is `unknown` yet."""
-        parts = [arrays.numpy(x).astype(np.float64) for x in (product, square)]
-        smooth = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
-        for _ in range(2):
-            smooth = np.asarray(self._precondition(key, smooth))
-        whole, squares = smooth[..., :1], smooth[..., 1:]
-        share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
-        share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
-        return np.broadcast_to(share, parts[0].shape).astype(np.float32)
+    def _preconditioners(self, strengths: Mapping[str, StrengthFit]) -> dict[str, Preconditioner]:
+        """{key: S} of the parameters that have one."""
+        smooth = self.preconditioner
+        if smooth is None:
+            return {}
+        if not isinstance(smooth, Sobolev):
+            return dict.fromkeys(self.preconditioned, smooth)
+        return {key: smooth.scaled(fit.share) for key, fit in strengths.items()}
 
     def _between(self, fast: Array, average: Array) -> Array:
         """y."""
@@ -261,6 +283,18 @@ class ScheduleFree:
             return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
 
         return moved(fast), moved(average)
+
+
+def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float) -> np.ndarray:
+    """The share of signal per element, 1 as far as it is `unknown` yet."""
+    parts = [arrays.numpy(x).astype(np.float64) for x in (product, square)]
+    means = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
+    for _ in range(2):
+        means = np.asarray(smooth.apply(means))
+    whole, squares = means[..., :1], means[..., 1:]
+    share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
+    share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
+    return np.broadcast_to(share, parts[0].shape).astype(np.float32)
 
 
 def _remember(product: Tree, square: Tree, current: Tree, previous: Tree) -> tuple[Tree, Tree]:

@@ -23,12 +23,14 @@ from unrender.core.errors import InputError
 __all__ = [
     "CholeskySolver",
     "Solver",
+    "Transform",
     "TransformSolver",
     "check",
     "laplacian",
     "per_axis",
     "solver",
     "square_root_solver",
+    "transform",
     "wraps",
 ]
 
@@ -62,34 +64,59 @@ class CholeskySolver:
         return result.reshape(x.shape)
 
 
-class TransformSolver:
-    """By the transform in which L is diagonal: n log n, nothing to factorise. Solves (I + λ L)^power y = x."""
+class Transform:
+    """The orthonormal transform in which L is diagonal: of cosines along axes with a border, Fourier's along axes that wrap.
 
-    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0):
+    Attributes:
+        eigenvalues: of L, (*grid, 1).
+    """
+
+    def __init__(self, grid: tuple[int, ...], wrap: tuple[bool, ...]):
         self._bordered = [axis for axis, wraps in enumerate(wrap) if not wraps]
         self._wrapped = [axis for axis, wraps in enumerate(wrap) if wraps]
-        eigenvalues = np.zeros(grid)
+        self.eigenvalues = np.zeros((*grid, 1))
         for axis, (size, wraps) in enumerate(zip(grid, wrap, strict=True)):
             turn = (2.0 if wraps else 1.0) * np.pi / size
             along = 2.0 - 2.0 * np.cos(turn * np.arange(size))
-            eigenvalues += along.reshape([-1 if a == axis else 1 for a in range(len(grid))])
-        self._gain = ((1.0 + strength * eigenvalues) ** -power)[..., None].astype(np.float32)
+            self.eigenvalues += along.reshape([-1 if a == axis else 1 for a in range(len(grid) + 1)])
 
-    def solve(self, x: np.ndarray) -> np.ndarray:
-        """See `Solver.solve`."""
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        """The spectrum of x, (*grid, channels), float32; complex where axes wrap."""
         import scipy.fft
 
         y = np.asarray(x, np.float32)
         if self._bordered:
             y = np.asarray(scipy.fft.dctn(y, axes=self._bordered, norm="ortho"))
+        return np.asarray(scipy.fft.fftn(y, axes=self._wrapped, norm="ortho")) if self._wrapped else y
+
+    def backward(self, spectrum: np.ndarray) -> np.ndarray:
+        """The array that has this spectrum, float32."""
+        import scipy.fft
+
+        y = spectrum
         if self._wrapped:
-            spectrum = np.asarray(scipy.fft.fftn(y, axes=self._wrapped)) * self._gain
-            y = np.real(np.asarray(scipy.fft.ifftn(spectrum, axes=self._wrapped)))
-        else:
-            y = y * self._gain
+            y = np.real(np.asarray(scipy.fft.ifftn(y, axes=self._wrapped, norm="ortho")))
         if self._bordered:
             y = np.asarray(scipy.fft.idctn(y, axes=self._bordered, norm="ortho"))
         return np.ascontiguousarray(y, np.float32)
+
+
+class TransformSolver:
+    """By the transform in which L is diagonal: n log n, nothing to factorise. Solves (I + λ L)^power y = x."""
+
+    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0):
+        self._transform = transform(grid, wrap)
+        self._gain = ((1.0 + strength * self._transform.eigenvalues) ** -power).astype(np.float32)
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        """See `Solver.solve`."""
+        return self._transform.backward(self._transform.forward(x) * self._gain)
+
+
+@lru_cache(maxsize=16)
+def transform(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Transform:
+    """The transform of one grid, made once; `wrap` says per axis whether its two ends are neighbours."""
+    return Transform(grid, wrap)
 
 
 @lru_cache(maxsize=16)

@@ -54,6 +54,8 @@ def facts(record: RunRecord) -> dict[str, str]:
         {
             "problem": {"name": record.name, **record.problem.description},
             "method": record.method,
+            "choices": "; ".join(record.choices),
+            "adapted": "; ".join(record.adapted),
             "settings": record.settings,
             "seed": record.seed,
             "time": formatting.phases(record.phases),

@@ -8,14 +8,14 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.methods import method, methods
-from unrender.optimizers.base import Optimizer
+from unrender.methods.base import Choice
 from unrender.problem.problem import Problem
 
 __all__ = ["resolve", "resolve_estimator"]
 
 
-def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator, Optimizer]:
-    """Both parts.
+def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Choice:
+    """Both parts, and why a method chose them.
 
     Args:
         problem: what methods choose their parts for.
@@ -27,8 +27,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator
             object.
     """
     if optimizer is None and isinstance(estimator, str):
-        choice = method(estimator).choose(problem)
-        return choice.estimator, choice.optimizer
+        return method(estimator).choose(problem)
     chosen = resolve_estimator(problem, estimator)
     if optimizer is None:
         raise InputError(
@@ -36,7 +35,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> tuple[Estimator
         )
     if not _is_component(optimizer, "requires", "init", "update"):
         raise InputError(f"optimize: optimizer: {_instead_of_optimizer(optimizer)}")
-    return chosen, optimizer
+    return Choice(chosen, optimizer)
 
 
 def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize") -> Estimator:

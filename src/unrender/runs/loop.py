@@ -13,7 +13,7 @@ from unrender.core import arrays, phases, trees
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.optimizers.base import Optimizer
+from unrender.optimizers.base import Choosing, Optimizer
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
@@ -46,7 +46,9 @@ class Descent:
 
     def result(self, info: bool = False) -> Result:
         """What the run has reached so far; with `info`, what the last estimate tells besides."""
-        return self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info)
+        optimizer = self.run.optimizer
+        adapted = optimizer.choices(self.state.optimizer) if isinstance(optimizer, Choosing) else ()
+        return self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
 
     def snapshot(self) -> dict[str, Any]:
         """All that decides what the next steps do."""

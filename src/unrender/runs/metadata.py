@@ -27,6 +27,7 @@ class RunAnnotations:
     Attributes:
         method: its name; "" for the estimator's.
         settings: of the method, as JSON can hold them.
+        choices: what the method chose and why, one line each.
         command: what was typed.
         final_spp: samples per pixel of the final pictures; None chooses.
         phases: {phase: seconds} of what came before, such as loading.
@@ -34,6 +35,7 @@ class RunAnnotations:
 
     method: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    choices: Sequence[str] = ()
     command: str = ""
     final_spp: int | None = None
     phases: Mapping[str, float] = field(default_factory=dict)
@@ -55,13 +57,14 @@ class RunMetadata:
     history: list[dict[str, Any]] = field(default_factory=list)
     warmup_seconds: float = 0.0
 
-    def result(self, run: Run, warnings: Sequence[str] = (), info: bool = False) -> Result:
+    def result(self, run: Run, warnings: Sequence[str] = (), info: bool = False, adapted: Sequence[str] = ()) -> Result:
         """What the run has reached so far.
 
         Args:
             run: the run.
             warnings: lines beside those of the run.
             info: whether to include `Estimate.info` of the last step.
+            adapted: see `Result.adapted`.
         """
         return Result(
             parameters=run.full(),
@@ -73,6 +76,7 @@ class RunMetadata:
             skipped=run.skipped,
             warnings=[*run.warnings, *warnings],
             info=to_numpy(run.estimate.info) if info and run.estimate else {},
+            adapted=list(adapted),
             **self.description,
         )
 
@@ -94,6 +98,7 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
         "name": problem.name,
         "method": annotations.method or describe(run.estimator),
         "settings": {**annotations.settings, **components, "steps": run.steps, "seconds": run.seconds},
+        "choices": list(annotations.choices),
         "seed": run.seed,
         "command": annotations.command,
         "problem": {

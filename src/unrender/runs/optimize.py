@@ -86,15 +86,15 @@ def optimize(
             cannot be begun, or cannot be written in the end; a run goes on in another thread.
     """
     named = estimator
-    estimator, optimizer = components.resolve(problem, estimator, optimizer)
-    check(estimator, optimizer, steps, seconds)
+    choice = components.resolve(problem, estimator, optimizer)
+    check(choice.estimator, choice.optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
     if isinstance(named, str) and not annotations.method:
-        annotations = replace(annotations, method=named)
-    run, state = prepare(problem, estimator, optimizer, steps, seconds, seed)
-    run.warnings += advice.remarks(problem, optimizer)
+        annotations = replace(annotations, method=named, choices=choice.reasons)
+    run, state = prepare(problem, choice.estimator, choice.optimizer, steps, seconds, seed)
+    run.warnings += advice.remarks(problem, choice.optimizer)
     log = RunMetadata(describe_run(run, annotations), run.full())
     with _progress(progress) as shown:
         return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)

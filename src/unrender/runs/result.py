@@ -51,6 +51,8 @@ class Result:
         warnings: one line each.
         info: of the last estimate, as NumPy arrays.
         name, method, settings, seed, command, problem: what was run.
+        choices: what the method chose for the problem and why, one line each.
+        adapted: what the optimizer has found as it went, such as how far its rates have changed, one line each.
         resumed: the steps at which it was resumed.
         truth: {key: array} where it is known.
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
@@ -72,6 +74,8 @@ class Result:
     name: str = "problem"
     method: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    choices: Sequence[str] = ()
+    adapted: Sequence[str] = ()
     seed: int = 0
     command: str = ""
     problem: Mapping[str, Any] = field(default_factory=dict)
@@ -146,6 +150,8 @@ class Result:
             "name": self.name,
             "method": self.method,
             "settings": dict(self.settings),
+            "choices": list(self.choices),
+            "adapted": list(self.adapted),
             "seed": self.seed,
             "command": self.command,
             "versions": versions(),

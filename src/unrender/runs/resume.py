@@ -127,7 +127,9 @@ class _UnusableCheckpoint(InputError):
 def _metadata(run: Run, stored: StoredRun, initial: dict[str, np.ndarray], fingerprint: dict[str, str]) -> RunMetadata:
     """What the result is to say of the run beside what it found."""
     record = stored.record
-    annotations = RunAnnotations(record.method, _method_settings(record), record.command, stored.method.final_spp)
+    annotations = RunAnnotations(
+        record.method, _method_settings(record), record.choices, record.command, stored.method.final_spp
+    )
     log = RunMetadata(describe_run(run, annotations), initial)
     log.description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
     return log

@@ -96,6 +96,7 @@ class RunRecord(BaseModel):
         status: what the run does or how it ended.
         name: of the problem.
         method, settings: how it was run.
+        choices, adapted: see `Result`.
         seed: of all random numbers.
         command: what was typed; "" for a run of the library.
         versions, hardware, variant: on what it ran.
@@ -113,6 +114,8 @@ class RunRecord(BaseModel):
     name: StrictStr
     method: StrictStr
     settings: dict[StrictStr, Any] = {}
+    choices: list[StrictStr] = []
+    adapted: list[StrictStr] = []
     seed: Annotated[StrictInt, Field(ge=-(2**63), lt=2**63)] = 0
     command: StrictStr = ""
     versions: dict[StrictStr, Any] = {}

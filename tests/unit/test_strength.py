@@ -1,0 +1,105 @@
+"""How strongly gradients are smoothed: closed forms, and what is chosen for detail, for regions, for noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from unrender.estimators.base import Estimate
+from unrender.optimizers import ScheduleFree
+from unrender.optimizers.strength import STEPS, StrengthFit
+from unrender.preconditioners import LargeSteps, Sobolev
+
+SHAPE = (32, 32, 1)
+BOARD = (np.indices(SHAPE[:2]).sum(0)[..., None] % 2 * 2.0 - 1.0).astype(np.float32)
+
+
+def normal(seed: int, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def fitted(gradient: Callable[[int], np.ndarray], steps: int = STEPS) -> StrengthFit:
+    """After the gradients of a function of the step."""
+    smooth = Sobolev()
+    fit, previous = StrengthFit.begun(smooth, SHAPE), smooth.apply(gradient(0))
+    for step in range(1, steps + 1):
+        found = gradient(step)
+        fit = fit.after(smooth, previous, found)
+        previous = smooth.scaled(fit.share).apply(found)
+    return fit
+
+
+@pytest.mark.parametrize("wrap", [False, True, (True, False)])
+def test_descents_are_products_of_smoothed_gradients(wrap: bool | tuple[bool, ...]):
+    smooth, shares = Sobolev(6.0, wrap), np.array([1.0, 0.25, 0.0])
+    one, other = normal(0, (9, 7, 2)), normal(1, (9, 7, 2))
+    found = smooth.descents(smooth.apply(one), other, shares)
+    for share, (product, square) in zip(shares, found.T, strict=True):
+        smoothed, as_much = (Sobolev(6.0 * share, wrap).apply(x).astype(float) for x in (one, other))
+        assert product == pytest.approx((smoothed * as_much).sum(), rel=1e-3, abs=1e-3)
+        assert square == pytest.approx((smoothed * smoothed).sum(), rel=1e-4)
+
+
+def test_a_share_of_the_strength_is_that_of_a_given_and_of_a_found_one():
+    assert Sobolev(8.0).scaled(0.25) == Sobolev(2.0)
+    assert Sobolev().scaled(0.25).strength_of(SHAPE) == pytest.approx(0.25 * Sobolev().strength_of(SHAPE))
+
+
+def test_regions_and_noise_keep_the_strength_and_detail_takes_it_away():
+    assert fitted(lambda step: np.ones(SHAPE, np.float32)).share == 1.0
+    assert fitted(lambda step: 0.2 + normal(step)).share == 1.0
+    assert fitted(lambda step: BOARD).share < 0.1
+    assert fitted(lambda step: np.zeros(SHAPE, np.float32)).share == 1.0
+    assert fitted(lambda step: (-1.0) ** step * BOARD).share == 1.0, "gradients that contradict each other tell nothing"
+
+
+def test_the_share_is_where_steps_descend_by_the_least():
+    """A gradient of white noise that stays: its descent by the share chosen, over that by the least smoothing."""
+    signal, smooth = normal(5), Sobolev()
+    fit = fitted(lambda step: signal)
+    assert 0.01 < fit.share < 0.9
+    product, square = smooth.descents(
+        smooth.apply(signal), signal, np.array([fit.share, 0.25 ** (fit.sums.shape[1] - 1)])
+    )
+    chosen, weakest = product / np.sqrt(square)
+    assert chosen == pytest.approx(0.4 * weakest, rel=0.1)
+
+
+def test_it_is_fitted_to_the_first_gradients_alone():
+    def turning(step: int) -> np.ndarray:
+        return np.ones(SHAPE, np.float32) if step <= STEPS else BOARD
+
+    assert fitted(turning, 3 * STEPS).share == 1.0
+    assert fitted(turning, 3 * STEPS).count == STEPS
+
+
+def test_a_checkerboard_is_recovered():
+    """A bowl whose minimum alternates from texel to texel, by 60 steps; by full strength most of it is still missing."""
+
+    def error(optimizer: ScheduleFree) -> float:
+        x = {"x": np.full(SHAPE, 0.5, np.float32)}
+        state = optimizer.init(x)
+        truth = 0.5 + 0.4 * BOARD
+        for _ in range(60):
+            steps, state = optimizer.update(Estimate(0.0, {"x": x["x"] - truth}), state, x)
+            x = {"x": np.clip(x["x"] + steps["x"], 0, 1)}
+        return float(np.sqrt(np.mean((x["x"] - truth) ** 2)))
+
+    chosen = error(ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",)))
+    full = error(ScheduleFree(0.1, preconditioner=LargeSteps(Sobolev().strength_of(SHAPE)), preconditioned=("x",)))
+    assert full > 0.3
+    assert chosen < 0.05
+
+
+def test_the_optimizer_says_what_it_has_chosen():
+    optimizer = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",))
+    x = {"x": np.full(SHAPE, 0.5, np.float32), "y": np.zeros(2, np.float32)}
+    state = optimizer.init(x)
+    assert optimizer.choices(state) == ()
+    for _ in range(3):
+        _, state = optimizer.update(Estimate(0.0, {"x": BOARD, "y": np.ones(2, np.float32)}), state, x)
+    smoothing, rate = optimizer.choices(state)
+    assert smoothing == f"smoothing, as a share of the strongest: x {state.strengths['x'].share:.2g}"
+    assert rate == "learning rate, over the first: x 1.2, y 1.2"
