@@ -11,7 +11,7 @@ import pytest
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.optimizers import Adam, ScheduleFree
+from unrender.optimizers import Adam, ScheduleFree, schedule_free
 from unrender.preconditioners import Sobolev
 from unrender.schedules import Cosine
 
@@ -63,7 +63,22 @@ def test_the_rate_of_a_constant_gradient_stays_or_grows():
     rises = [states[0].fast["x"][1], states[1].fast["x"][1] - states[0].fast["x"][1]]
     np.testing.assert_allclose(rises, [0.05, 0.1], rtol=1e-9)
     _, states = descend(ScheduleFree(0.1, growth=0.2), np.zeros(3), along, 30)
-    assert states[-1].log_rate["x"] == pytest.approx(29 * 0.2)
+    assert states[-1].log_rate["x"] == pytest.approx(29 * 0.2 * (1 - 2 / math.sqrt(27)))
+
+
+def test_single_numbers_that_agree_by_chance_do_not_speed_up(monkeypatch: pytest.MonkeyPatch):
+    """The gradients of forty numbers are noise: without the standard error of their correlation most rates grow, with it hardly any."""
+
+    def grown() -> int:
+        found = (
+            descend(ScheduleFree(0.1, decay=0.0), np.zeros(1), lambda step, x, n=n: noise(100 * n + step, x), 60)[1]
+            for n in range(40)
+        )
+        return sum(states[-1].log_rate["x"] > 0.15 for states in found)
+
+    assert grown() <= 8
+    monkeypatch.setattr(schedule_free, "_PAIRS", math.inf)
+    assert grown() >= 20
 
 
 def test_the_rate_of_uncorrelated_gradients_falls_by_its_power():

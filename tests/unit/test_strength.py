@@ -102,4 +102,4 @@ def test_the_optimizer_says_what_it_has_chosen():
         _, state = optimizer.update(Estimate(0.0, {"x": BOARD, "y": np.ones(2, np.float32)}), state, x)
     smoothing, rate = optimizer.choices(state)
     assert smoothing == f"smoothing, as a share of the strongest: x {state.strengths['x'].share:.2g}"
-    assert rate == "learning rate, over the first: x 1.2, y 1.2"
+    assert rate == "learning rate, over the first: x 1.2, y 1.1"

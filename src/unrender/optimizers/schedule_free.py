@@ -32,6 +32,8 @@ _STEEPEST = 0.6
 """The greatest power of 1/t that the rate falls by: between 1/2 and 1, with averages, as in Polyak and Juditsky 1992."""
 _MEMORY = 0.8
 """Decay of the mean correlation of successive gradients."""
+_PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
+"""Independent pairs of gradients of which a plain mean would tell as much."""
 _LEAST_SIGNAL = 0.02
 """The least factor of a step: gradients that were noise may come to tell something."""
 _PROJECTED = 1e-5
@@ -101,10 +103,11 @@ class ScheduleFree:
 
     The rate needs no horizon. It is halved at the first step, and then changes by
 
-        log η_{t+1} = log η_t + q max(0, 2 ρ − 1) − min(p (1 − ρ), 0.6) / (t + 10)
+        log η_{t+1} = log η_t + q max(0, 2 (ρ − 1/(3 √n)) − 1) − min(p (1 − ρ), 0.6) / (t + 10)
 
-    with `growth` q, `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself: while they
-    agree, the rate grows; once they are noise it falls as t^-0.6. No faster: what is left of the signal has to arrive, and averages of
+    with `growth` q, `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself, of n elements:
+    while they agree, the rate grows; once they are noise it falls as t^-0.6. Of single numbers the last nine gradients may agree by
+    chance, hence 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and averages of
     iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
 
     Each element's step is shortened by the share of its gradient that is signal, as Wiener's filter does,
@@ -136,7 +139,7 @@ class ScheduleFree:
     beta: float = 0.9
     beta_2: float = 0.95
     epsilon: float = 1e-12
-    averaging: float = 4.0
+    averaging: float = 2.0
     growth: float = 0.1
     decay: float = 1.5
     schedule: Schedule | None = None
@@ -201,7 +204,7 @@ class ScheduleFree:
         if made > 0:
             for key, found in _correlations(gradient, state.gradient).items():
                 correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
-                log_rate[key] += self._change(correlation[key], made)
+                log_rate[key] += self._change(correlation[key], arrays.shape(gradient[key]), made)
             product, square = _remember(product, square, gradient, state.gradient)
 
         steps: Tree = {}
@@ -248,10 +251,11 @@ class ScheduleFree:
         """`learning_rate` as {key: rate, "*": of the others}."""
         return self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
 
-    def _change(self, correlation: float, made: int) -> float:
+    def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
         """Of the logarithm of the rate, in one step."""
         power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
-        return self.growth * max(0.0, 2.0 * correlation - 1.0) - power / (made + _DELAY)
+        error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
+        return self.growth * max(0.0, 2.0 * (correlation - error) - 1.0) - power / (made + _DELAY)
 
     def _fitted(self, state: ScheduleFreeState, gradient: Tree) -> dict[str, StrengthFit]:
         """The strengths after another gradient."""
