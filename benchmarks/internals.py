@@ -56,6 +56,7 @@ __all__ = [
     "hardware",
     "image_step",
     "loss_derivative",
+    "method",
     "method_parts",
     "mi",
     "mitsuba_renderer",

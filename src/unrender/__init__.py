@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from unrender.runs.optimize import estimate, optimize
     from unrender.runs.reopen import resume
     from unrender.runs.result import Result
+    from unrender.runs.sensitivity import sensitivity
     from unrender.runs.tensorboard import TensorBoard
     from unrender.smoothing import grey_box as grey_box
 
@@ -100,6 +101,7 @@ _HOMES = {
     "render": "problem.render",
     "render_pair": "problem.render",
     "resume": "runs.reopen",
+    "sensitivity": "runs.sensitivity",
     "write_grid": "io.volumes",
 }
 
@@ -146,6 +148,7 @@ __all__ = [
     "report",
     "resume",
     "schedules",
+    "sensitivity",
     "smoothed",
     "statistics",
     "use",

@@ -20,7 +20,7 @@ from unrender.runs.final_images import render_pictures
 
 KEY = "wall.bsdf.reflectance.value"
 FILES = ["checkpoints", "history.jsonl", "initial.npz", "method.toml", "parameters.npz", "pictures.npz", "problem.toml"]
-FILES += ["report.html", "run.json", "truth.npz"]
+FILES += ["report.html", "run.json", "sensitivity.npz", "truth.npz"]
 QUICK = ["--final-spp", "4"]
 
 

@@ -107,7 +107,7 @@ FOLDERS: dict[str, Hostile] = {
     **{
         f"report: {kind} as {name}": _spoilt(make(name), _page)
         for kind, make in _KINDS.items()
-        for name in ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz")
+        for name in ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz", "sensitivity.npz")
     },
     "resume: a pipe as the controls": _spoilt(_pipe("control.json"), _resume),
     "resume: a pipe as the lock": _spoilt(_pipe("lock"), _resume),

@@ -12,6 +12,7 @@ from unrender.display.maps import is_map
 from unrender.report import tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
+from unrender.runs.sensitivity import hardly_seen
 
 __all__ = [
     "ColourScale",
@@ -24,6 +25,10 @@ __all__ = [
     "view_of_methods",
     "view_of_run",
 ]
+
+
+_TENS = -3.0
+"""Where the colours of a sensitivity end, as a power of ten of the greatest."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +146,14 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
 
 
 def map_of_run(
-    key: str, result: np.ndarray, initial: np.ndarray, truth: np.ndarray | None, encoder: PictureEncoder = INLINE
+    key: str,
+    result: np.ndarray,
+    initial: np.ndarray,
+    truth: np.ndarray | None,
+    encoder: PictureEncoder = INLINE,
+    sensitivity: np.ndarray | None = None,
 ) -> Panel:
-    """A recovered texture or volume against its truth, or against its start where the truth is unknown."""
+    """A recovered texture or volume against its truth, or against its start where the truth is unknown; and how much the images tell."""
     scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
     planes = maps.planes(result)
@@ -166,6 +176,8 @@ def map_of_run(
                     Figure(scale.picture(encoder, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
                 )
             column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
+        if sensitivity is not None and (told := maps.planes(sensitivity).get(label)) is not None:
+            column.append(_sensitivity(encoder, told, float(np.max(sensitivity)), f"{key} {label}: sensitivity"))
         if len(planes) == 1:
             stacks += [(item,) for item in column]
         else:
@@ -253,6 +265,17 @@ def _compare_map(
 def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
     note = f"mean {formatting.number(_finite_mean(error))}"
     return Figure(encoder.error(error, high, alt), caption, note, tone_mapping.error_bar(high))
+
+
+def _sensitivity(encoder: PictureEncoder, told: np.ndarray, greatest: float, alt: str) -> Figure:
+    """Of the images to each texel, in powers of ten below the greatest."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tens = np.nan_to_num(np.log10(told.mean(axis=-1) / greatest), nan=_TENS, neginf=_TENS)
+    bar = tone_mapping.colour_bar(
+        _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
+    )
+    note = f"{hardly_seen(told).mean():.0%} of the texels hardly change the images"
+    return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
 
 
 def _finite_mean(values: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from unrender.io.thumbnails import resize_nearest
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
 from unrender.runs.result import Result
+from unrender.runs.sensitivity import sensitivity
 
 __all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"]
 
@@ -21,6 +22,8 @@ _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0
 """Of the time of the steps, what final pictures may take, but a second at least."""
+_SENSITIVITY_SHARE = 0.5
+"""Of that time, what the sensitivity to the parameters may take besides."""
 _TRIAL_PATHS = 1 << 18
 
 _SEEDS = {"initial": 1, "result": 2}
@@ -36,11 +39,13 @@ class FinalImages:
         pictures: see `Result.pictures`.
         errors: see `Result.image_errors`.
         spp: samples per pixel of each.
+        sensitivity: see `Result.sensitivity`.
     """
 
     pictures: dict[str, np.ndarray]
     errors: dict[str, tuple[float, float]]
     spp: int
+    sensitivity: dict[str, np.ndarray]
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -49,7 +54,8 @@ def render_pictures(problem: Problem, result: Result, spp: int | None = None) ->
 
 
 def render_final_images(problem: Problem, result: Result, spp: int | None = None) -> FinalImages:
-    """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any.
+    """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any; and how
+    much the views tell of each element of the parameters.
 
     Each picture is rendered in two independent halves, which tell its error apart from its noise (`evaluation.debiased`).
 
@@ -78,7 +84,9 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
             if index in probabilities:
                 density = np.asarray(probabilities[index], np.float32)
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
-    return FinalImages(pictures, errors, samples)
+        seconds = _SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS)
+        found = sensitivity(problem, result.parameters, seconds=seconds)
+    return FinalImages(pictures, errors, samples, found)
 
 
 def image_name(view: int, which: str) -> str:

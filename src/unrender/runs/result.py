@@ -59,6 +59,9 @@ class Result:
             reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
         phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
             and, of the command line, what came before. Of the last session, where the run was resumed.
+        sensitivity: {key: array} of the parameters' shapes: by how much the images change per unit of each element, as the root of the sum
+            of squares over all pixels and channels, see `unrender.sensitivity`; {} of runs without a run folder, and where path
+            gradients do not reach the parameters. Where it is small, the images tell nothing.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
     """
 
@@ -83,6 +86,7 @@ class Result:
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
     image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    sensitivity: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -116,7 +120,7 @@ class Result:
         return "failed" if self.stopped == NON_FINITE else "finished"
 
     def save(self, directory: str | Path, status: str | None = None) -> Path:
-        """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz.
+        """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz, sensitivity.npz.
 
         Each file is written beside its place, renamed, and on the disk when this returns; run.json, with `status` (None for the result's
         own), comes last. Raises `InputError` where the folder cannot be written.
@@ -125,7 +129,8 @@ class Result:
         try:
             files.make_folder(folder)
             archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
-            for name, values in {**archives, schema.PICTURES: self.pictures}.items():
+            others = {schema.PICTURES: self.pictures, schema.SENSITIVITY: self.sensitivity}
+            for name, values in {**archives, **others}.items():
                 if values or name in (schema.PARAMETERS, schema.INITIAL):
                     files.write_arrays(folder / name, values, name_too=False)
             files.write(folder / schema.HISTORY, lines(self.history), name_too=False)

@@ -152,7 +152,8 @@ def _of_run(snapshot: Snapshot, run: RunFolder | None, pictures: PictureCache, v
         "view": view,
         "parameters": [tables.parameter_row(run, key) for key in run.parameters],
         "maps": [
-            panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k), encoder) for k in maps[:_MAPS]
+            panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k), encoder, run.sensitivity.get(k))
+            for k in maps[:_MAPS]
         ],
         "more_maps": max(0, len(maps) - _MAPS),
         "command": run.record.command,

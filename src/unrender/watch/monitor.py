@@ -20,7 +20,7 @@ from unrender.runs.folder.schema import HISTORY, LIVE, LIVE_STATUS, RECORD, Live
 
 __all__ = ["RunMonitor", "Snapshot"]
 
-_FILES = (RECORD, HISTORY, schema.PARAMETERS, schema.INITIAL, schema.TRUTH, schema.PICTURES)
+_FILES = (RECORD, HISTORY, schema.PARAMETERS, schema.INITIAL, schema.TRUTH, schema.PICTURES, schema.SENSITIVITY)
 _LIVE_FILES = (LIVE_STATUS, schema.LIVE_START, schema.LIVE_VIEWS, *_FILES)
 
 WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"

@@ -55,6 +55,7 @@ class RunFolder:
         parameters, initial, truth: {key: array}; `truth` holds the keys whose truth is known.
         views: {view index: pictures}, ascending; empty where the run saved none.
         error_before, error_after: {key: root mean square error} at the start and at the end, where they are known.
+        sensitivity: see `Result.sensitivity`; {} where the run saved none.
         shapes: {key: shape} of parameters whose arrays here are smaller than those of the run.
     """
 
@@ -68,6 +69,7 @@ class RunFolder:
     error_before: dict[str, float] = field(default_factory=dict)
     error_after: dict[str, float] = field(default_factory=dict)
     shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    sensitivity: dict[str, np.ndarray] = field(default_factory=dict)
 
     def shape(self, key: str) -> tuple[int, ...]:
         """Of a parameter, as it is in the run."""
@@ -96,7 +98,12 @@ def read(directory: str | Path) -> RunFolder:
         for of in (initial, parameters)
     )
     views = pictures_by_view(_optional(path / schema.PICTURES, path), path / schema.PICTURES)
-    return RunFolder(path, record, history, parameters, initial, known, views, before, after)
+    told = {
+        k: x
+        for k, x in _optional(path / schema.SENSITIVITY, path).items()
+        if k in parameters and x.shape == parameters[k].shape
+    }
+    return RunFolder(path, record, history, parameters, initial, known, views, before, after, sensitivity=told)
 
 
 def read_run_record(folder: Path) -> RunRecord:

@@ -37,6 +37,7 @@ from unrender.runs.folder.schema import (
     PICTURES,
     RECORD,
     REPORT,
+    SENSITIVITY,
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 __all__ = ["RunWriter"]
 
 _FILES = (
-    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES),
+    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY),
     *(REPORT, CONTROL),
 )
 _STEPS, _MOST_SECONDS = 50, 60.0
@@ -152,7 +153,9 @@ class RunWriter(Hook):
                 self._save(result, "running" if result.status == "finished" else result.status)
             started = time.perf_counter()
             images = render_final_images(descent.run.problem, result, self.final_spp)
-            result = replace(result, pictures=images.pictures, image_errors=images.errors)
+            result = replace(
+                result, pictures=images.pictures, image_errors=images.errors, sensitivity=images.sensitivity
+            )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
         return result

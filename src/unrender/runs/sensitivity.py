@@ -1,0 +1,101 @@
+"""How much the images tell of each element of the parameters."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from unrender.core import arrays, checks
+from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.problem.problem import Problem
+from unrender.problem.render import as_tree
+from unrender.rendering.renderer import RenderSession, SampleRequest
+
+__all__ = ["HARDLY", "hardly_seen", "sensitivity"]
+
+PROBES, _FEWEST = 32, 2
+_SPP = 4
+HARDLY = 0.05
+"""Of the median: elements that change the images less are hardly seen."""
+
+
+@exclusive("sensitivity")
+def sensitivity(
+    problem: Problem,
+    values: Mapping[str, np.ndarray] | None = None,
+    probes: int = PROBES,
+    spp: int = _SPP,
+    seconds: float = np.inf,
+    seed: int = 0,
+) -> dict[str, np.ndarray]:
+    """√diag(JᵀJ) with J the derivative of all views' pixels by the parameters: by how much, as the root of the sum of squares over pixels
+    and channels, the images change per unit of each element.
+
+    Where it is small, the images tell nothing of an element, and what is recovered there is noise or smoothing: JᵀJ is the Gauss-Newton
+    Hessian of L2, and with noise σ in each pixel of the references no estimate of the element alone has a smaller standard deviation than
+    σ over this.
+
+    diag(JᵀJ) is the expectation of (Jᵀs)² over images s of independent signs. The two factors are adjoints on separate paths, so that the
+    product is unbiased; the root, and negative estimates that become 0, are not.
+
+    Args:
+        problem: its views and scene.
+        values: {key: array}; None for the initial ones.
+        probes: images of signs, >= 1. The standard error of the square is about √(2/probes) of it.
+        spp: samples per pixel of each adjoint, >= 1.
+        seconds: after which no further probe is begun, but for the second one.
+        seed: of all random numbers.
+
+    Returns:
+        {key: array} of the parameters' shapes, float32; {} where path gradients do not reach a parameter.
+
+    Raises:
+        InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` below 1.
+    """
+    checks.integer("sensitivity", "probes", probes, at_least=1)
+    checks.integer("sensitivity", "spp", spp, at_least=1)
+    try:
+        session = problem.renderer.prepare(list(problem.shapes()), None)
+    except InputError:
+        return {}
+    parameters = as_tree(problem, values)
+    squares = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    made, until = 0, time.perf_counter() + seconds
+    while made < min(_FEWEST, probes) or (made < probes and time.perf_counter() < until):
+        one, other = (_projections(problem, session, parameters, spp, Key(seed, made), half) for half in range(2))
+        for key, square in squares.items():
+            square += one[key] * other[key]
+        made += 1
+    return {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
+
+
+def hardly_seen(found: np.ndarray) -> np.ndarray:
+    """Which elements of a parameter change the images by less than a twentieth of the median of those that do; means over channels.
+
+    Args:
+        found: of `sensitivity`, (..., channels).
+
+    Returns:
+        (...), truth values.
+    """
+    whole = found.mean(axis=-1)
+    return whole <= HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
+
+
+def _projections(
+    problem: Problem, session: RenderSession, parameters: Tree, spp: int, key: Key, half: int
+) -> dict[str, np.ndarray]:
+    """{key: Jᵀs}: of the signs s of a probe, on one of its two halves' paths."""
+    found = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    signs = np.random.default_rng(key.uint32())
+    for view in range(len(problem.views)):
+        rendering = session.image(parameters, SampleRequest(view, spp, key.fold(2 * view + half).uint32()))
+        weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
+        for name, value in session.adjoint(parameters, rendering.paths, problem.renderer.array(weights)).items():
+            found[name] += arrays.numpy(value).reshape(found[name].shape)
+    return found

@@ -1,0 +1,87 @@
+"""How much images tell of each element: against the matrix of linear images, and a planted fault."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core.errors import InputError
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import sensitivity as module
+from unrender.runs.sensitivity import hardly_seen, sensitivity
+
+SHAPE, TEXTURE = (8, 8), (4, 3, 2)
+MATRIX = np.random.default_rng(0).random((8 * 8 * 3, 24)) * np.geomspace(0.001, 3.0, 24)
+
+
+def problem(noise: float = 1.0, views: int = 2) -> Problem:
+    truth = {"wall": np.full(TEXTURE, 0.5)}
+    renderer = AnalyticRenderer(truth, MATRIX, 0.1, noise, shape=SHAPE, sensors=views)
+    given = [View(renderer.exact(truth), sensor=view) for view in range(views)]
+    return Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], given, truth=truth)
+
+
+def z_score(probes: int = 4000) -> np.ndarray:
+    """Of the mean square over elements, each in units of its expectation, with the spread over ten runs."""
+    expected = 2 * (MATRIX**2).sum(axis=0).reshape(TEXTURE)
+    found = [
+        sensitivity(problem(), probes=probes // 10, spp=1, seed=seed)["wall"] ** 2 / expected for seed in range(10)
+    ]
+    means = np.array([each.mean() for each in found])
+    return (means.mean() - 1) / (means.std(ddof=1) / np.sqrt(len(means)))
+
+
+def test_it_is_the_root_of_the_sum_of_squares_over_pixels_of_all_views():
+    exact = np.sqrt(2 * (MATRIX**2).sum(axis=0)).reshape(TEXTURE)
+    found = sensitivity(problem(noise=0.0), probes=2000)["wall"]
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, exact, rtol=0.1)
+    assert abs(z_score()) < 4
+
+
+def test_noise_of_the_adjoint_would_be_counted_without_separate_paths(monkeypatch: pytest.MonkeyPatch):
+    """Planted: both factors on the same paths, whose product has the variance of the derivative in it."""
+    real = module._projections
+
+    def same(problem: Problem, session: Any, parameters: Any, spp: int, key: Any, half: int) -> Any:
+        return real(problem, session, parameters, spp, key, 0)
+
+    monkeypatch.setattr(module, "_projections", same)
+    assert z_score() > 8
+
+
+def test_elements_that_no_pixel_sees_are_hardly_seen():
+    found = np.ones((3, 4, 3), np.float32)
+    found[0] = 0.0
+    found[1, 0] = 0.01
+    expected = np.zeros((3, 4), bool)
+    expected[0], expected[1, 0] = True, True
+    np.testing.assert_array_equal(hardly_seen(found), expected)
+    assert hardly_seen(np.zeros((2, 2, 3))).all()
+
+
+def test_time_ends_it_after_two_probes(monkeypatch: pytest.MonkeyPatch):
+    counts: list[int] = []
+    real = module._projections
+
+    def counted(*arguments: Any) -> Any:
+        counts.append(1)
+        return real(*arguments)
+
+    monkeypatch.setattr(module, "_projections", counted)
+    sensitivity(problem(), seconds=0.0)
+    assert len(counts) == 4
+
+
+def test_refuses_what_makes_no_sense():
+    with pytest.raises(InputError, match="probes"):
+        sensitivity(problem(), probes=0)
+    with pytest.raises(InputError, match="expected shape"):
+        sensitivity(problem(), {"wall": np.zeros((2, 2, 2))})
+    assert ur.sensitivity is sensitivity
