@@ -14,6 +14,13 @@ def _mean(ratios: list[float]) -> float:
     return math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else math.nan
 
 
+def _cell(ratio: float | None, best: float) -> str:
+    """A ratio, bold where it is the best and below 1; nothing where `auto` chose the same."""
+    if ratio is None:
+        return ""
+    return f"**{ratio:.2f}**" if ratio == best < 1 else f"{ratio:.2f}"
+
+
 def table(record: Record) -> str:
     """Errors at the end over those of `auto`, and the regret."""
     settings, problems = record["settings"], record["problems"]
@@ -33,7 +40,7 @@ def table(record: Record) -> str:
     within = sum(regret <= 1.15 for regret in regrets)
     lines = [
         f"{settings['seconds']:g} s, {settings['seeds']} seeds, medians: the error at the end where seen, relative to the start, "
-        "of `auto`; of its options, over that of `auto` (below 1, the option is better).",
+        "of `auto`; of its options, over that of `auto` (below 1, the option is better; nothing where `auto` chose the same).",
         markdown.table(head, rows),
         f"Regret at most 1.15 on {within} of {len(regrets)}; geometric mean {_mean(regrets):.2f}.",
     ]

@@ -16,11 +16,11 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
-__all__ = ["HARDLY", "hardly_seen", "sensitivity"]
+__all__ = ["hardly_seen", "over_channels", "sensitivity"]
 
-PROBES, _FEWEST = 32, 2
+_PROBES, _FEWEST = 32, 2
 _SPP = 4
-HARDLY = 0.05
+_HARDLY = 0.05
 """Of the median: elements that change the images less are hardly seen."""
 
 
@@ -28,7 +28,7 @@ HARDLY = 0.05
 def sensitivity(
     problem: Problem,
     values: Mapping[str, np.ndarray] | None = None,
-    probes: int = PROBES,
+    probes: int = _PROBES,
     spp: int = _SPP,
     seconds: float = np.inf,
     seed: int = 0,
@@ -74,8 +74,13 @@ def sensitivity(
     return {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
 
 
+def over_channels(found: np.ndarray) -> np.ndarray:
+    """The root mean square over the last axis of an array of `sensitivity`: (..., channels) -> (...)."""
+    return np.sqrt(np.mean(np.square(found, dtype=np.float64), axis=-1))
+
+
 def hardly_seen(found: np.ndarray) -> np.ndarray:
-    """Which elements of a parameter change the images by less than a twentieth of the median of those that do; means over channels.
+    """Which cells of a texture or grid change the images by less than a twentieth of the median of those that do.
 
     Args:
         found: of `sensitivity`, (..., channels).
@@ -83,8 +88,8 @@ def hardly_seen(found: np.ndarray) -> np.ndarray:
     Returns:
         (...), truth values.
     """
-    whole = found.mean(axis=-1)
-    return whole <= HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
+    whole = over_channels(found)
+    return whole <= _HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
 
 
 def _projections(
