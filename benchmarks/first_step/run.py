@@ -27,10 +27,26 @@ QUICK = {"problem": ("mirror-trio",), "options": ("resolution=16", "reference_sp
 def start(name: str, options: tuple[str, ...], cache: Path, out: Path) -> dict[str, Any]:
     """Seconds to the first line that names a step, and of the phases before it."""
     words = [part for option in options for part in ("--problem-set", option)]
-    command = [sys.executable, "-m", "unrender", "run", name, "--steps", "1", "--final-spp", "1", "--out", str(out), *words]
-    environment = {**os.environ, "UNRENDER_CACHE_DIR": str(cache)}
+    command = [
+        sys.executable,
+        "-m",
+        "unrender",
+        "run",
+        name,
+        "--steps",
+        "1",
+        "--final-spp",
+        "1",
+        "--out",
+        str(out),
+        *words,
+    ]
+    kept = {name: value for name, value in os.environ.items() if name != "DRJIT_CACHE_DIR"}  # of this process
+    environment = {**kept, "UNRENDER_CACHE_DIR": str(cache)}
     began, first = time.perf_counter(), None
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if first is None and line.startswith("step "):

@@ -49,6 +49,17 @@ def test_a_reference_is_rendered_once(place: Path, rendered: list[int]) -> None:
     assert [path.suffix for path in place.iterdir()] == [".npz"]
 
 
+def test_each_view_is_rendered_once(place: Path, rendered: list[int]) -> None:
+    """Rendering one view changes what the scene says of its sampler, and so does reading it instead of rendering it."""
+    options = {"resolution": 8, "reference_spp": 8}
+    views = len(ur.gallery.problem("two-planets", **options).views)
+    assert views > 1
+    for _ in range(2):
+        ur.gallery.problem("two-planets", **options)
+    assert rendered == list(range(views))
+    assert len(list(place.iterdir())) == views
+
+
 def test_a_gallery_problem_takes_it_from_there(place: Path, rendered: list[int]) -> None:
     first = reference()
     found = ur.gallery.problem("indirect-room", loss="L2", **SMALL)  # the loss decides nothing of a reference

@@ -1,8 +1,9 @@
 """What `auto` chooses, against the same method with one choice made otherwise.
 
-On each problem `auto` runs with no option given and with each of `CHOICES` set, at equal time. The regret is its error at the end over that
-of the choice that turned out to be best; `smooth=false` tells what smoothing over neighbouring texels brings, also on a checkerboard of
-one-texel squares, where there is nothing to smooth. What `auto` chooses by itself is not run again. Errors are of the elements that the views see, as in `suite`.
+On each problem `auto` runs with no option given and with each of `CHOICES` set, at equal time. The regret is its error at the end over
+that of the choice that turned out to be best; `smooth=false` tells what smoothing over neighbouring texels brings, also on a checkerboard
+of one-texel squares, where there is nothing to smooth. What `auto` chooses by itself is not run again. Errors are of the elements that the
+views see, as in `suite`.
 """
 
 from __future__ import annotations

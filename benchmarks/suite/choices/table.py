@@ -15,9 +15,9 @@ def _mean(ratios: list[float]) -> float:
 
 
 def _cell(ratio: float | None, best: float) -> str:
-    """A ratio, bold where it is the best and below 1; nothing where `auto` chose the same."""
+    """A ratio, bold where it is the best and below 1; same: `auto` chose it, too."""
     if ratio is None:
-        return ""
+        return "same"
     return f"**{ratio:.2f}**" if ratio == best < 1 else f"{ratio:.2f}"
 
 
@@ -32,15 +32,13 @@ def table(record: Record) -> str:
         regrets.append(max(1.0, 1 / others[best]))
         if "smooth=false" in others and name != "checkerboard":
             smoothing.append(1 / others["smooth=false"])
-        cells = [
-            f"**{ratio:.2f}**" if label == best and ratio < 1 else f"{ratio:.2f}" for label, ratio in others.items()
-        ]
+        cells = [_cell(others.get(label), others[best]) for label in settings["choice"]]
         rows.append([name, f"{chosen:.3f}", *cells, f"{regrets[-1]:.2f}"])
     head = ["problem", "auto", *settings["choice"], "regret"]
     within = sum(regret <= 1.15 for regret in regrets)
     lines = [
         f"{settings['seconds']:g} s, {settings['seeds']} seeds, medians: the error at the end where seen, relative to the start, "
-        "of `auto`; of its options, over that of `auto` (below 1, the option is better; nothing where `auto` chose the same).",
+        "of `auto`; of its options, over that of `auto` (below 1, the option is better; same: `auto` chose it, too).",
         markdown.table(head, rows),
         f"Regret at most 1.15 on {within} of {len(regrets)}; geometric mean {_mean(regrets):.2f}.",
     ]

@@ -30,6 +30,8 @@ _FORMAT = 1
 _NAME = "reference"
 _ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")
 """Parts of a scene's description that differ from one load to the next."""
+_SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) = .*\n", re.MULTILINE)
+"""What a rendering leaves behind in a sampler, and the next one sets."""
 
 
 def recall(scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray]) -> np.ndarray:
@@ -58,7 +60,16 @@ def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
     """A name for the image: SHA-256 of what decides it."""
     state = hashlib.sha256()
     versions = [f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit")]
-    facts = [_FORMAT, *versions, current(), llvm_version(), sensor, spp, max_depth, _ADDRESS.sub("", str(scene))]
+    facts = [
+        _FORMAT,
+        *versions,
+        current(),
+        llvm_version(),
+        sensor,
+        spp,
+        max_depth,
+        _SAMPLER.sub("", _ADDRESS.sub("", str(scene))),
+    ]
     state.update("\n".join(map(str, facts)).encode())
     parameters = mi.traverse(scene)
     for key in sorted(_ADDRESS.sub("", name) + "\0" + name for name in parameters.keys()):  # noqa: SIM118 (iterating gives pairs)

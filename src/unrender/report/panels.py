@@ -177,7 +177,9 @@ def map_of_run(
                 )
             column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
         if sensitivity is not None and (told := maps.planes(sensitivity).get(label)) is not None:
-            column.append(_sensitivity(encoder, told, float(np.max(over_channels(sensitivity))), f"{key} {label}: sensitivity"))
+            column.append(
+                _sensitivity(encoder, told, float(np.max(over_channels(sensitivity))), f"{key} {label}: sensitivity")
+            )
         if len(planes) == 1:
             stacks += [(item,) for item in column]
         else:
