@@ -126,7 +126,7 @@ def test_a_power_cut_leaves_the_last_checkpoint(tmp_path: Path, whole: dict[str,
         run(tmp_path / "run", callbacks=[Note()])
         end = now.copy()
     assert len(cuts) >= 5
-    for cut in [*cuts, end]:
+    for cut in {cut.flushes: cut for cut in [*cuts, end]}.values():  # the end may be a fifth flush
         place = tmp_path / f"cut-{cut.flushes}"
         cut.restore(place)
         folder = place / "run"

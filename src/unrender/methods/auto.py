@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -137,7 +136,7 @@ class AutoMethod(Options):
         """The pixels of a step, and why they are not all."""
         if self.pixels is not None:
             return pixels.Uniform(self.pixels), ""
-        count = _pixels_of(problem)
+        count = problem.pixels
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
         drawn = _MOST_PIXELS // 2
@@ -145,7 +144,7 @@ class AutoMethod(Options):
 
     def _samples(self, problem: Problem, sampler: PixelSampler) -> int:
         """Per pixel: the power of two that comes nearest to the paths of a step from below."""
-        count = sampler.count if isinstance(sampler, pixels.Uniform) else _pixels_of(problem)
+        count = sampler.count if isinstance(sampler, pixels.Uniform) else problem.pixels
         return self.spp or min(max(1 << ((_PATHS // count).bit_length() - 1 if count <= _PATHS else 0), _FEWEST), _MOST)
 
     def _smoothed(self, problem: Problem) -> tuple[str, ...]:
@@ -181,11 +180,6 @@ def _firefly_share(problem: Problem) -> float:
     found = np.sort(np.concatenate(noise))[::-1]
     whole = found.sum()
     return float(found[: max(1, len(found) // 100)].sum() / whole) if len(found) >= 1000 and whole > 0 else 0.0
-
-
-def _pixels_of(problem: Problem) -> int:
-    """Of all views together."""
-    return sum(math.prod(np.asarray(view.reference).shape[:2]) for view in problem.views)
 
 
 def _is_map(shape: tuple[int, ...]) -> bool:

@@ -138,6 +138,11 @@ class Problem:
         """`initial` as NumPy arrays."""
         return {key: np.array(value) for key, value in self._initial.items()}
 
+    @property
+    def pixels(self) -> int:
+        """Of all views together."""
+        return sum(math.prod(np.asarray(view.reference).shape[:2]) for view in self.views)
+
     def initial(self) -> Tree:
         """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""
         return {key: self.renderer.array(value) for key, value in self._initial.items()}

@@ -23,7 +23,7 @@ _FEWEST, _MOST = 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0
 """Of the time of the steps, what final pictures may take, but a second at least."""
 _SENSITIVITY_SHARE = 0.5
-"""Of that time, what the sensitivity to the parameters may take besides."""
+"""Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
 _TRIAL_PATHS = 1 << 18
 
 _SEEDS = {"initial": 1, "result": 2}

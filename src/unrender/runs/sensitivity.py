@@ -18,8 +18,7 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 
 __all__ = ["hardly_seen", "over_channels", "sensitivity"]
 
-_PROBES, _FEWEST = 32, 2
-_SPP = 4
+_PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 _HARDLY = 0.05
 """Of the median: elements that change the images less are hardly seen."""
 
@@ -29,7 +28,7 @@ def sensitivity(
     problem: Problem,
     values: Mapping[str, np.ndarray] | None = None,
     probes: int = _PROBES,
-    spp: int = _SPP,
+    spp: int | None = None,
     seconds: float = np.inf,
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
@@ -47,8 +46,8 @@ def sensitivity(
         problem: its views and scene.
         values: {key: array}; None for the initial ones.
         probes: images of signs, >= 1. The standard error of the square is about √(2/probes) of it.
-        spp: samples per pixel of each adjoint, >= 1.
-        seconds: after which no further probe is begun, but for the second one.
+        spp: samples per pixel of each adjoint, >= 1; None for 4, or fewer where the views have more than 2¹⁸ pixels together.
+        seconds: after which no further probe is begun; there is one at least.
         seed: of all random numbers.
 
     Returns:
@@ -58,6 +57,8 @@ def sensitivity(
         InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` below 1.
     """
     checks.integer("sensitivity", "probes", probes, at_least=1)
+    if spp is None:
+        spp = min(max(_PATHS // problem.pixels, 1), _MOST_SPP)
     checks.integer("sensitivity", "spp", spp, at_least=1)
     try:
         session = problem.renderer.prepare(list(problem.shapes()), None)
@@ -66,7 +67,7 @@ def sensitivity(
     parameters = as_tree(problem, values)
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     made, until = 0, time.perf_counter() + seconds
-    while made < min(_FEWEST, probes) or (made < probes and time.perf_counter() < until):
+    while made == 0 or (made < probes and time.perf_counter() < until):
         one, other = (_projections(problem, session, parameters, spp, Key(seed, made), half) for half in range(2))
         for key, square in squares.items():
             square += one[key] * other[key]
