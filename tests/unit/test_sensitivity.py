@@ -56,12 +56,13 @@ def test_noise_of_the_adjoint_would_be_counted_without_separate_paths(monkeypatc
     assert z_score() > 8
 
 
-def test_elements_that_no_pixel_sees_are_hardly_seen():
-    found = np.ones((3, 4, 3), np.float32)
-    found[0] = 0.0
-    found[1, 0] = 0.01
-    expected = np.zeros((3, 4), bool)
-    expected[0], expected[1, 0] = True, True
+def test_cells_that_no_pixel_sees_are_hardly_seen():
+    """With those around them: one that noise has made 0 among others that are seen is none."""
+    found = np.ones((12, 9, 3), np.float32)
+    found[:4] = 0.0
+    found[8, 5] = 0.0
+    expected = np.zeros((12, 9), bool)
+    expected[:3] = True
     np.testing.assert_array_equal(hardly_seen(found), expected)
     assert hardly_seen(np.zeros((2, 2, 3))).all()
 

@@ -12,7 +12,7 @@ from unrender.display.maps import is_map
 from unrender.report import tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.runs.folder.reader import ViewPictures
-from unrender.runs.sensitivity import hardly_seen, over_channels
+from unrender.runs.sensitivity import around, hardly_seen
 
 __all__ = [
     "ColourScale",
@@ -178,7 +178,7 @@ def map_of_run(
             column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
         if sensitivity is not None and (told := maps.planes(sensitivity).get(label)) is not None:
             column.append(
-                _sensitivity(encoder, told, float(np.max(over_channels(sensitivity))), f"{key} {label}: sensitivity")
+                _sensitivity(encoder, told, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
             )
         if len(planes) == 1:
             stacks += [(item,) for item in column]
@@ -272,7 +272,7 @@ def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str
 def _sensitivity(encoder: PictureEncoder, told: np.ndarray, greatest: float, alt: str) -> Figure:
     """Of the images to each texel, in powers of ten below the greatest."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        tens = np.nan_to_num(np.log10(over_channels(told) / greatest), nan=_TENS, neginf=_TENS)
+        tens = np.nan_to_num(np.log10(around(told) / greatest), nan=_TENS, neginf=_TENS)
     bar = tone_mapping.colour_bar(
         _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
     )

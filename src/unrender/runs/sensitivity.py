@@ -16,7 +16,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
-__all__ = ["hardly_seen", "over_channels", "sensitivity"]
+__all__ = ["around", "hardly_seen", "sensitivity"]
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 _HARDLY = 0.05
@@ -75,13 +75,18 @@ def sensitivity(
     return {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
 
 
-def over_channels(found: np.ndarray) -> np.ndarray:
-    """The root mean square over the last axis of an array of `sensitivity`: (..., channels) -> (...)."""
-    return np.sqrt(np.mean(np.square(found, dtype=np.float64), axis=-1))
+def around(found: np.ndarray) -> np.ndarray:
+    """The root mean square of an array of `sensitivity` over channels and the cells around each: (..., channels) -> (...).
+
+    Few probes leave much noise in a single element.
+    """
+    from scipy.ndimage import uniform_filter
+
+    return np.sqrt(uniform_filter(np.mean(np.square(found, dtype=np.float64), axis=-1), 3, mode="nearest"))
 
 
 def hardly_seen(found: np.ndarray) -> np.ndarray:
-    """Which cells of a texture or grid change the images by less than a twentieth of the median of those that do.
+    """Which cells of a texture or grid, with those around them, change the images by less than a twentieth of the median of those that do.
 
     Args:
         found: of `sensitivity`, (..., channels).
@@ -89,7 +94,7 @@ def hardly_seen(found: np.ndarray) -> np.ndarray:
     Returns:
         (...), truth values.
     """
-    whole = over_channels(found)
+    whole = around(found)
     return whole <= _HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
 
 
