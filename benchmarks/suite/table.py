@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import geometric_mean
 
 from benchmarks import markdown
 from benchmarks.runner.records import Record
@@ -37,7 +38,7 @@ def table(record: Record) -> str:
     head = ["problem", "the loop's best setting", "loop, half and end", "auto, half and end", "fixed point"]
     head += ["loop at its best", "auto there", "faster", "compile"]
     reached = [entry["speed"] for entry in problems.values() if entry["speed"]]
-    mean = math.exp(sum(map(math.log, reached)) / len(reached)) if reached else math.nan
+    mean = geometric_mean(reached) if reached else math.nan
     tuned = len(settings["spp"]) * len(settings["rates"]) * 2
     return "\n\n".join(
         [

@@ -21,16 +21,9 @@ from benchmarks.suite.scenes import problem as foreign_problem
 from unrender.gallery.wall import Wall
 
 GALLERY = ("wall", "checkerboard", "indirect-room", "sunlit-vase", "lamp", "sun-glossy")
-CHOICES: dict[str, dict[str, Any]] = {
-    "image=plain": {"image": "plain"},
-    "image=rcv": {"image": "rcv"},
-    "smooth=false": {"smooth": False},
-    "spp=2": {"spp": 2},
-    "spp=16": {"spp": 16},
-    "learning_rate=0.03": {"learning_rate": 0.03},
-    "learning_rate=0.3": {"learning_rate": 0.3},
-    "tolerance=0": {"tolerance": 0.0},
-}
+CHOICES = (
+    "image=plain", "image=rcv", "smooth=false", "spp=2", "spp=16", "learning_rate=0.03", "learning_rate=0.3", "tolerance=0",
+)  # fmt: skip
 """Options of `auto`."""
 QUICK = {
     "problem": ("checkerboard",),
@@ -77,7 +70,7 @@ def run(
     problem: tuple[str, ...] = GALLERY,
     foreign: tuple[str, ...] = FOREIGN,
     assets: Path | None = None,
-    choice: tuple[str, ...] = tuple(CHOICES),
+    choice: tuple[str, ...] = CHOICES,
     seconds: float = 4.0,
     seeds: int = 2,
     resolution: int = 64,
@@ -107,11 +100,11 @@ def run(
         else:
             opened = checkerboard(**options) if name == "checkerboard" else ur.gallery.problem(name, **options)
         error = error_of(opened)
-        ends, parts = {}, {}
-        for label, settings in {"auto": {}, **{label: CHOICES[label] for label in choice}}.items():
-            chosen = method("auto").choose(opened, settings)
-            parts[label] = chosen.estimator, chosen.optimizer
-            if label != "auto" and parts[label] == parts["auto"]:
+        own = method("auto").choose(opened)
+        ends = {}
+        for label in ("auto", *choice):
+            chosen = own if label == "auto" else method("auto").choose(opened, dict([label.split("=")]))
+            if label != "auto" and (chosen.estimator, chosen.optimizer) == (own.estimator, own.optimizer):
                 continue  # as auto chooses by itself
             ends[label] = [_end(opened, chosen, error, seconds, seed) for seed in range(seeds)]
             print(f"{name}, {label}: {', '.join(f'{end:.4f}' for end in ends[label])}", flush=True)

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from statistics import median
+from statistics import geometric_mean, median
 
 from benchmarks import markdown
 from benchmarks.runner.records import Record
-
-
-def _mean(ratios: list[float]) -> float:
-    """Geometric."""
-    return math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else math.nan
 
 
 def _cell(ratio: float | None, best: float) -> str:
@@ -40,8 +34,10 @@ def table(record: Record) -> str:
         f"{settings['seconds']:g} s, {settings['seeds']} seeds, medians: the error at the end where seen, relative to the start, "
         "of `auto`; of its options, over that of `auto` (below 1, the option is better; same: `auto` chose it, too).",
         markdown.table(head, rows),
-        f"Regret at most 1.15 on {within} of {len(regrets)}; geometric mean {_mean(regrets):.2f}.",
+        f"Regret at most 1.15 on {within} of {len(regrets)}; geometric mean {geometric_mean(regrets):.2f}.",
     ]
     if smoothing:
-        lines.append(f"With smoothing over without, geometric mean without the checkerboard: {_mean(smoothing):.2f}.")
+        lines.append(
+            f"With smoothing over without, geometric mean without the checkerboard: {geometric_mean(smoothing):.2f}."
+        )
     return "\n\n".join(lines)

@@ -182,8 +182,8 @@ class ScheduleFree:
         zeros = trees.zeros_like(parameters)
         ones = dict.fromkeys(parameters, 1.0)
         none = dict.fromkeys(parameters, 0.0)
-        near = {} if self.preconditioner is None else {key: zeros[key] for key in self.preconditioned}
         smooth = self.preconditioner
+        near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
         fits = {
             key: StrengthFit.begun(smooth, arrays.shape(x)) for key, x in near.items() if isinstance(smooth, Sobolev)
         }
