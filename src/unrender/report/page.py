@@ -43,12 +43,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         more_views=len(run.views) - len(shown),
         view_rows=tables.view_rows(run),
         measures=image_metrics.available()[1:],
-        maps=[
-            panels.map_of_run(
-                k, run.parameters[k], run.initial[k], run.truth.get(k), sensitivity=run.sensitivity.get(k)
-            )
-            for k in maps[:_MAPS]
-        ],
+        maps=[panels.map_of_run(run, key) for key in maps[:_MAPS]],
         more_maps=max(0, len(maps) - _MAPS),
         rows=[tables.parameter_row(run, key) for key in run.parameters],
         charts={axis: convergence.charts(run, axis) for axis in plots.AXES},

@@ -11,7 +11,7 @@ from unrender.display import formatting, maps
 from unrender.display.maps import is_map
 from unrender.report import tone_mapping
 from unrender.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
-from unrender.runs.folder.reader import ViewPictures
+from unrender.runs.folder.reader import RunFolder, ViewPictures
 from unrender.runs.sensitivity import around, hardly_seen
 
 __all__ = [
@@ -145,15 +145,10 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
     return Panel(f"View {view}", _exposure_note(factor), stacks, False)
 
 
-def map_of_run(
-    key: str,
-    result: np.ndarray,
-    initial: np.ndarray,
-    truth: np.ndarray | None,
-    encoder: PictureEncoder = INLINE,
-    sensitivity: np.ndarray | None = None,
-) -> Panel:
+def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Panel:
     """A recovered texture or volume against its truth, or against its start where the truth is unknown; and how much the images tell."""
+    result, initial = run.parameters[key], run.initial[key]
+    truth, sensitivity = run.truth.get(key), run.sensitivity.get(key)
     scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
     planes = maps.planes(result)

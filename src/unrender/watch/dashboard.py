@@ -151,10 +151,7 @@ def _of_run(snapshot: Snapshot, run: RunFolder | None, pictures: PictureCache, v
         "views": list(run.views),
         "view": view,
         "parameters": [tables.parameter_row(run, key) for key in run.parameters],
-        "maps": [
-            panels.map_of_run(k, run.parameters[k], run.initial[k], run.truth.get(k), encoder, run.sensitivity.get(k))
-            for k in maps[:_MAPS]
-        ],
+        "maps": [panels.map_of_run(run, key, encoder) for key in maps[:_MAPS]],
         "more_maps": max(0, len(maps) - _MAPS),
         "command": run.record.command,
         "facts": html.facts(run.record),
