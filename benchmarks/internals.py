@@ -31,6 +31,7 @@ from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, 
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
+from unrender.runs.sensitivity import hardly_seen
 from unrender.statistics.recursion import advance
 
 dr: Any = importlib.import_module("drjit")
@@ -53,9 +54,11 @@ __all__ = [
     "coupled_gradients",
     "dr",
     "from_tensor",
+    "hardly_seen",
     "hardware",
     "image_step",
     "loss_derivative",
+    "media",
     "method",
     "method_parts",
     "mi",
@@ -88,6 +91,13 @@ def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
     """The problem's scene and its `mi.traverse` parameters, for loops of stock Mitsuba on them."""
     pair = _mitsuba(problem).pair
     return pair.previous, pair.previous_parameters
+
+
+def media(scene: Any) -> list[Any]:
+    """The participating media of a scene."""
+    from unrender.rendering.mitsuba.scene_loading import media as found
+
+    return found(scene)
 
 
 def scene_description(problem: ur.Problem) -> Any:

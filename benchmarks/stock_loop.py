@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
+from benchmarks.internals import dr, from_tensor, media, mi, project, stock_scene
 
 
 def step_seed(seed: int, step: int, view: int) -> int:
@@ -29,14 +29,17 @@ def stock_loop(
     falling: bool = False,
     error: Callable[[dict[str, Any]], Any] | None = None,
 ) -> list[dict[str, Any]]:
-    """`mi.render` with `prb`, `dr.backward`, `mi.ad.Adam`, values clipped; with `falling`, rates fall over the budget as half a cosine.
+    """`mi.render` with `prb`, or `prbvolpath` where there are media, `dr.backward`, `mi.ad.Adam`, values clipped.
+
+    With `falling`, rates fall over the budget as half a cosine.
 
     `error` is what the history has under "parameter_error"; None for the problem's own.
 
     Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
     """
     scene, parameters = stock_scene(problem)
-    integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
+    kind = "prbvolpath" if media(scene) else "prb"
+    integrator = mi.load_dict({"type": kind, "max_depth": problem.max_depth})
     start = problem.initial()
     history: list[dict[str, Any]] = []
     for warm in (True, False):

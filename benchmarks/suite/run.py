@@ -4,8 +4,8 @@ Each problem gets the same time from both. `auto` has no option given. The loop 
 a seed of its own for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time;
 its best setting is then run on the other seeds. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
 
-Errors are of the elements that the views see: those whose influence on the images at the start is at least a twentieth of the median
-influence. Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
+Errors are of the elements that the views see: those that change the images at the truth by at least a twentieth of the median
+(`unrender.sensitivity`). Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
 (benchmarks/fixed_point.py). Compilation is left out of the time on both sides, and told apart. Problems of poses are in
 higher_order.table2, since the loop has no gradients of them.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.fixed_point import applies, fixed_point
-from benchmarks.internals import SampleRequest, dr, prepare
+from benchmarks.internals import dr, hardly_seen
 from benchmarks.races import total_error
 from benchmarks.stock_loop import stock_loop
 from benchmarks.suite import scenes
@@ -36,28 +36,16 @@ TUNING_SEED = 1000
 QUICK = {
     "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "spp": (4,), "rates": (0.02,), "gallery_reference_spp": 1, "every": 1,
 }  # fmt: skip
-SEEN = 0.05
 FIXED_POINT_SPP = 16
 Points = list[tuple[float, float]]
 
 
 def visible(problem: ur.Problem) -> dict[str, np.ndarray]:
-    """{key: mask of the elements that the images depend on}, from adjoints of ones at the initial parameters."""
-    keys, start = list(problem.shapes()), problem.initial()
-    session = prepare(problem, keys)
-    influence = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
-    for view in range(len(problem.views)):
-        rendering = session.image(start, SampleRequest(view, 64, 5, 1))
-        ones = problem.renderer.array(np.ones(rendering.images.shape, np.float32))
-        for key, value in session.adjoint(start, rendering.paths, ones).items():
-            influence[key] += np.abs(np.array(value, np.float64).reshape(influence[key].shape))
+    """{key: mask of the elements that the images depend on at the truth}; of numbers, all."""
     found = {}
-    for key, value in influence.items():
-        whole = value.mean(axis=-1, keepdims=True) if value.ndim > 1 else value
-        median = np.median(whole[whole > 0]) if (whole > 0).any() else 0.0
-        found[key] = (
-            np.broadcast_to(whole > SEEN * median, value.shape) if value.size > 3 else np.ones(value.shape, bool)
-        )
+    for key, value in ur.sensitivity(problem, {**problem.initial_values(), **problem.truth}).items():
+        seen = ~hardly_seen(value)[..., None] if value.ndim > 1 else np.True_
+        found[key] = np.broadcast_to(seen, value.shape)
     return found
 
 

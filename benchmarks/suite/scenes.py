@@ -13,9 +13,9 @@ from benchmarks.internals import mi
 from benchmarks.real_input import run as real_input
 from benchmarks.runner.records import scratch
 
-TRAY = "bsdf_tray.base_color.data"
+TRAY, PAINTING = "bsdf_tray.base_color.data", "mat-painting_material.brdf_0.base_color.data"
 _ALPHA = 0.1
-_BASE = "01_default_BaseColor.png"
+_BASE, _CANVAS = "01_default_BaseColor.png", "Claude_Lorrain_008.jpg"
 
 
 def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
@@ -37,6 +37,26 @@ def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[st
     return TRAY, 1
 
 
+def _painting(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
+    """The painting on a wall of Weier et al. 2025 from near and far, its base colour unknown.
+
+    Another environment, and Mitsuba's bitmaps and normal maps in place of the authors' plugins, since theirs are not here.
+    """
+    painting = assets / "problems/painting/mts_scene"
+    mi.Bitmap(real_input.photograph(painting / "textures" / _CANVAS, texture)).write(str(folder / "truth.exr"))
+    text = (painting / "painting.xml").read_text()
+    nested = r'<texture type="mipmap_flat" name="(\w+)">\s*<texture type="bitmap" name="nested_bitmap">(.*?)</texture>\s*</texture>'
+    text = re.sub(nested, r'<texture type="bitmap" name="\1">\2</texture>', text, flags=re.DOTALL)
+    text = text.replace("normalmap_flip", "normalmap").replace('<boolean name="safe_flip" value="true"/>', "")
+    text = text.replace('<string name="format" value="variant"/>', "")
+    text = text.replace(f'value="textures/{_CANVAS}"/>', 'value="truth.exr"/><boolean name="raw" value="true"/>')
+    text = text.replace("textures/hotel_room_2k.exr", str(assets / "textures/museum.exr"))
+    text = text.replace('"textures/', f'"{painting}/textures/').replace('"meshes/', f'"{painting}/meshes/')
+    text = re.sub(r'(name="res[xy]" value=)"1024"', rf'\1"{resolution}"', text)
+    (folder / "scene.xml").write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
+    return PAINTING, 2
+
+
 def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """The tutorials' cbox.xml as it is, but for its mirror, which is rough: two walls' reflectances and the roughness unknown."""
     del texture
@@ -55,7 +75,7 @@ def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple
     return {**found, "mirror.alpha.value": (0.3, [_ALPHA])}, 1
 
 
-SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray, "numbers": _numbers}
+SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray, "painting": _painting, "numbers": _numbers}
 """Each writes scene.xml, and returns the key of a texture, whose truth it wrote as truth.exr, or {key: (initial, truth)}; and the number of
 views."""
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ import unrender as ur
 from tiers import quick, slow
 from unrender.core import registry
 from unrender.core.random import Key
+from unrender.estimators.capabilities import FreshGradient
+from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import MARGIN
@@ -30,6 +33,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "plain, other spp": lambda: ur.PathGradient(spp=4, adjoint_spp=1),
     "control variate, path space": lambda: ur.PathGradient(CV(), spp=2),
     "control variate, primary space": lambda: ur.PathGradient(CV(space="primary"), spp=2),
+    "control variate, fresh gradients too": lambda: ur.PathGradient(CV(), spp=2, fresh_from=8),
     "control variate, own paths": lambda: ur.PathGradient(CV(), spp=1),
     "plain, uniform pixels": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(24), spp=2),
     "plain, independent pixels": lambda: ur.PathGradient(pixels=ur.pixels.Uniform(24, stratified=False), spp=2),
@@ -219,6 +223,64 @@ def test_gradients_are_unbiased_for_linear_losses(name: str, loss: Any) -> None:
     worst, limit = worst_z(rows, exact)
     assert worst < limit
     assert worst_z(rows * 1.1, exact)[0] > limit, "a planted bias of 10 % went unseen"
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_fresh_gradients_know_nothing_of_earlier_samples(noise: float) -> None:
+    """Their mean is the gradient, and over runs they are uncorrelated with the gradient of the step before, where the next is."""
+    asked = problem(noise=noise)
+    estimator = ur.PathGradient(CV(), spp=2, fresh_from=8)
+    rows = []
+    for seed in range(300 if noise else 3):
+        parameters, state, last = asked.initial(), estimator.init(asked, asked.initial()), None
+        for step in range(9):
+            before = last
+            last, state = estimator.estimate(asked, parameters, state, Key(seed, step))
+            assert (last.get(FreshGradient) is not None) == (step >= 8)
+        assert before is not None
+        assert last is not None
+        trees = (before.gradient, last.gradient, last.require("the test", FreshGradient).values)
+        rows.append([np.concatenate([g.ravel() for g in tree.values()]) for tree in trees])
+    found = np.array(rows)
+    exact = np.concatenate([g.ravel() for g in exact_gradient(asked, asked.initial()).values()])
+    if not noise:
+        np.testing.assert_allclose(found, np.broadcast_to(exact, found.shape), rtol=1e-5)
+        return
+    worst, limit = worst_z(found[:, 2], exact)
+    assert worst < limit
+    before, after, fresh = (found[:, n] - found[:, n].mean(0) for n in range(3))
+    scale = np.sqrt((before**2).mean(0) * (fresh**2).mean(0)) / np.sqrt(len(found))
+    assert np.abs((before * fresh).mean(0) / scale).max() < limit
+    assert (before * after).mean() > 0.3 * (before**2).mean(), "gradients that remember agree on their noise"
+
+
+def test_a_fresh_gradient_follows_the_secant_of_a_loss_that_is_not_linear() -> None:
+    """Of L1, a residual of the samples twice that of the image weighs twice as much; its sign alone would weigh the same."""
+    asked = problem(ur.losses.L1())
+    reference = asked.reference(0)
+    residual = np.random.default_rng(0).choice([-0.3, 0.2], size=(1, *reference.shape))
+    seen = ImageEstimate(reference + residual, None, fresh=reference + 2 * residual)
+    weights = WholeView(asked, 0).loss_derivative(seen.images)
+    np.testing.assert_allclose(fresh_weights(asked, WholeView(asked, 0), seen, weights), 2 * weights, rtol=1e-6)
+    assert np.abs(weights).max() == pytest.approx(np.abs(weights).min())
+
+
+def test_fresh_gradients_come_eight_at_a_time_and_ever_more_rarely() -> None:
+    asked = problem()
+    estimator = ur.PathGradient(CV(), fresh_from=9)
+    state, having = estimator.init(asked, asked.initial()), []
+    for step in range(50):
+        found, state = estimator.estimate(asked, asked.initial(), state, Key(step))
+        having += [step] if found.get(FreshGradient) else []
+    assert having == [*range(9, 17), *range(18, 26), *range(36, 44)]
+    estimator = ur.PathGradient(fresh_from=9)  # a plain image remembers nothing: its gradient is fresh
+    found, _ = estimator.estimate(
+        asked, asked.initial(), replace(estimator.init(asked, asked.initial()), step=9), Key(0)
+    )
+    assert found.get(FreshGradient) is None
+    for wrong in (-1, 3, 8.5):
+        with pytest.raises(ur.InputError, match="fresh_from"):
+            ur.PathGradient(fresh_from=wrong)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("joint", quick([True, False], True))

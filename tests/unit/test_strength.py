@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from unrender.estimators.base import Estimate
-from unrender.optimizers import ScheduleFree
+from unrender.optimizers import ScheduleFree, strength
 from unrender.optimizers.strength import STEPS, StrengthFit
 from unrender.preconditioners import LargeSteps, Sobolev
 
@@ -73,6 +73,54 @@ def test_it_is_fitted_to_the_first_gradients_alone():
 
     assert fitted(turning, 3 * STEPS).share == 1.0
     assert fitted(turning, 3 * STEPS).count == STEPS
+
+
+def remembered(step: int) -> np.ndarray:
+    """Detail and the noise that an image remembers: it changes by a twentieth from step to step."""
+    found = normal(0)
+    for n in range(1, step + 1):
+        found = 0.95 * found + np.sqrt(1 - 0.95**2) * normal(n)
+    return found.astype(np.float32)
+
+
+def watched(detail: float, memory: float, rows: int = 2, late: float = 1.0) -> list[StrengthFit]:
+    """First of constant gradients, then of a checkerboard under remembered noise; fresh gradients do not have that noise, but their own.
+
+    In the last row the detail has become `late` of itself."""
+    smooth = Sobolev()
+    fits = [fitted(lambda step: np.ones(SHAPE, np.float32))]
+    for row in range(rows):
+        now = detail * (late if row == rows - 1 else 1.0)
+        previous = smooth.scaled(fits[-1].share).apply(now * BOARD + memory * remembered(0))
+        fit = fits[-1]
+        for step in range(1, 9):
+            found = now * BOARD + memory * remembered(step)
+            fit = fit.after(smooth, previous, found, now * BOARD + 3.0 * normal(100 * row + step))
+            previous = smooth.scaled(fit.share).apply(found)
+        fits.append(fit.after(smooth, previous, previous))
+    return fits
+
+
+def test_detail_that_fresh_samples_confirm_is_no_longer_smoothed_away():
+    first, second, _ = watched(1.0, 0.3)
+    assert first.share == 1.0
+    assert second.share < 0.1
+    squares = (np.square(Sobolev().scaled(fit.share).apply(BOARD)).sum() for fit in (first, second))
+    assert second.gain == pytest.approx(1 / np.divide(*squares), rel=0.5), "steps by a gradient that has so grown"
+
+
+def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPatch):
+    assert [fit.share for fit in watched(0.0, 1.0)] == [1.0] * 3
+    assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"
+    monkeypatch.setattr(strength, "_CONFIRMED", 0.1)
+    assert watched(0.7, 1.0)[-1].share < 0.1, "without the share that has to be confirmed"
+
+
+def test_smoothing_returns_when_fresh_samples_show_no_detail_any_more():
+    *_, before, after = watched(1.0, 0.3, rows=3, late=0.0)
+    assert before.share < 0.1
+    assert after.share == 1.0
+    assert after.gain < 0.1
 
 
 def test_a_checkerboard_is_recovered():

@@ -14,6 +14,7 @@ from unrender.core.trees import Tree
 __all__ = [
     "Capabilities",
     "Capability",
+    "FreshGradient",
     "Gradient",
     "Hessian",
     "HessianProduct",
@@ -50,6 +51,18 @@ class Variance(Capability):
     """
 
     name: ClassVar[str] = "variance"
+    values: Tree
+
+
+@dataclass(frozen=True)
+class FreshGradient(Capability):
+    """The gradient as this step's samples alone show it: its noise is independent of that of all earlier gradients.
+
+    Attributes:
+        values: {key: array}, of the gradient's keys and shapes.
+    """
+
+    name: ClassVar[str] = "fresh_gradient"
     values: Tree
 
 

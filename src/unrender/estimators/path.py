@@ -11,7 +11,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient
+from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
@@ -22,6 +22,9 @@ from unrender.problem.upsampling import Upsampler, upsampled
 
 __all__ = ["PathGradient", "PathGradientState"]
 
+_WINDOW = 8
+"""Estimates in a row that have the fresh gradient."""
+
 
 @dataclass(frozen=True)
 class PathGradientState:
@@ -31,11 +34,13 @@ class PathGradientState:
         image: the image estimator's.
         pixels: the pixel sampler's.
         batches: steps with pixel mini-batches since the last that rendered whole views.
+        step: estimates made so far.
     """
 
     image: Any
     pixels: Any
     batches: int = 0
+    step: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> PathGradientState:
         """See `Upsamplable`: the states of image estimator and pixel sampler are carried."""
@@ -69,6 +74,9 @@ class PathGradient:
             over neighbouring pixels. Of L1 that makes Charbonnier's loss √(r² + δ²) with δ = κ σ: where the sign of r is the noise's,
             r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls, it is the loss
             itself again.
+        fresh_from: the estimate, counted from 0, from which eight have `FreshGradient`, too, as again from twice, four times, … that
+            count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples: where it
+            does not, every gradient is fresh.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -76,12 +84,16 @@ class PathGradient:
     spp: int = 4
     adjoint_spp: int | None = None
     tolerance: float = 0.0
+    fresh_from: int = 0
 
     def __post_init__(self):
         checks.number("PathGradient", "tolerance", self.tolerance, above=0.0, inclusive=True)
         for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise InputError(f"PathGradient: {name} must be a whole number of at least 1, got {value!r}")
+        checks.integer("PathGradient", "fresh_from", self.fresh_from, at_least=0)
+        if 0 < self.fresh_from < _WINDOW:
+            raise InputError(f"PathGradient: fresh_from must be 0, or at least {_WINDOW}, got {self.fresh_from}")
         check_pixels("PathGradient", self.pixels, self.image)
 
     @property
@@ -93,6 +105,13 @@ class PathGradient:
     def groups(self) -> int:
         """How many leave-one-out sample groups there are; 1 where the adjoint has paths of its own."""
         return leave_one_out_groups(self.spp, self.adjoint_spp)
+
+    def _in_window(self, step: int) -> bool:
+        """Whether an estimate, counted from 0, has the fresh gradient, too."""
+        if self.fresh_from == 0 or step < self.fresh_from:
+            return False
+        begun = self.fresh_from << ((step // self.fresh_from).bit_length() - 1)
+        return step < begun + _WINDOW
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
@@ -117,13 +136,15 @@ class PathGradient:
             self.adjoint_spp,
             batch=batch,
             tolerance=self.tolerance,
+            fresh=batch.sample is None and self._in_window(state.step),
         )
         pixels = self.pixels.observe(problem, pixels, step.gradient)
         whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):
             image = self.image.prepare(problem, image)
-        next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1)
-        arrays.evaluate(step.gradient, step.losses, next_state, step.info)
+        next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1)
+        arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)
         loss = sum(arrays.number(value) for value in step.losses)
         info = {"samples": step.samples, "images": step.images, **step.info}
-        return Estimate(loss, step.gradient, info=info), next_state
+        capabilities = (FreshGradient(step.fresh),) if step.fresh else ()
+        return Estimate(loss, step.gradient, capabilities, info), next_state

@@ -14,14 +14,14 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.damping import damping, smoothed_variance
-from unrender.images.base import ImageEstimator, PairRequest
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
-__all__ = ["PIXELS", "GradientSample", "check_pixels", "gather", "leave_one_out_groups"]
+__all__ = ["PIXELS", "GradientSample", "check_pixels", "fresh_weights", "gather", "leave_one_out_groups"]
 
 PIXELS = 1 << 32
 """The stream of a step's key that draws its pixels; the streams below are its frames'."""
@@ -40,6 +40,7 @@ class GradientSample:
     Attributes:
         gradient: of the loss with respect to the current parameters.
         previous: of the loss at the previous parameters with respect to them, from the same paths; {} where it was not requested.
+        fresh: of the loss as the samples of this step alone show it; {} where it was not requested.
         losses: of the current state, one per frame, lazy.
         images: of the current state, per whole view, as the loss sees them.
         samples: paths traced for images, adjoints and the probabilities of pixels.
@@ -49,6 +50,7 @@ class GradientSample:
 
     gradient: Tree
     previous: Tree
+    fresh: Tree
     losses: list[Array]
     images: dict[int, Array]
     samples: int
@@ -80,6 +82,7 @@ def gather(
     pair_request: PairRequest | None = None,
     batch: MiniBatch | None = None,
     tolerance: float = 0.0,
+    fresh: bool = False,
 ) -> GradientSample:
     """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
 
@@ -92,7 +95,7 @@ def gather(
     frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
     parts = [
         _gather_frame(
-            problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request, tolerance
+            problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request, tolerance, fresh
         )
         for index, frame in enumerate(frames)
     ]
@@ -106,6 +109,7 @@ def gather(
     return GradientSample(
         gradient=reduce(trees.add, [part.gradient for part in parts]),
         previous=reduce(trees.add, [part.previous for part in parts]),
+        fresh=reduce(trees.add, [part.fresh for part in parts]),
         losses=[part.loss for part in parts],
         images=images,
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
@@ -120,6 +124,7 @@ class _FrameGradient:
 
     gradient: Tree
     previous: Tree
+    fresh: Tree
     loss: Array
     image: Array
     samples: int
@@ -138,6 +143,7 @@ def _gather_frame(
     adjoint_spp: int | None,
     pair_request: PairRequest | None,
     tolerance: float,
+    with_fresh: bool,
 ) -> _FrameGradient:
     groups = leave_one_out_groups(spp, adjoint_spp)
     session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
@@ -157,7 +163,10 @@ def _gather_frame(
     else:
         weights_previous = derivative(found.previous_others())
         gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
-    return _FrameGradient(gradient, previous, loss, mean, traced * frame.pixels, found.info, kept)
+    fresh: Tree = {}
+    if with_fresh and found.fresh is not None:
+        fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, weights))
+    return _FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept)
 
 
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:
@@ -167,6 +176,20 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
         return frame.loss_derivative
     around, reference = smoothed_variance(variance), problem.reference(frame.view)
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
+
+
+def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, weights: Array) -> Array:
+    """The loss derivative at this step's samples alone; where it is not linear, along its secant at the image that the loss sees.
+
+    L1's own would be the sign of the noise.
+    """
+    fresh = found.fresh_others()
+    if problem.loss.linear or not problem.loss.pixelwise or not isinstance(frame, WholeView):
+        return frame.loss_derivative(fresh)
+    reference = problem.reference(frame.view)
+    residual = found.others() - reference
+    square = residual * residual
+    return weights * residual * (fresh - reference) / (square + 1e-12)
 
 
 def _paths(session: RenderSession, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:

@@ -27,6 +27,7 @@ class ImageEstimate:
         info: for people, e.g. {"control_weight": array}.
         previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
         variance: of `mean()`, (H, W, 3), as far as it is known; None where it is not.
+        fresh: `images` of this step's samples alone, where those are of earlier ones, too; None where they are not.
         filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
     """
 
@@ -35,6 +36,7 @@ class ImageEstimate:
     info: Mapping[str, Any] = field(default_factory=dict)
     previous: Array | None = None
     variance: Array | None = None
+    fresh: Array | None = None
     filter: Callable[[Array], Array] | None = None
 
     def mean(self) -> Array:
@@ -45,6 +47,10 @@ class ImageEstimate:
     def others(self) -> Array:
         """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group."""
         return self._filtered(_leave_one_out(self.images))
+
+    def fresh_others(self) -> Array:
+        """`others()` of this step's samples alone."""
+        return self._filtered(_leave_one_out(self.images if self.fresh is None else self.fresh))
 
     def previous_others(self) -> Array:
         """`others()` of the previous step's parameters."""

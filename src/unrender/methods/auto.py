@@ -40,6 +40,8 @@ _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
 """Of the images that the share is measured on."""
+_FRESH_FROM = 16
+"""Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _MOST_PIXELS = 1 << 19
 """Of all views, that a step renders whole; where there are more, it draws half as many of them."""
 
@@ -113,7 +115,8 @@ class AutoMethod(Options):
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             f"schedule-free Adam, first rate {first}",
         )
-        estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance)
+        fresh_from = _FRESH_FROM if smoothed else 0
+        estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
     def _image(self, problem: Problem, whole: bool) -> _Image:

@@ -14,7 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient
+from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.optimizers import rates
 from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
@@ -34,6 +34,9 @@ _MEMORY = 0.8
 """Decay of the mean correlation of successive gradients."""
 _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 """Independent pairs of gradients of which a plain mean would tell as much."""
+_MOST_GROWTH = 3.0
+"""Times the first rate, and times what the parameters themselves have grown by."""
+_NOT_FITTED = StrengthFit()
 _LEAST_SIGNAL = 0.02
 """The least factor of a step: gradients that were noise may come to tell something."""
 _PROJECTED = 1e-5
@@ -56,6 +59,7 @@ class ScheduleFreeState:
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor that the rate has fallen by}.
         strengths: {key: how strongly the gradient is smoothed}, where that is fitted.
+        sizes: {key: root mean square of the first parameters, 1 where that is 0}.
         begun: the step at which all this began.
     """
 
@@ -70,6 +74,7 @@ class ScheduleFreeState:
     correlation: dict[str, float]
     log_rate: dict[str, float]
     strengths: dict[str, StrengthFit]
+    sizes: dict[str, float]
     begun: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> ScheduleFreeState:
@@ -103,20 +108,22 @@ class ScheduleFree:
 
     The rate needs no horizon. It is halved at the first step, and then changes by
 
-        log η_{t+1} = log η_t + q max(0, 2 (ρ − 1/(3 √n)) − 1) − min(p (1 − ρ), 0.6) / (t + 10)
+        log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − ρ), 0.6) / (t + 10)
 
-    with `growth` q, `decay` p and the mean correlation ρ of successive gradients, in [0, 1], of each parameter by itself, of n elements:
-    while they agree, the rate grows; once they are noise it falls as t^-0.6. Of single numbers the last nine gradients may agree by
-    chance, hence 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and averages of
-    iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
+    with `growth` q, `decay` p and the mean correlation ρ of successive gradients of each parameter by itself, of n elements: while they
+    agree, the rate grows, up to 3 η_0 times what the parameter itself has grown by; where they contradict one another, as after steps
+    too long, it shrinks; once they are noise it falls as t^-0.6. Of single numbers the last nine gradients may agree by chance, hence
+    s = 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and averages of iterates take the noise
+    away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
 
     Each element's step is shortened by the share of its gradient that is signal, as Wiener's filter does,
 
         max(s, 0.02),   s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩
 
     with means ⟨·⟩ over the last steps and the channels of a cell, and S² over its neighbours: two gradients share the signal, not the
-    noise. Adam's division lets all elements walk alike, and those that the images tell little of would walk at random. Parameters that
-    are not in `preconditioned` have no neighbours, and whole steps.
+    noise. Where estimates tell what fresh samples do not confirm of that product (`FreshGradient`), that is noise remembered: product and
+    ρ count by the share confirmed (`StrengthFit`). Adam's division lets all elements walk alike, and those that the images tell little of
+    would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps.
 
     Parameters that bounds have moved take their iterates along.
 
@@ -131,7 +138,7 @@ class ScheduleFree:
         schedule: a further factor of every learning rate by step; see `unrender.schedules.functions`.
         preconditioner: S, applied to the gradients and to the steps of z of the parameters in `preconditioned`. In place of the
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
-            The strength of `Sobolev` is the greatest that is of use: it is fitted to the first gradients, see `StrengthFit`.
+            The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
     """
 
@@ -187,7 +194,8 @@ class ScheduleFree:
         fits = {
             key: StrengthFit.begun(smooth, arrays.shape(x)) for key, x in near.items() if isinstance(smooth, Sobolev)
         }
-        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits)
+        sizes = {key: _size(x) or 1.0 for key, x in parameters.items()}
+        return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits, sizes)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
         """See `Optimizer.update`. Waits for the device: the correlation of gradients is read."""
@@ -196,15 +204,13 @@ class ScheduleFree:
         factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
         weight = (1.0 + self.averaging) / (made + 1.0 + self.averaging)
 
-        strengths = self._fitted(state, estimate.gradient) if made > 0 else state.strengths
+        strengths = self._fitted(state, estimate) if made > 0 else state.strengths
         maps = self._preconditioners(strengths)
         gradient = {key: maps[key].apply(g) if key in maps else g for key, g in estimate.gradient.items()}
-        correlation, log_rate = dict(state.correlation), dict(state.log_rate)
+        correlation, log_rate = state.correlation, state.log_rate
         product, square = state.product, state.square
         if made > 0:
-            for key, found in _correlations(gradient, state.gradient).items():
-                correlation[key] = _MEMORY * correlation[key] + (1.0 - _MEMORY) * found
-                log_rate[key] += self._change(correlation[key], arrays.shape(gradient[key]), made)
+            correlation, log_rate = self._rates(state, gradient, parameters, strengths)
             product, square = _remember(product, square, gradient, state.gradient)
 
         steps: Tree = {}
@@ -213,11 +219,12 @@ class ScheduleFree:
         second: Tree = {}
         for key, g in gradient.items():
             y = parameters[key]
-            second[key] = self.beta_2 * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
+            fit = strengths.get(key, _NOT_FITTED)
+            second[key] = self.beta_2 * fit.gain * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)
             if key in maps:
-                share = _signal(maps[key], product[key], square[key], _MEMORY**made)
+                share = _signal(maps[key], product[key] * fit.confirmed, square[key], _MEMORY**made)
                 direction = maps[key].apply(direction) * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             before, mean = self._within_bounds(state.fast[key], state.average[key], y)
@@ -251,18 +258,39 @@ class ScheduleFree:
         """`learning_rate` as {key: rate, "*": of the others}."""
         return self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
 
+    def _rates(
+        self, state: ScheduleFreeState, gradient: Tree, parameters: Tree, strengths: Mapping[str, StrengthFit]
+    ) -> tuple[dict[str, float], dict[str, float]]:
+        """The next mean correlations, and logarithms of the rates' factors, which begin anew where smoothing has changed."""
+        correlation, log_rate = {}, {}
+        for key, found in _correlations(gradient, state.gradient).items():
+            correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * found
+            fit, shape = strengths.get(key, _NOT_FITTED), arrays.shape(gradient[key])
+            change = self._change(correlation[key] * fit.confirmed, shape, state.step - state.begun)
+            most = 0.0
+            if fit.gain == 1.0:
+                most = math.log(_MOST_GROWTH * max(1.0, _size(parameters[key]) / state.sizes[key]))
+            log_rate[key] = min(state.log_rate[key] + change, most)
+        return correlation, log_rate
+
     def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
         """Of the logarithm of the rate, in one step."""
         power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
         error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
-        return self.growth * max(0.0, 2.0 * (correlation - error) - 1.0) - power / (made + _DELAY)
+        change = self.growth * (max(0.0, 2.0 * (correlation - error) - 1.0) - 2.0 * max(0.0, -correlation - error))
+        return change - power / (made + _DELAY)
 
-    def _fitted(self, state: ScheduleFreeState, gradient: Tree) -> dict[str, StrengthFit]:
+    def _fitted(self, state: ScheduleFreeState, estimate: Estimate) -> dict[str, StrengthFit]:
         """The strengths after another gradient."""
         smooth = self.preconditioner
         if not isinstance(smooth, Sobolev):
             return state.strengths
-        return {key: fit.after(smooth, state.gradient[key], gradient[key]) for key, fit in state.strengths.items()}
+        found = estimate.get(FreshGradient)
+        fresh: Mapping[str, Array] = {} if found is None else found.values
+        return {
+            key: fit.after(smooth, state.gradient[key], estimate.gradient[key], fresh.get(key))
+            for key, fit in state.strengths.items()
+        }
 
     def _preconditioners(self, strengths: Mapping[str, StrengthFit]) -> dict[str, Preconditioner]:
         """{key: S} of the parameters that have one."""
@@ -287,6 +315,11 @@ class ScheduleFree:
             return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
 
         return moved(fast), moved(average)
+
+
+def _size(x: Array) -> float:
+    """The root mean square; 0 of no elements."""
+    return math.sqrt(arrays.number(arrays.total(x * x)) / max(1, math.prod(arrays.shape(x))))
 
 
 def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float) -> np.ndarray:

@@ -82,7 +82,8 @@ def around(found: np.ndarray) -> np.ndarray:
     """
     from scipy.ndimage import uniform_filter
 
-    return np.sqrt(uniform_filter(np.mean(np.square(found, dtype=np.float64), axis=-1), 3, mode="nearest"))
+    means = uniform_filter(np.mean(np.square(found, dtype=np.float64), axis=-1), 3, mode="nearest")
+    return np.sqrt(means.clip(min=0.0))  # running sums round to less than 0 beside large values
 
 
 def hardly_seen(found: np.ndarray) -> np.ndarray:
