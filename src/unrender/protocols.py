@@ -8,6 +8,7 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.capabilities import (
     Capabilities,
     Capability,
+    FreshGradient,
     Gradient,
     Hessian,
     HessianProduct,
@@ -30,6 +31,7 @@ __all__ = [
     "Capability",
     "Estimate",
     "Estimator",
+    "FreshGradient",
     "Gradient",
     "Hessian",
     "HessianProduct",

@@ -248,6 +248,7 @@ def test_fresh_gradients_know_nothing_of_earlier_samples(noise: float) -> None:
         return
     worst, limit = worst_z(found[:, 2], exact)
     assert worst < limit
+    assert worst_z(found[:, 2] * 1.3, exact)[0] > limit, "a planted bias of 30 % went unseen"
     before, after, fresh = (found[:, n] - found[:, n].mean(0) for n in range(3))
     scale = np.sqrt((before**2).mean(0) * (fresh**2).mean(0)) / np.sqrt(len(found))
     assert np.abs((before * fresh).mean(0) / scale).max() < limit
@@ -261,7 +262,9 @@ def test_a_fresh_gradient_follows_the_secant_of_a_loss_that_is_not_linear() -> N
     residual = np.random.default_rng(0).choice([-0.3, 0.2], size=(1, *reference.shape))
     seen = ImageEstimate(reference + residual, None, fresh=reference + 2 * residual)
     weights = WholeView(asked, 0).loss_derivative(seen.images)
-    np.testing.assert_allclose(fresh_weights(asked, WholeView(asked, 0), seen, weights), 2 * weights, rtol=1e-6)
+    np.testing.assert_allclose(
+        fresh_weights(asked, WholeView(asked, 0), seen, seen.images, weights), 2 * weights, rtol=1e-6
+    )
     assert np.abs(weights).max() == pytest.approx(np.abs(weights).min())
 
 
@@ -278,6 +281,14 @@ def test_fresh_gradients_come_eight_at_a_time_and_ever_more_rarely() -> None:
         asked, asked.initial(), replace(estimator.init(asked, asked.initial()), step=9), Key(0)
     )
     assert found.get(FreshGradient) is None
+    for tolerance in (0.0, 2.0):  # L1's secant at no residual has no bound, but where it is damped
+        estimator = ur.PathGradient(CV(), spp=2, tolerance=tolerance, fresh_from=8)
+        absolute = problem(ur.losses.L1())
+        _, state = estimator.estimate(
+            absolute, absolute.initial(), estimator.init(absolute, absolute.initial()), Key(0)
+        )
+        found, _ = estimator.estimate(absolute, absolute.initial(), replace(state, step=8), Key(1))
+        assert (found.get(FreshGradient) is not None) == (tolerance > 0)
     for wrong in (-1, 3, 8.5):
         with pytest.raises(ur.InputError, match="fresh_from"):
             ur.PathGradient(fresh_from=wrong)  # pyright: ignore[reportArgumentType]

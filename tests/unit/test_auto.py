@@ -51,7 +51,7 @@ def test_images_have_a_memory(loss: Any) -> None:
     assert estimator == PathGradient(images.RecursiveControlVariate("path"), **fresh)
     estimator, _ = chosen(problem(loss, shares_paths=False))
     assert estimator.image == images.RecursiveControlVariate("primary")
-    assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(**{**fresh, "spp": 6})
+    assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6, tolerance=tolerance)
     assert chosen(problem(loss), tolerance=0)[0].tolerance == 0
     reasons = method("auto").choose(problem(loss), {}).reasons
     assert any("damped where noise exceeds the residual" in line for line in reasons) == (not loss.linear)
@@ -78,7 +78,7 @@ def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeyp
     assert 0.02 < pilot(False) < 0.06  # a hundredth of the pixels, those at the end of a chi-square of three channels
     assert pilot(True) > 0.95
     monkeypatch.setattr(module, "_firefly_share", lambda problem: 0.9)
-    assert chosen(made)[0] == PathGradient(spp=module._MOST, fresh_from=module._FRESH_FROM)
+    assert chosen(made)[0] == PathGradient(spp=module._MOST)
     assert "90% of the noise" in method("auto").choose(made).reasons[0]
     assert chosen(made, image="rcv")[0].image == images.RecursiveControlVariate("path")
     assert chosen(problem(losses.L1()))[0].image == images.RecursiveControlVariate("path")

@@ -23,7 +23,7 @@ def normal(seed: int, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 def fitted(gradient: Callable[[int], np.ndarray], steps: int = STEPS) -> StrengthFit:
     """After the gradients of a function of the step."""
     smooth = Sobolev()
-    fit, previous = StrengthFit.begun(smooth, SHAPE), smooth.apply(gradient(0))
+    fit, previous = StrengthFit(), smooth.apply(gradient(0))
     for step in range(1, steps + 1):
         found = gradient(step)
         fit = fit.after(smooth, previous, found)
@@ -60,9 +60,7 @@ def test_the_share_is_where_steps_descend_by_the_least():
     signal, smooth = normal(5), Sobolev()
     fit = fitted(lambda step: signal)
     assert 0.01 < fit.share < 0.9
-    product, square = smooth.descents(
-        smooth.apply(signal), signal, np.array([fit.share, 0.25 ** (fit.sums.shape[1] - 1)])
-    )
+    product, square = smooth.descents(smooth.apply(signal), signal, np.array([fit.share, 0.25 ** (len(fit.sums) - 1)]))
     chosen, weakest = product / np.sqrt(square)
     assert chosen == pytest.approx(0.4 * weakest, rel=0.1)
 
@@ -83,21 +81,26 @@ def remembered(step: int) -> np.ndarray:
     return found.astype(np.float32)
 
 
-def watched(detail: float, memory: float, rows: int = 2, late: float = 1.0) -> list[StrengthFit]:
+def watched(
+    detail: float, memory: float, rows: int = 2, late: float = 1.0, scales: tuple[float, ...] = (1.0, 1.0, 1.0)
+) -> list[StrengthFit]:
     """First of constant gradients, then of a checkerboard under remembered noise; fresh gradients do not have that noise, but their own.
 
-    In the last row the detail has become `late` of itself."""
+    In the last row the detail has become `late` of itself; `scales` are of all gradients in each row.
+    """
     smooth = Sobolev()
     fits = [fitted(lambda step: np.ones(SHAPE, np.float32))]
     for row in range(rows):
-        now = detail * (late if row == rows - 1 else 1.0)
-        previous = smooth.scaled(fits[-1].share).apply(now * BOARD + memory * remembered(0))
+        now = detail * (late if row == rows - 1 else 1.0) * scales[row]
+        kept = memory * scales[row]
+        previous = smooth.scaled(fits[-1].share).apply(now * BOARD + kept * remembered(0))
         fit = fits[-1]
         for step in range(1, 9):
-            found = now * BOARD + memory * remembered(step)
-            fit = fit.after(smooth, previous, found, now * BOARD + 3.0 * normal(100 * row + step))
+            found = now * BOARD + kept * remembered(step)
+            noise = 3.0 * scales[row] * normal(1000 * (row + 1) + step)
+            fit = fit.after(smooth, previous, found, now * BOARD + noise)
             previous = smooth.scaled(fit.share).apply(found)
-        fits.append(fit.after(smooth, previous, previous))
+        fits.append(fit)
     return fits
 
 
@@ -114,6 +117,42 @@ def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPa
     assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"
     monkeypatch.setattr(strength, "_CONFIRMED", 0.1)
     assert watched(0.7, 1.0)[-1].share < 0.1, "without the share that has to be confirmed"
+
+
+def test_fresh_gradients_that_are_not_finite_are_left_out():
+    fit = watched(0.0, 1.0, rows=1)[-1]
+    broken = np.where(BOARD > 0, np.nan, BOARD).astype(np.float32)
+    for bad in (broken, np.float32(np.inf) * BOARD):
+        after = fit.after(Sobolev(), BOARD, BOARD, bad)
+        assert len(after.fresh) == len(fit.fresh)
+        assert after.unjudged == 0
+    after = fit.after(Sobolev(), 0 * BOARD, BOARD, BOARD)
+    assert len(after.fresh) == len(fit.fresh), "nor do gradients of nothing count"
+
+
+def test_gradients_that_have_become_smaller_count_as_much():
+    """Noise alone, a hundredth as large as the detail that was there first: the last row decides."""
+    steady, faded = (watched(0.4, 1.0, late=0.0, scales=(1.0, scale)) for scale in (1.0, 0.01))
+    assert faded[-1].confirmed == pytest.approx(steady[-1].confirmed, rel=0.2)
+    assert faded[-1].confirmed < faded[-2].confirmed
+
+
+def test_where_gradients_contradict_one_another_there_is_nothing_to_refute():
+    *_, fit = watched(1.0, 0.3)
+    assert fit.share < 0.1
+    smooth = Sobolev()
+    for step in range(8):
+        found = (-1.0) ** step * BOARD
+        fit = fit.after(smooth, smooth.scaled(fit.share).apply(-found), found, found)
+    assert fit.share < 0.1
+    assert fit.confirmed == 1.0
+
+
+def test_what_gradients_agree_on_counts_as_far_as_fresh_samples_confirm_it():
+    confirmed = [watched(detail, 1.0)[-1].confirmed for detail in (0.0, 0.5)]
+    assert confirmed[0] < 0.3
+    assert confirmed[0] < confirmed[1]
+    assert watched(1.0, 0.0, rows=1)[-1].confirmed == 1.0
 
 
 def test_smoothing_returns_when_fresh_samples_show_no_detail_any_more():

@@ -16,6 +16,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import (
     Capability,
+    FreshGradient,
     Hessian,
     HessianProduct,
     LossFunction,
@@ -97,6 +98,8 @@ def as_numpy(estimate: Estimate) -> Estimate:
         match capability:
             case Variance(values):
                 return Variance(trees.numpy(values))
+            case FreshGradient(values):
+                return FreshGradient(trees.numpy(values))
             case Hessian(matrix):
                 return Hessian(arrays.numpy(matrix))
         return capability

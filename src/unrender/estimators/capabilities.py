@@ -56,7 +56,9 @@ class Variance(Capability):
 
 @dataclass(frozen=True)
 class FreshGradient(Capability):
-    """The gradient as this step's samples alone show it: its noise is independent of that of all earlier gradients.
+    """The gradient as this step's samples alone show it: whatever the earlier ones were, its noise is 0 on average.
+
+    Estimators that remember samples give it now and then.
 
     Attributes:
         values: {key: array}, of the gradient's keys and shapes.

@@ -15,6 +15,7 @@ from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradie
 from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
+from unrender.losses.base import Loss
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.problem.problem import Problem
@@ -75,8 +76,8 @@ class PathGradient:
             r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls, it is the loss
             itself again.
         fresh_from: the estimate, counted from 0, from which eight have `FreshGradient`, too, as again from twice, four times, … that
-            count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples: where it
-            does not, every gradient is fresh.
+            count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples (where it
+            does not, every gradient is fresh), and with a linear derivative or a tolerance.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -105,6 +106,10 @@ class PathGradient:
     def groups(self) -> int:
         """How many leave-one-out sample groups there are; 1 where the adjoint has paths of its own."""
         return leave_one_out_groups(self.spp, self.adjoint_spp)
+
+    def _has_secant(self, loss: Loss) -> bool:
+        """Whether the derivative is linear, or has a secant that is bounded."""
+        return loss.linear or (loss.pixelwise and self.tolerance > 0)
 
     def _in_window(self, step: int) -> bool:
         """Whether an estimate, counted from 0, has the fresh gradient, too."""
@@ -136,7 +141,7 @@ class PathGradient:
             self.adjoint_spp,
             batch=batch,
             tolerance=self.tolerance,
-            fresh=batch.sample is None and self._in_window(state.step),
+            fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
         )
         pixels = self.pixels.observe(problem, pixels, step.gradient)
         whole, image = batch.sample is None, step.image

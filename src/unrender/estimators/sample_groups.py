@@ -156,7 +156,8 @@ def _gather_frame(
         paths = _paths(session, parameters, request, pair_request)
         traced += request.spp
     derivative = _derivative(problem, frame, found.variance, tolerance)
-    weights = derivative(found.others())
+    others = found.others()
+    weights = derivative(others)
     previous: Tree = {}
     if pair_request is None:
         gradient = session.adjoint(parameters, paths, weights)
@@ -165,7 +166,7 @@ def _gather_frame(
         gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
     fresh: Tree = {}
     if with_fresh and found.fresh is not None:
-        fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, weights))
+        fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
     return _FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept)
 
 
@@ -178,16 +179,21 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
 
 
-def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, weights: Array) -> Array:
-    """The loss derivative at this step's samples alone; where it is not linear, along its secant at the image that the loss sees.
+def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: Array, weights: Array) -> Array:
+    """The loss derivative at this step's samples alone; where it is not linear, along its secant at the image that the loss sees: L1's own
+    would be the sign of the noise.
 
-    L1's own would be the sign of the noise.
+    Args:
+        problem, frame: whose loss and reference.
+        found: the image.
+        others: its leave-one-out images.
+        weights: the loss derivative at these; of a loss that is not linear, damped (`tolerance`), or the secant has no bound.
     """
     fresh = found.fresh_others()
     if problem.loss.linear or not problem.loss.pixelwise or not isinstance(frame, WholeView):
         return frame.loss_derivative(fresh)
     reference = problem.reference(frame.view)
-    residual = found.others() - reference
+    residual = others - reference
     square = residual * residual
     return weights * residual * (fresh - reference) / (square + 1e-12)
 

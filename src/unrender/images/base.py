@@ -27,8 +27,8 @@ class ImageEstimate:
         info: for people, e.g. {"control_weight": array}.
         previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
         variance: of `mean()`, (H, W, 3), as far as it is known; None where it is not.
-        fresh: `images` of this step's samples alone, where those are of earlier ones, too; None where they are not.
         filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
+        fresh: the same as `images`, from this step's samples alone; None where `images` are.
     """
 
     images: Array
@@ -36,8 +36,8 @@ class ImageEstimate:
     info: Mapping[str, Any] = field(default_factory=dict)
     previous: Array | None = None
     variance: Array | None = None
-    fresh: Array | None = None
     filter: Callable[[Array], Array] | None = None
+    fresh: Array | None = None
 
     def mean(self) -> Array:
         """The image of all samples together, (H, W, 3) or (N, 3)."""

@@ -210,7 +210,7 @@ class RecursiveControlVariate:
         previous = advance(memory.image, rendering.previous, rendering.previous, weight)
         if (within := variance_of_mean(rendering.images)) is not None:
             variance = arrays.where(known, variance, relative * within)
-        estimate = ImageEstimate(current, rendering.paths, info, previous, variance, rendering.images)
+        estimate = ImageEstimate(current, rendering.paths, info, previous, variance, fresh=rendering.images)
         return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
 
     def advance(

@@ -115,7 +115,8 @@ class AutoMethod(Options):
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             f"schedule-free Adam, first rate {first}",
         )
-        fresh_from = _FRESH_FROM if smoothed else 0
+        remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
+        fresh_from = _FRESH_FROM if smoothed and remembers else 0
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 

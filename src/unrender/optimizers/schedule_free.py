@@ -78,7 +78,7 @@ class ScheduleFreeState:
     begun: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> ScheduleFreeState:
-        """See `Upsamplable`: iterates and moments are interpolated."""
+        """See `Upsamplable`: iterates and moments are interpolated; how strongly to smooth is found anew."""
         return replace(
             self,
             fast=upsampler.tree(self.fast),
@@ -87,6 +87,7 @@ class ScheduleFreeState:
             gradient=upsampler.tree(self.gradient, 1.0),
             product=upsampler.tree(self.product, SQUARES),
             square=upsampler.tree(self.square, SQUARES),
+            strengths={key: StrengthFit() if key in upsampler.shares else fit for key, fit in self.strengths.items()},
         )
 
     def restarted(self, fresh: ScheduleFreeState) -> ScheduleFreeState:
@@ -108,7 +109,7 @@ class ScheduleFree:
 
     The rate needs no horizon. It is halved at the first step, and then changes by
 
-        log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − ρ), 0.6) / (t + 10)
+        log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + 10)
 
     with `growth` q, `decay` p and the mean correlation ρ of successive gradients of each parameter by itself, of n elements: while they
     agree, the rate grows, up to 3 η_0 times what the parameter itself has grown by; where they contradict one another, as after steps
@@ -191,14 +192,12 @@ class ScheduleFree:
         none = dict.fromkeys(parameters, 0.0)
         smooth = self.preconditioner
         near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
-        fits = {
-            key: StrengthFit.begun(smooth, arrays.shape(x)) for key, x in near.items() if isinstance(smooth, Sobolev)
-        }
+        fits = dict.fromkeys(near if isinstance(smooth, Sobolev) else {}, StrengthFit())
         sizes = {key: _size(x) or 1.0 for key, x in parameters.items()}
         return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits, sizes)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
-        """See `Optimizer.update`. Waits for the device: the correlation of gradients is read."""
+        """See `Optimizer.update`. Waits for the device: the correlation of gradients and the parameters' size are read."""
         made = state.step - state.begun
         debias = 1.0 / math.sqrt(1.0 - self.beta_2 ** (made + 1))
         factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
@@ -211,7 +210,7 @@ class ScheduleFree:
         product, square = state.product, state.square
         if made > 0:
             correlation, log_rate = self._rates(state, gradient, parameters, strengths)
-            product, square = _remember(product, square, gradient, state.gradient)
+            product, square = _remember(state, gradient, strengths)
 
         steps: Tree = {}
         fast: Tree = {}
@@ -220,11 +219,12 @@ class ScheduleFree:
         for key, g in gradient.items():
             y = parameters[key]
             fit = strengths.get(key, _NOT_FITTED)
-            second[key] = self.beta_2 * fit.gain * state.second_moment[key] + (1.0 - self.beta_2) * (g * g)
+            before = state.second_moment[key] * arrays.scalar(self.beta_2 * fit.gain, g)
+            second[key] = before + (1.0 - self.beta_2) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)
             if key in maps:
-                share = _signal(maps[key], product[key] * fit.confirmed, square[key], _MEMORY**made)
+                share = _signal(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed)
                 direction = maps[key].apply(direction) * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             before, mean = self._within_bounds(state.fast[key], state.average[key], y)
@@ -261,15 +261,13 @@ class ScheduleFree:
     def _rates(
         self, state: ScheduleFreeState, gradient: Tree, parameters: Tree, strengths: Mapping[str, StrengthFit]
     ) -> tuple[dict[str, float], dict[str, float]]:
-        """The next mean correlations, and logarithms of the rates' factors, which begin anew where smoothing has changed."""
+        """The next mean correlations, and logarithms of the rates' factors: where smoothing has changed, no rate is above its first."""
         correlation, log_rate = {}, {}
-        for key, found in _correlations(gradient, state.gradient).items():
-            correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * found
+        for key, (cosine, size) in _measured(gradient, state.gradient, parameters).items():
+            rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
             fit, shape = strengths.get(key, _NOT_FITTED), arrays.shape(gradient[key])
-            change = self._change(correlation[key] * fit.confirmed, shape, state.step - state.begun)
-            most = 0.0
-            if fit.gain == 1.0:
-                most = math.log(_MOST_GROWTH * max(1.0, _size(parameters[key]) / state.sizes[key]))
+            change = self._change(min(rho, rho * fit.confirmed), shape, state.step - state.begun)
+            most = math.log(_MOST_GROWTH * max(1.0, size / state.sizes[key])) if fit.gain == 1.0 else 0.0
             log_rate[key] = min(state.log_rate[key] + change, most)
         return correlation, log_rate
 
@@ -322,36 +320,41 @@ def _size(x: Array) -> float:
     return math.sqrt(arrays.number(arrays.total(x * x)) / max(1, math.prod(arrays.shape(x))))
 
 
-def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float) -> np.ndarray:
-    """The share of signal per element, 1 as far as it is `unknown` yet."""
+def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float, confirmed: float) -> np.ndarray:
+    """The share of signal per element: as far as gradients agree, and fresh ones confirm it; 1 as far as it is `unknown` yet."""
     parts = [arrays.numpy(x).astype(np.float64) for x in (product, square)]
     means = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
     for _ in range(2):
         means = np.asarray(smooth.apply(means))
-    whole, squares = means[..., :1], means[..., 1:]
+    whole, squares = means[..., :1] * confirmed, means[..., 1:]
     share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
     share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
     return np.broadcast_to(share, parts[0].shape).astype(np.float32)
 
 
-def _remember(product: Tree, square: Tree, current: Tree, previous: Tree) -> tuple[Tree, Tree]:
-    """The sums of `ScheduleFreeState.product` and `square` after another step."""
-    pairs = {key: (current[key], previous[key]) for key in product}
-    products = {key: _MEMORY * product[key] + g * h for key, (g, h) in pairs.items()}
-    squares = {key: _MEMORY * square[key] + 0.5 * (g * g + h * h) for key, (g, h) in pairs.items()}
-    return products, squares
+def _remember(state: ScheduleFreeState, gradient: Tree, strengths: Mapping[str, StrengthFit]) -> tuple[Tree, Tree]:
+    """`product` and `square` of the next state: what was remembered is of the size that it has with the strengths of this step."""
+    product, square = {}, {}
+    for key, past in state.product.items():
+        gain, g, h = strengths.get(key, _NOT_FITTED).gain, gradient[key], state.gradient[key]
+        memory = arrays.scalar(_MEMORY * gain, g)
+        h = h * arrays.scalar(math.sqrt(gain), g)
+        product[key] = memory * past + g * h
+        square[key] = memory * state.square[key] + 0.5 * (g * g + h * h)
+    return product, square
 
 
-def _correlations(current: Tree, previous: Tree) -> dict[str, float]:
-    """{key: cosine of the angle between two gradients}; 0 where one of them is 0."""
-    products = {
-        key: (arrays.total(g * previous[key]), arrays.total(g * g), arrays.total(previous[key] * previous[key]))
-        for key, g in current.items()
+def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tuple[float, float]]:
+    """{key: (cosine of the angle between two gradients, 0 where one of them is 0; root mean square of the parameter)}."""
+    sums = {
+        key: [arrays.total(x) for x in (g * previous[key], g * g, previous[key] * previous[key], parameters[key] ** 2)]
+        for key, g in gradient.items()
     }
-    arrays.evaluate(products)
-    found: dict[str, float] = {}
-    for key, parts in products.items():
-        product, one, other = (arrays.number(part) for part in parts)
+    arrays.evaluate(sums)
+    found = {}
+    for key, parts in sums.items():
+        product, one, other, square = (arrays.number(part) for part in parts)
         lengths = math.sqrt(one) * math.sqrt(other)
-        found[key] = product / lengths if lengths > 0 else 0.0
+        size = math.sqrt(square / max(1, math.prod(arrays.shape(parameters[key]))))
+        found[key] = (product / lengths if lengths > 0 else 0.0, size)
     return found

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.preconditioners import Sobolev
 
@@ -19,15 +19,14 @@ _FACTOR, _WEAKEST = 4.0, 1 / 16
 """Candidates are λ, λ/4, λ/16, ... down to the first that hardly smooths."""
 _LEAST_DESCENT = 0.4
 """Of the best candidate's."""
+_ROWS = 8
+"""Fresh gradients from one judgement to the next; it is by those of the last two."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 5.5
-"""The same with fresh samples; and the standard errors by which the descent must be the greater one."""
-_LEAST_CONFIRMED = 0.02
+"""Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
 _CONFIRMED, _REFUTED = 0.75, 0.2
 """Shares of what successive gradients agree on that fresh samples have to show for less smoothing, and below which it is given up."""
-
-
-def _candidates(strength: float) -> int:
-    return 1 + max(0, math.ceil(math.log(max(strength, _WEAKEST) / _WEAKEST, _FACTOR)))
+_LEAST_CONFIRMED = 0.02
+"""The share by which such an agreement counts at least."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +46,22 @@ class StrengthFit:
 
     Attributes:
         share: of the λ given, in (0, 1].
-        count: pairs of gradients seen.
-        sums: (2, n), over them, of S g · S g' and |S g|² for the n candidates.
-        fresh: (k, 3, 1 + n), of k fresh gradients since the last change: S g · S f, |S g|² and S g · S g' for this share and the
+        count: pairs of gradients that the first fit has seen.
+        sums: (n, 2), over them, of S g · S g' and |S g|² for the n candidates.
+        fresh: of up to 16 fresh gradients since the last change, (3, 1 + n) each: S g · S f, |S g|² and S g · S g' for this share and the
             candidates.
-        judged: how many of these there were when the strength was last judged by them.
-        gain: |S g|² with this share over that with the share of the step before.
+        unjudged: how many of these came after the last judgement.
+        gain: |S g|² with this share over that with the share before, where fresh gradients have changed it at this step; 1 elsewhere.
         confirmed: the share of S g · S g' that is S g · S f, at most, in [0.02, 1]: by how much gradients agree for what is no noise.
     """
 
     share: float = 1.0
     count: int = 0
-    sums: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
-    fresh: np.ndarray = field(default_factory=lambda: np.zeros((0, 3, 0)))
-    judged: int = 0
+    sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    fresh: tuple[np.ndarray, ...] = ()
+    unjudged: int = 0
     gain: float = 1.0
     confirmed: float = 1.0
-
-    @classmethod
-    def begun(cls, preconditioner: Sobolev, shape: Sequence[int]) -> StrengthFit:
-        """Before the first gradient of a parameter of this shape."""
-        count = _candidates(preconditioner.strength_of(tuple(shape)))
-        return cls(sums=np.zeros((2, count)), fresh=np.zeros((0, 3, 1 + count)))
 
     def after(
         self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array | None = None
@@ -79,69 +72,92 @@ class StrengthFit:
             preconditioner: with all of λ.
             previous: the gradient of the last step, preconditioned with this share.
             gradient: that of this step, as it is.
-            fresh: that of this step's samples alone; None where it was not estimated.
+            fresh: that of this step's samples alone; None where it was not estimated. Left out where it is not finite.
         """
-        found = self if self.gain == 1.0 else replace(self, gain=1.0)
+        found = replace(self, gain=1.0)
         if found.count < STEPS:
-            return found._fitted(preconditioner, previous, gradient)
+            return found._with_pair(preconditioner, previous, gradient)
         if fresh is not None:
-            return found._seen(preconditioner, previous, gradient, fresh)
-        return found._judged() if len(found.fresh) > max(found.judged, 1) else found
+            found = found._with_fresh(preconditioner, previous, gradient, fresh)
+        return found._judged() if found.unjudged >= _ROWS else found
 
-    def _fitted(self, preconditioner: Sobolev, previous: Array, gradient: Array) -> StrengthFit:
+    def _with_pair(self, preconditioner: Sobolev, previous: Array, gradient: Array) -> StrengthFit:
+        """The first fit, with another pair."""
+        found = self
+        if self.count == 0:
+            found = replace(self, sums=np.zeros((_candidates(preconditioner.strength_of(arrays.shape(gradient))), 2)))
         smooth = preconditioner.scaled(self.share)
-        sums = self.sums + smooth.descents(previous, gradient, self._shares / self.share)
-        return replace(self, share=_share(sums), count=self.count + 1, sums=sums)
+        sums = found.sums + smooth.descents(previous, gradient, found._shares / self.share).T
+        return replace(found, share=_share(sums), count=self.count + 1, sums=sums)
 
-    def _seen(self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array) -> StrengthFit:
+    def _with_fresh(self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array) -> StrengthFit:
+        """With the products of another fresh gradient."""
         smooth, shares = preconditioner.scaled(self.share), np.append(1.0, self._shares / self.share)
         products, squares = smooth.descents(previous, fresh, shares)
         agreement, _ = smooth.descents(previous, gradient, shares)
-        return replace(self, fresh=np.concatenate([self.fresh, [[products, squares, agreement]]]))
+        row = np.stack([products, squares, agreement])
+        if not np.isfinite(row).all() or (squares <= 0).any():
+            return self
+        return replace(self, fresh=(*self.fresh, row)[-2 * _ROWS :], unjudged=self.unjudged + 1)
 
     def _judged(self) -> StrengthFit:
-        """At the end of a row of fresh gradients."""
-        products, squares = self.fresh[:, 0], self.fresh[:, 1].mean(axis=0)
+        """With the strength that the fresh gradients speak for."""
+        rows = np.stack(self.fresh)
+        products, squares = rows[:, 0], rows[:, 1]
         first = _share(self.sums)
-        if self.share < first and _confirmed(self.fresh[self.judged :], 0) < _REFUTED:
-            known = np.interp(math.log(first), np.log(self._shares[::-1]), squares[:0:-1])
-            return self._changed(first, float(known / squares[0]))
-        descents = products / np.sqrt(np.where(squares > 0, squares, np.inf))
+        if self.share < first and _confirmed(rows[-self.unjudged :], 0) < _REFUTED:
+            known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
+            return self._changed(first, float(known / squares[:, 0].mean()))
+        descents = products / np.sqrt(squares)
         means = descents.mean(axis=0)[1:]
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
         more = descents[:, 1 + best] - descents[:, 0]
         beyond_doubt = more.mean() > _ERRORS * more.std(ddof=1) / math.sqrt(len(more))
-        if self._shares[best] < self.share and beyond_doubt and _confirmed(self.fresh, 1 + best) >= _CONFIRMED:
-            return self._changed(float(self._shares[best]), float(squares[1 + best] / squares[0]))
-        return replace(self, judged=len(self.fresh), confirmed=_most_confirmed(self.fresh))
+        if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best) >= _CONFIRMED:
+            return self._changed(float(self._shares[best]), float(squares[:, 1 + best].sum() / squares[:, 0].sum()))
+        return replace(self, unjudged=0, confirmed=_most_confirmed(rows))
 
     def _changed(self, share: float, gain: float) -> StrengthFit:
-        return replace(self, share=share, gain=gain, fresh=self.fresh[:0], judged=0, confirmed=1.0)
+        """With another strength, of which nothing is known yet."""
+        return replace(self, share=share, gain=gain, fresh=(), unjudged=0, confirmed=1.0)
 
     @property
     def _shares(self) -> np.ndarray:
         """Of the candidates, (n,)."""
-        return _FACTOR ** -np.arange(self.sums.shape[1], dtype=float)
+        return _FACTOR ** -np.arange(len(self.sums), dtype=float)
 
 
-def _confirmed(fresh: np.ndarray, candidate: int) -> float:
-    """Σ S g · S f / Σ S g · S g' of `StrengthFit.fresh`; 0 where successive gradients do not agree."""
-    product, agreement = fresh[:, 0, candidate].sum(), fresh[:, 2, candidate].sum()
-    return float(product / agreement) if agreement > 0 else 0.0
+def _candidates(strength: float) -> int:
+    return 1 + max(0, math.ceil(math.log(max(strength, _WEAKEST) / _WEAKEST, _FACTOR)))
 
 
-def _most_confirmed(fresh: np.ndarray) -> float:
+def _ratio(rows: np.ndarray, candidate: int) -> tuple[float, float]:
+    """Σ S g · S f / Σ S g · S g' and its standard error, of rows (k, 3, 1 + n) that count alike, each over its |S g|².
+
+    (1, 0) where successive gradients do not agree: there is then nothing to confirm.
+    """
+    products, agreement = rows[:, (0, 2), candidate].T / rows[:, 1, candidate]
+    if agreement.sum() <= 0:
+        return 1.0, 0.0
+    found = products.sum() / agreement.sum()
+    error = (products - found * agreement).std(ddof=1) * math.sqrt(len(rows)) / agreement.sum()
+    return float(found), float(error)
+
+
+def _confirmed(rows: np.ndarray, candidate: int) -> float:
+    """The share of what successive gradients agree on that fresh ones confirm, with a candidate's strength."""
+    return _ratio(rows, candidate)[0]
+
+
+def _most_confirmed(rows: np.ndarray) -> float:
     """Two standard errors above the share that fresh gradients confirm with the present strength, within [0.02, 1]."""
-    share, agreement = _confirmed(fresh, 0), fresh[:, 2, 0].sum()
-    if agreement <= 0:
-        return 1.0
-    error = (fresh[:, 0, 0] - share * fresh[:, 2, 0]).std(ddof=1) * math.sqrt(len(fresh)) / agreement
-    return float(np.clip(share + 2.0 * error, _LEAST_CONFIRMED, 1.0))
+    share, error = _ratio(rows, 0)
+    return min(max(share + 2.0 * error, _LEAST_CONFIRMED), 1.0)
 
 
 def _share(sums: np.ndarray) -> float:
     """From the sums of a `StrengthFit`; between candidates, where the straight line over log λ meets the least descent."""
-    products, squares = sums
+    products, squares = sums.T
     descent = products / np.sqrt(np.where(squares > 0, squares, np.inf))
     least = _LEAST_DESCENT * descent.max()
     if least <= 0:

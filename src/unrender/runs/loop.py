@@ -13,6 +13,7 @@ from unrender.core import arrays, phases, trees
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.capabilities import FreshGradient
 from unrender.optimizers.base import Choosing, Optimizer
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
@@ -206,7 +207,11 @@ class _Update:
 def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
     """Precondition, update, bound. The optimizer sees S g, the parameters S (step): descent in u where x = S u."""
     if not estimate.preconditioned:
-        estimate = replace(estimate, gradient=problem.precondition(estimate.gradient), preconditioned=True)
+        fresh = estimate.get(FreshGradient)
+        others = tuple(found for found in estimate.capabilities if found is not fresh)
+        mapped = () if fresh is None else (FreshGradient(problem.precondition(fresh.values)),)
+        gradient = problem.precondition(estimate.gradient)
+        estimate = replace(estimate, gradient=gradient, capabilities=(*others, *mapped), preconditioned=True)
     steps, state = optimizer.update(estimate, state, parameters)
     moved = trees.add(parameters, problem.precondition(steps))
     bounded = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
