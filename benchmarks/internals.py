@@ -58,7 +58,6 @@ __all__ = [
     "hardware",
     "image_step",
     "loss_derivative",
-    "media",
     "method",
     "method_parts",
     "mi",
@@ -72,6 +71,7 @@ __all__ = [
     "trees",
     "vectors",
     "versions",
+    "volumetric",
 ]
 
 
@@ -93,11 +93,9 @@ def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
     return pair.previous, pair.previous_parameters
 
 
-def media(scene: Any) -> list[Any]:
-    """The participating media of a scene."""
-    from unrender.rendering.mitsuba.scene_loading import media as found
-
-    return found(scene)
+def volumetric(problem: ur.Problem) -> bool:
+    """Whether the problem's scene has participating media."""
+    return _mitsuba(problem).pair.volumetric
 
 
 def scene_description(problem: ur.Problem) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, from_tensor, media, mi, project, stock_scene
+from benchmarks.internals import dr, from_tensor, mi, project, stock_scene, volumetric
 
 
 def step_seed(seed: int, step: int, view: int) -> int:
@@ -38,7 +38,7 @@ def stock_loop(
     Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
     """
     scene, parameters = stock_scene(problem)
-    kind = "prbvolpath" if media(scene) else "prb"
+    kind = "prbvolpath" if volumetric(problem) else "prb"
     integrator = mi.load_dict({"type": kind, "max_depth": problem.max_depth})
     start = problem.initial()
     history: list[dict[str, Any]] = []

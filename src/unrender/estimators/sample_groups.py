@@ -190,7 +190,7 @@ def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: 
         weights: the loss derivative at these; of a loss that is not linear, damped (`tolerance`), or the secant has no bound.
     """
     fresh = found.fresh_others()
-    if problem.loss.linear or not problem.loss.pixelwise or not isinstance(frame, WholeView):
+    if problem.loss.linear or not isinstance(frame, WholeView):
         return frame.loss_derivative(fresh)
     reference = problem.reference(frame.view)
     residual = others - reference

@@ -193,7 +193,7 @@ class ScheduleFree:
         smooth = self.preconditioner
         near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
         fits = dict.fromkeys(near if isinstance(smooth, Sobolev) else {}, StrengthFit())
-        sizes = {key: _size(x) or 1.0 for key, x in parameters.items()}
+        sizes = {key: _size(x, arrays.number(arrays.total(x * x))) or 1.0 for key, x in parameters.items()}
         return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits, sizes)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
@@ -315,9 +315,9 @@ class ScheduleFree:
         return moved(fast), moved(average)
 
 
-def _size(x: Array) -> float:
-    """The root mean square; 0 of no elements."""
-    return math.sqrt(arrays.number(arrays.total(x * x)) / max(1, math.prod(arrays.shape(x))))
+def _size(x: Array, square: float) -> float:
+    """The root mean square of an array whose squares sum up to `square`; 0 of no elements."""
+    return math.sqrt(square / max(1, math.prod(arrays.shape(x))))
 
 
 def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float, confirmed: float) -> np.ndarray:
@@ -355,6 +355,5 @@ def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tup
     for key, parts in sums.items():
         product, one, other, square = (arrays.number(part) for part in parts)
         lengths = math.sqrt(one) * math.sqrt(other)
-        size = math.sqrt(square / max(1, math.prod(arrays.shape(parameters[key]))))
-        found[key] = (product / lengths if lengths > 0 else 0.0, size)
+        found[key] = (product / lengths if lengths > 0 else 0.0, _size(parameters[key], square))
     return found

@@ -105,7 +105,7 @@ class StrengthFit:
         rows = np.stack(self.fresh)
         products, squares = rows[:, 0], rows[:, 1]
         first = _share(self.sums)
-        if self.share < first and _confirmed(rows[-self.unjudged :], 0) < _REFUTED:
+        if self.share < first and _confirmed(rows[-self.unjudged :], 0)[0] < _REFUTED:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
             return self._changed(first, float(known / squares[:, 0].mean()))
         descents = products / np.sqrt(squares)
@@ -113,7 +113,7 @@ class StrengthFit:
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
         more = descents[:, 1 + best] - descents[:, 0]
         beyond_doubt = more.mean() > _ERRORS * more.std(ddof=1) / math.sqrt(len(more))
-        if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best) >= _CONFIRMED:
+        if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best)[0] >= _CONFIRMED:
             return self._changed(float(self._shares[best]), float(squares[:, 1 + best].sum() / squares[:, 0].sum()))
         return replace(self, unjudged=0, confirmed=_most_confirmed(rows))
 
@@ -131,8 +131,10 @@ def _candidates(strength: float) -> int:
     return 1 + max(0, math.ceil(math.log(max(strength, _WEAKEST) / _WEAKEST, _FACTOR)))
 
 
-def _ratio(rows: np.ndarray, candidate: int) -> tuple[float, float]:
-    """Σ S g · S f / Σ S g · S g' and its standard error, of rows (k, 3, 1 + n) that count alike, each over its |S g|².
+def _confirmed(rows: np.ndarray, candidate: int) -> tuple[float, float]:
+    """The share of what successive gradients agree on that fresh ones confirm, with a candidate's strength, and its standard error.
+
+    Σ S g · S f / Σ S g · S g' of rows (k, 3, 1 + n) that count alike, each over its |S g|².
 
     (1, 0) where successive gradients do not agree: there is then nothing to confirm.
     """
@@ -144,14 +146,9 @@ def _ratio(rows: np.ndarray, candidate: int) -> tuple[float, float]:
     return float(found), float(error)
 
 
-def _confirmed(rows: np.ndarray, candidate: int) -> float:
-    """The share of what successive gradients agree on that fresh ones confirm, with a candidate's strength."""
-    return _ratio(rows, candidate)[0]
-
-
 def _most_confirmed(rows: np.ndarray) -> float:
     """Two standard errors above the share that fresh gradients confirm with the present strength, within [0.02, 1]."""
-    share, error = _ratio(rows, 0)
+    share, error = _confirmed(rows, 0)
     return min(max(share + 2.0 * error, _LEAST_CONFIRMED), 1.0)
 
 
