@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from skimage.transform import resize
 
 import unrender as ur
 from benchmarks.internals import mi
@@ -75,7 +76,95 @@ def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple
     return {**found, "mirror.alpha.value": (0.3, [_ALPHA])}, 1
 
 
-SCENES: dict[str, Any] = {**real_input.SCENES, "tray": _tray, "painting": _painting, "numbers": _numbers}
+def _maps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """The tray of Gu and Moon 2025 with all that is unknown there: base colour, roughness, metallic."""
+    key, views = _tray(assets, folder, resolution, texture)
+    found = {key: (0.5, np.array(mi.Bitmap(str(folder / "truth.exr")))[..., :3])}
+    text = (folder / "scene.xml").read_text()
+    for name, file in (("roughness", "roughness.png"), ("metallic", "01_default_Metallic.png")):
+        path = f"{assets}/problems/tray/textures/{file}"
+        truth = real_input.photograph(Path(path), texture).mean(axis=-1, keepdims=True)
+        mi.Bitmap(truth).write(str(folder / f"{name}.exr"))
+        opening = rf'({re.escape(path)}" ?/>.*?<boolean name="raw" value=)"false"'
+        text = re.sub(opening, r'\1"true"', text, count=1, flags=re.DOTALL).replace(path, str(folder / f"{name}.exr"))
+        found[f"bsdf_tray.{name}.data"] = (0.5, truth)
+    (folder / "scene.xml").write_text(text)
+    return found, views
+
+
+def _plates(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """The golden plane of Chang et al. 2024, its roughness unknown."""
+    plates = assets / "problems/plates"
+    truth = real_input.photograph(plates / "textures/textured_roughness.jpg", texture).mean(axis=-1, keepdims=True)
+    mi.Bitmap(truth).write(str(folder / "truth.exr"))
+    text = (plates / "scene.xml").read_text().replace("textures/textured_roughness.jpg", "truth.exr")
+    text = text.replace('"textures/', f'"{plates}/textures/').replace('"meshes/', f'"{plates}/meshes/')
+    text = text.replace('name="res" value="1536"', f'name="res" value="{resolution}"')
+    (folder / "scene.xml").write_text(text.replace('<rfilter type="gaussian"/>', '<rfilter type="box"/>'))
+    return {"plane.bsdf.alpha.data": (0.3, truth)}, 1
+
+
+def _light(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """Spot, of plastic, under an environment map that is unknown."""
+    _, views = real_input.spot(assets, folder, resolution, texture)
+    text = (folder / "scene.xml").read_text()
+    image = np.array(mi.Bitmap(str(assets / "textures/museum.exr")))[..., :3].astype(np.float32)
+    truth = np.asarray(resize(image, (texture // 2, texture, 3), anti_aliasing=True), np.float32)
+    mi.Bitmap(truth).write(str(folder / "light.exr"))
+    text = text.replace(str(assets / "textures/museum.exr"), str(folder / "light.exr"))
+    text = text.replace('<emitter type="envmap">', '<emitter type="envmap" id="sky">')
+    text = text.replace(
+        '<bsdf type="diffuse"><texture', '<bsdf type="roughplastic"><float name="alpha" value="0.1"/><texture'
+    )
+    text = text.replace('name="reflectance"', 'name="diffuse_reflectance"')
+    (folder / "scene.xml").write_text(text)
+    key = "sky.data"
+    known = np.array(mi.traverse(mi.load_file(str(folder / "scene.xml")))[key])
+    return {key: (float(truth.mean()), known)}, views
+
+
+def _lamps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """The tutorials' simple.xml, but that its teapot is not black in blue: the intensities of the two lamps above it unknown."""
+    del texture
+    text = (assets / "tutorials/simple.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    text = text.replace('value="0.9 0.9 0.0"', 'value="0.9 0.9 0.3"')
+    (folder / "scene.xml").write_text(text.replace('name="res" value="256"', f'name="res" value="{resolution}"'))
+    return {f"light{n}.intensity.value": (20.0, [100.0, 100.0, 100.0]) for n in (1, 2)}, 1
+
+
+def _cloud(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
+    """The tutorials' volume.vol under museum.exr, from four sides: its extinction unknown."""
+    del texture
+    real_input.spot(assets, folder, resolution, 8)
+    text = (folder / "scene.xml").read_text()
+    grid = np.array(mi.VolumeGrid(str(assets / "tutorials/volume.vol")), np.float32)
+    grid = grid.reshape(*grid.shape[:3], -1)[..., :1]
+    sides = [min(side, 16) for side in grid.shape[:3]]
+    truth = np.asarray(resize(grid, (*sides, 1), anti_aliasing=True), np.float32)
+    truth *= 4.0 / truth.max()
+    mi.VolumeGrid(truth).write(str(folder / "truth.vol"))
+    medium = (
+        '<medium type="heterogeneous" name="interior"><volume type="gridvolume" name="sigma_t">'
+        f'<string name="filename" value="{folder / "truth.vol"}"/><transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/>'
+        '<scale value="2"/></transform></volume><float name="albedo" value="0.8"/></medium>'
+    )
+    cube = f'<shape type="cube" id="box"><bsdf type="null"/>{medium}</shape>'
+    text = re.sub(r'<shape type="obj" id="spot">.*?</shape>', cube, text, flags=re.DOTALL)
+    (folder / "scene.xml").write_text(text.replace('<float name="fov" value="40"/>', '<float name="fov" value="60"/>'))
+    return {"box.interior_medium.sigma_t.data": (0.5, truth)}, 4
+
+
+SCENES: dict[str, Any] = {
+    **real_input.SCENES,
+    "tray": _tray,
+    "maps": _maps,
+    "painting": _painting,
+    "plates": _plates,
+    "light": _light,
+    "lamps": _lamps,
+    "cloud": _cloud,
+    "numbers": _numbers,
+}
 """Each writes scene.xml, and returns the key of a texture, whose truth it wrote as truth.exr, or {key: (initial, truth)}; and the number of
 views."""
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
@@ -83,14 +172,15 @@ DEPTH = 6
 
 
 def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) -> ur.Problem:
-    """The problem of a name such as "cbox, L2"; references of `spp` samples per pixel are rendered by Mitsuba's `path` and kept."""
+    """The problem of a name such as "cbox, L2"; references of `spp` samples per pixel are rendered by Mitsuba and kept."""
     scene, loss = name.split(", ")
     folder = scratch(f"suite/{scene}-{resolution}-{texture}")
     folder.mkdir(parents=True, exist_ok=True)
     unknown, views = SCENES[scene](assets.resolve(), folder, resolution, texture)
     kept = folder / f"references-{spp}.npz"
     if not kept.exists():
-        loaded, path = mi.load_file(str(folder / "scene.xml")), mi.load_dict({"type": "path", "max_depth": DEPTH})
+        integrator = "volpath" if "<medium" in (folder / "scene.xml").read_text() else "path"
+        loaded, path = mi.load_file(str(folder / "scene.xml")), mi.load_dict({"type": integrator, "max_depth": DEPTH})
         parts = max(1, spp // 256)
         images = [
             np.mean(
