@@ -19,6 +19,7 @@ from unrender.estimators.capabilities import (
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.losses.base import Loss
 from unrender.optimizers.base import Optimizer
+from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, RenderSession, SampleRequest
@@ -43,6 +44,7 @@ __all__ = [
     "Optimizer",
     "PairRequest",
     "ParameterInfo",
+    "Parameterisation",
     "PixelSampler",
     "Preconditioner",
     "RenderSession",
@@ -51,5 +53,6 @@ __all__ = [
     "SampleRequest",
     "Schedule",
     "Smoothing",
+    "Transform",
     "Variance",
 ]

@@ -20,6 +20,7 @@ FLOORS = (
         "rendering",
         "losses",
         "schedules",
+        "parameterisations",
         "preconditioners",
     ),
     *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "loops"),

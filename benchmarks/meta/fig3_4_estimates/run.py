@@ -43,7 +43,7 @@ def estimates_along(
 
     for step, parameters in enumerate(path):
         found, state = estimator.estimate(problem, parameters, state, Key(seed, step))
-        gradient = flat(found.gradient if found.preconditioned else problem.precondition(found.gradient))
+        gradient = flat(found.gradient if found.preconditioned else problem.coordinates.pull_back(found.gradient, {}))
         if found.variance is not None:
             rows.append((gradient, np.sqrt(flat(found.variance)), flat(found.info["alpha"])))
             continue

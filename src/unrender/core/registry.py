@@ -82,6 +82,7 @@ KINDS: dict[str, Kind] = {
     for kind in (
         _kind("loss", "unrender.losses", "unrender.losses.base.Loss", "value derivative"),
         _kind("schedule", "unrender.schedules", "unrender.schedules.functions.Schedule", "__call__"),
+        _kind("parameterisation", "unrender.parameterisations", "unrender.parameterisations.base.Parameterisation", "transform"),
         _kind("preconditioner", "unrender.preconditioners", "unrender.preconditioners.base.Preconditioner", "check apply"),
         _kind("pixel sampler", "unrender.pixels", "unrender.pixels.base.PixelSampler", "init draw observe"),
         _kind("image estimator", "unrender.images", "unrender.images.base.ImageEstimator", "init estimate advance"),

@@ -41,9 +41,11 @@ def unravel(vector: np.ndarray, like: Tree) -> Tree:
     return found
 
 
-def repeat_per_element(numbers: Mapping[str, float], like: Tree) -> np.ndarray:
-    """One number per parameter, repeated for its elements, (n,)."""
-    return np.concatenate([np.full(math.prod(arrays.shape(x)), float(numbers[key])) for key, x in like.items()])
+def repeat_per_element(numbers: Mapping[str, float | np.ndarray], like: Tree) -> np.ndarray:
+    """One number per parameter, repeated for its elements, or one for each element, (n,)."""
+    return np.concatenate(
+        [np.broadcast_to(np.asarray(numbers[key], float), arrays.shape(x)).ravel() for key, x in like.items()]
+    )
 
 
 def clip_norm(step: np.ndarray, radius: float | None) -> np.ndarray:

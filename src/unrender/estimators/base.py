@@ -40,8 +40,8 @@ class Estimate:
         capabilities: what else was computed, at most one of each type; library code reads it by `get` and `require`, which return
             typed values.
         info: for people: samples traced, control weights, images. Never read back.
-        preconditioned: whether `gradient` and its variance are already those of u, where a parameter with a preconditioner S is
-            x = S u: estimators with a per-element state keep it in the coordinates of the descent.
+        preconditioned: whether `gradient` and its variance are already by v, where a parameter is x = φ(S v) with its parameterisation φ
+            and its preconditioner S: estimators with a per-element state keep it in the coordinates of the descent.
     """
 
     loss: float
@@ -85,7 +85,7 @@ class Estimate:
         return None if found is None else found.evaluate
 
     @property
-    def sigma(self) -> Mapping[str, float] | None:
+    def sigma(self) -> Mapping[str, float | np.ndarray] | None:
         """{key: σ} of the Gaussian that the derivatives are smoothed by; None where they are not smoothed."""
         found = self.get(Smoothing)
         return None if found is None else found.sigma

@@ -109,11 +109,11 @@ class Smoothing(Capability):
     """The derivatives are those of the loss smoothed by a Gaussian over the parameters. Trust regions are in units of its σ.
 
     Attributes:
-        sigma: {key: standard deviation in units of the parameter}, > 0.
+        sigma: {key: standard deviation in units of the parameter}, > 0: a number, or one for each element.
     """
 
     name: ClassVar[str] = "sigma"
-    sigma: Mapping[str, float]
+    sigma: Mapping[str, float | np.ndarray]
 
 
 class Capabilities(frozenset[str]):

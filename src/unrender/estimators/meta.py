@@ -101,8 +101,8 @@ class MetaEstimator:
     Where any parameter moves geometry, a path of one state is not valid in the other, and the whole difference is taken in
     primary sample space, from the same random numbers: `info["space"]` says which was taken, for each parameter.
 
-    Gradient and variance are those of u where a parameter with a preconditioner S is x = S u (`Estimate.preconditioned`): a
-    variance per element does not pass through S.
+    Gradient and variance are by v where a parameter is x = φ(S v) with its parameterisation and preconditioner
+    (`Estimate.preconditioned`): a variance per element does not pass through S.
 
     Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does not
     depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α
@@ -198,7 +198,8 @@ class MetaEstimator:
             step_norm: Array = 0.0
         else:
             elements, previous = state.elements, state.parameters
-            moved = trees.subtract(parameters, previous)
+            of = problem.coordinates.of
+            moved = trees.subtract(of(parameters), of(previous))
             step_norm = arrays.sqrt(sum(arrays.total(x * x) for x in moved.values()))
         space = self._space(problem, parameters)
         pair_request = PairRequest(previous, space, state.step)
@@ -262,13 +263,16 @@ class MetaEstimator:
         `_gather`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
         step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL), first=first)
-        F = problem.precondition(step.gradient)
+        coordinates = problem.coordinates
+        slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
+        F = coordinates.pull_back(step.gradient, slopes)
         if fresh:  # no change to be estimated
             return F, trees.zeros_like(F), step, pixels
         again = replace(state, pixels=pixels)
         further = key.fold(_DIFFERENCE)
         pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
-        difference = problem.precondition(trees.subtract(pair.gradient, pair.previous))
+        now, then = coordinates.pull_back(pair.gradient, slopes), coordinates.pull_back(pair.previous, before)
+        difference = trees.subtract(now, then)
         return F, difference, replace(step, samples=step.samples + pair.samples), pixels
 
     def _coupled(
@@ -285,7 +289,10 @@ class MetaEstimator:
         del fresh
         spp = self.spp or _COUPLED_SPP
         step, pixels = self._gather(problem, parameters, state, spp, key, pair_request, first=first)
-        return problem.precondition(step.gradient), problem.precondition(step.previous), step, pixels
+        coordinates = problem.coordinates
+        F = coordinates.pull_back(step.gradient, coordinates.slopes(parameters))
+        H = coordinates.pull_back(step.previous, coordinates.slopes(pair_request.previous))
+        return F, H, step, pixels
 
     def _gather(
         self,

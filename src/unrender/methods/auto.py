@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from unrender import pixels
-from unrender.core import arrays
+from unrender.core import arrays, registry
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
@@ -113,6 +113,7 @@ class AutoMethod(Options):
             drawn,
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
+            f"moved as {moved}" if (moved := _parameterised(problem)) else "",
             f"schedule-free Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
@@ -191,9 +192,15 @@ def _is_map(shape: tuple[int, ...]) -> bool:
     return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
 
 
+def _parameterised(problem: Problem) -> str:
+    """Which parameterisations parameters were given: "log (lamp.radiance)"; "" for none."""
+    found = {key: registry.component_of(type(given)) for key, given in problem.parameterisations.items()}
+    return ", ".join(f"{known.name if known else 'its own'} ({key})" for key, known in found.items())
+
+
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
-    values, or the share itself where they are 0."""
+    values, or the share itself where they are 0. With a parameterisation, that of u which is such a step in the middle or at that size."""
     found: dict[str, float] = {}
     for key, value in problem.initial_values().items():
         low, high = problem.bounds[key]
@@ -203,5 +210,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
         if key.endswith(_VERTICES):
             size *= _VERTEX_SHARE
+        if key in problem.coordinates.transforms:
+            middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
+            size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))
         found[key] = share * size
     return found

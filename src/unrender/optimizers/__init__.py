@@ -4,11 +4,26 @@ from unrender import schedules
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.cma_es import CMAES
+from unrender.optimizers.dowg import DoWG
 from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.optimizers.newton import Newton
 from unrender.optimizers.newton_cg import NewtonCG
+from unrender.optimizers.prodigy import Prodigy
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.optimizers.sgd import SGD
 
-__all__ = ["CMAES", "LBFGS", "SGD", "Adam", "MetaAdam", "Newton", "NewtonCG", "Optimizer", "ScheduleFree", "schedules"]
+__all__ = [
+    "CMAES",
+    "LBFGS",
+    "SGD",
+    "Adam",
+    "DoWG",
+    "MetaAdam",
+    "Newton",
+    "NewtonCG",
+    "Optimizer",
+    "Prodigy",
+    "ScheduleFree",
+    "schedules",
+]

@@ -40,7 +40,7 @@ _NOT_FITTED = StrengthFit()
 _LEAST_SIGNAL = 0.02
 """The least factor of a step: gradients that were noise may come to tell something."""
 _PROJECTED = 1e-5
-"""Relative difference from which a parameter counts as moved by its bounds; below it, as rounded."""
+"""Difference, relative to parameter and first rate, from which a parameter counts as moved by its bounds; below it, as rounded."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ScheduleFreeState:
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor that the rate has fallen by}.
         strengths: {key: how strongly the gradient is smoothed}, where that is fitted.
-        sizes: {key: root mean square of the first parameters, 1 where that is 0}.
+        sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
         begun: the step at which all this began.
     """
 
@@ -193,7 +193,9 @@ class ScheduleFree:
         smooth = self.preconditioner
         near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
         fits = dict.fromkeys(near if isinstance(smooth, Sobolev) else {}, StrengthFit())
-        sizes = {key: _size(x, arrays.number(arrays.total(x * x))) or 1.0 for key, x in parameters.items()}
+        sizes = {
+            key: max(_size(x, arrays.number(arrays.total(x * x))) or 1.0, own[key]) for key, x in parameters.items()
+        }
         return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits, sizes)
 
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
@@ -227,7 +229,8 @@ class ScheduleFree:
                 share = _signal(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed)
                 direction = maps[key].apply(direction) * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
-            before, mean = self._within_bounds(state.fast[key], state.average[key], y)
+            tolerance = state.learning_rates[key] * _PROJECTED
+            before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
             fast[key] = before + arrays.scalar(rate, g) * direction
             average[key] = mean + arrays.scalar(weight, g) * (fast[key] - mean)
             steps[key] = self._between(fast[key], average[key]) - y
@@ -303,10 +306,10 @@ class ScheduleFree:
         """y."""
         return fast + self.beta * (average - fast)
 
-    def _within_bounds(self, fast: Array, average: Array, y: Array) -> tuple[Array, Array]:
-        """z and x on the same side of a bound as the parameters y, where the bound has moved y."""
+    def _within_bounds(self, fast: Array, average: Array, y: Array, least: float) -> tuple[Array, Array]:
+        """z and x on the same side of a bound as the parameters y, where the bound has moved y by more than `least`."""
         planned = self._between(fast, average)
-        tolerance = arrays.absolute(planned) * _PROJECTED
+        tolerance = arrays.absolute(planned) * _PROJECTED + least
         above, below = planned - y > tolerance, y - planned > tolerance
 
         def moved(x: Array) -> Array:

@@ -121,9 +121,8 @@ def _round(
         found.append(problem.loss.derivative(image, own) * factor)
     if scales:
         signs = random_signs(parameters, key.fold(2))
-        tangents = problem.precondition(
-            {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
-        )
+        scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
+        tangents = problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
         found.append(session.tangent_moment(parameters, rendering.paths, tangents))
     arrays.evaluate(found)
     return [arrays.numpy(x) for x in found]

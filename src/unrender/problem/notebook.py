@@ -43,6 +43,7 @@ def html(problem: Problem) -> str:
         about = [f"shape {shape}" if shape else "a number", f"bounds {low} to {high}"]
         about += [f"learning rate {problem.learning_rates[key]:g}"] if key in problem.learning_rates else []
         about += [f"{problem.preconditioners[key]!r:.80}"] if key in problem.preconditioners else []
+        about += [f"{problem.parameterisations[key]!r:.80}"] if key in problem.parameterisations else []
         rows[key] = ", ".join(about)
     title = f"Problem {problem.name}: {describe_views(problem)}, {_loss(problem)}, up to {problem.max_depth} segments"
     return notebook.block(

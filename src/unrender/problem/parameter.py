@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from unrender.parameterisations.base import Parameterisation
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.coarse_to_fine import CoarseToFine
 
@@ -29,6 +30,9 @@ class Parameter:
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
         coarse_to_fine: `CoarseToFine`, or its steps alone, for a texture or grid that is coarse at first; None for one resolution.
+        parameterisation: "identity", "log", "logit", "softplus", or one of `unrender.parameterisations`: what the optimizer moves in place
+            of the values, see there. Its learning rate is then that of u. None is the identity. Preconditioners and the optimizer act on
+            u; values, bounds and results are the parameter's own.
     """
 
     key: str
@@ -37,3 +41,4 @@ class Parameter:
     learning_rate: float | None = None
     preconditioner: Preconditioner | None = None
     coarse_to_fine: CoarseToFine | Sequence[int] | None = None
+    parameterisation: Parameterisation | str | Mapping[str, Any] | None = None

@@ -15,6 +15,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
 from unrender.problem import notebook
+from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
@@ -69,6 +70,8 @@ class Problem:
         learning_rates: {key: rate} of the parameters that have their own.
         preconditioners: {key: preconditioner} of the parameters that have one.
         coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
+        parameterisations: {key: parameterisation} of the parameters that were given one.
+        coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
 
@@ -106,6 +109,9 @@ class Problem:
         self.learning_rates = {k: rate for k, found in checked.items() if (rate := found.learning_rate) is not None}
         self.preconditioners = {k: p for k, found in checked.items() if (p := found.preconditioner) is not None}
         self.coarse_to_fine = {k: c for k, found in checked.items() if (c := found.coarse_to_fine) is not None}
+        self.parameterisations = {k: p for k, found in checked.items() if (p := found.parameterisation) is not None}
+        transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
+        self.coordinates = Coordinates(transforms, self.preconditioners)
         self._initial = {key: found.initial for key, found in checked.items()}
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
@@ -204,11 +210,6 @@ class Problem:
     def _masked(self, image: Array, reference: Array, mask: Array | None) -> Array:
         """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
-
-    def precondition(self, tree: Tree) -> Tree:
-        """S x for each parameter that has a preconditioner S, x for the others."""
-        maps = self.preconditioners
-        return {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
         """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""

@@ -75,6 +75,8 @@ def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Array
         table["learning_rate"] = float(parameter.learning_rate)
     if parameter.preconditioner is not None:
         table["preconditioner"] = _component(parameter.preconditioner)
+    if parameter.key in problem.parameterisations:
+        table["parameterisation"] = _component(problem.parameterisations[parameter.key])
     if parameter.key in problem.coarse_to_fine:
         table["coarse_to_fine"] = tables.fields(problem.coarse_to_fine[parameter.key])
     if parameter.key in problem.truth:
@@ -108,7 +110,7 @@ def _option(value: Any) -> Any:
 
 
 def _component(value: Any) -> Any:
-    """The table of a loss or a preconditioner; of an unregistered one its `repr`, which no reader accepts."""
+    """The table of a loss, a preconditioner or a parameterisation; of an unregistered one its `repr`, which no reader accepts."""
     if isinstance(value, Mapping):
         return dict(value)
     try:

@@ -12,6 +12,7 @@
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
     coarse_to_fine = [200, 400]                # steps before which the resolution doubles, see CoarseToFine
+    parameterisation = "logit"                 # what the optimizer moves: identity, log, logit, softplus
     truth = "wall.exr"                         # where it is known, to measure the error
 
     [[views]]
@@ -64,6 +65,10 @@ class _Parameter(_Model):
     coarse_to_fine: list[StrictInt] | dict[str, Any] | None = Field(
         None,
         description='a list of steps such as [200, 400], or a table such as { steps = [200, 400], states = "reset" }',
+    )
+    parameterisation: StrictStr | dict[str, Any] | None = Field(
+        None,
+        description='"identity", "log", "logit" or "softplus", or a table such as { type = "softplus", scale = 0.1 }',
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
@@ -168,7 +173,8 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             way = coarse_to_fine.of(model.coarse_to_fine)
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
-    return Parameter(model.key, _value(model.initial, folder), model.bounds, model.learning_rate, preconditioner, way)
+    start = _value(model.initial, folder)
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, model.parameterisation)
 
 
 def _value(value: Any, folder: Path) -> Any:

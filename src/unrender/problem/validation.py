@@ -10,12 +10,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
 from unrender.io import bounded_files, images, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
+from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem import coarse_to_fine
 from unrender.problem.coarse_to_fine import CoarseToFine
@@ -59,6 +60,10 @@ class _Preconditioner(Preconditioner, Protocol): ...
 
 
 @runtime_checkable
+class _Parameterisation(Parameterisation, Protocol): ...
+
+
+@runtime_checkable
 class _Loss(Loss, Protocol): ...
 
 
@@ -72,6 +77,8 @@ class CheckedParameter:
         learning_rate: None for the optimizer's.
         preconditioner: None for none.
         coarse_to_fine: None where its resolution is constant.
+        parameterisation: None where none was given.
+        transform: of that; None for the identity.
         initial: float32, inside the bounds, of the scene's shape.
         notices: one line for each change made to the input.
     """
@@ -81,6 +88,8 @@ class CheckedParameter:
     learning_rate: float | None
     preconditioner: Preconditioner | None
     coarse_to_fine: CoarseToFine | None
+    parameterisation: Parameterisation | None
+    transform: Transform | None
     initial: np.ndarray
     notices: tuple[str, ...]
 
@@ -160,9 +169,27 @@ def check_parameter(
     except InputError as error:
         raise wrong("initial", error) from error
     initial, clipped = _clip_to_bounds(start, bounds)
+    try:
+        parameterisation, transform = _parameterisation(parameter, bounds, initial)
+    except InputError as error:
+        raise wrong("parameterisation", error) from error
     notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
     own_rate = None if rate is None else float(rate)
-    return CheckedParameter(key, bounds, own_rate, preconditioner, schedule, initial, tuple(notices))
+    return CheckedParameter(
+        key, bounds, own_rate, preconditioner, schedule, parameterisation, transform, initial, tuple(notices)
+    )
+
+
+def _parameterisation(
+    parameter: Parameter, bounds: Bounds, initial: np.ndarray
+) -> tuple[Parameterisation | None, Transform | None]:
+    given = parameter.parameterisation
+    if given is None:
+        return None, None
+    made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
+    if isinstance(made, type) or not isinstance(made, _Parameterisation):
+        raise InputError(f"expected one of unrender.parameterisations, or its name, got {shorten(repr(given), 60)}")
+    return made, made.transform(bounds, initial)
 
 
 def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner | None:

@@ -23,7 +23,8 @@ def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
     found = []
     for key, (low, high) in problem.bounds.items():
         rate = problem.learning_rates.get(key, optimizer.learning_rate)
-        if low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
+        natural = key not in problem.coordinates.transforms
+        if natural and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
             found.append(
                 f"parameter {key}: a learning_rate of {rate:g} crosses its range, {low:g} to {high:g}, in "
                 f"{_steps((high - low) / rate)}; 0.005 to 0.05 of the range are usual"

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, phases, trees
+from unrender.core import arrays, phases
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.capabilities import FreshGradient
+from unrender.estimators.coordinates import by_coordinates
 from unrender.optimizers.base import Choosing, Optimizer
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
@@ -92,7 +92,7 @@ def initialize(run: Run, state: RunState, step: int) -> None:
     problem = run.problem
     run.parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.start(step).items()}
     state.estimator = run.estimator.init(problem, run.parameters)
-    state.optimizer = run.optimizer.init(run.parameters, problem.learning_rates)
+    state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 
 
 def descend(descent: Descent) -> Result:
@@ -205,16 +205,12 @@ class _Update:
 
 
 def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
-    """Precondition, update, bound. The optimizer sees S g, the parameters S (step): descent in u where x = S u."""
-    if not estimate.preconditioned:
-        fresh = estimate.get(FreshGradient)
-        others = tuple(found for found in estimate.capabilities if found is not fresh)
-        mapped = () if fresh is None else (FreshGradient(problem.precondition(fresh.values)),)
-        gradient = problem.precondition(estimate.gradient)
-        estimate = replace(estimate, gradient=gradient, capabilities=(*others, *mapped), preconditioned=True)
-    steps, state = optimizer.update(estimate, state, parameters)
-    moved = trees.add(parameters, problem.precondition(steps))
-    bounded = {k: project(x, *problem.bounds[k]) for k, x in moved.items()}
+    """Transform, update, transform back, bound: the optimizer works in the problem's `coordinates`, bounds are the parameters' own."""
+    coordinates = problem.coordinates
+    found = by_coordinates(estimate, problem, parameters)
+    steps, state = optimizer.update(found, state, coordinates.of(parameters))
+    moved, reached = coordinates.moved(parameters, steps)
+    bounded = {k: project(x, *problem.bounds[k]) for k, x in reached.items()}
     arrays.evaluate(moved, bounded, state)
     # Before they are bounded: the nearest point to what is no number may be a bound.
     broken = next((key for key, value in moved.items() if not arrays.all_finite(value)), "")

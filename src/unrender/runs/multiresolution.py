@@ -43,7 +43,7 @@ def refine(run: Run, state: RunState) -> float:
     run.parameters = upsampler.tree(run.parameters)
     fresh = (
         run.estimator.init(run.problem, run.parameters),
-        run.optimizer.init(run.parameters, run.problem.learning_rates),
+        run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates),
     )
     for name, new in zip(("estimator", "optimizer"), fresh, strict=True):
         component = getattr(state, name)

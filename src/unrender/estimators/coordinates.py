@@ -1,0 +1,105 @@
+"""An estimate of derivatives by the parameters, as one by the variables that an optimizer moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from unrender.core import arrays, trees, vectors
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import (
+    Capability,
+    FreshGradient,
+    Hessian,
+    HessianProduct,
+    LossFunction,
+    Smoothing,
+    Variance,
+)
+from unrender.problem.problem import Problem
+
+__all__ = ["by_coordinates"]
+
+
+def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
+    """The estimate by v, where x = φ(u) and u = S v (`problem.coordinates`); itself where it is by v already.
+
+    With J the diagonal matrix of φ': gradients become S J g, variances J² Var (a variance per element does not pass through S). The second
+    derivatives are exact, J H J + diag(g φ''), with the term of φ's own curvature; the loss is a function of u. The σ of smoothed
+    derivatives, which is of x, becomes σ / φ' of each element.
+    """
+    if estimate.preconditioned:
+        return estimate
+    coordinates = problem.coordinates
+    slopes = coordinates.slopes(parameters)
+
+    def converted(capability: Capability) -> Capability:
+        if isinstance(capability, FreshGradient):
+            return FreshGradient(coordinates.pull_back(capability.values, slopes))
+        return _second_order(capability, estimate.gradient, problem, parameters, slopes) if slopes else capability
+
+    gradient = coordinates.pull_back(estimate.gradient, slopes)
+    capabilities = tuple(converted(capability) for capability in estimate.capabilities)
+    return replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
+
+
+def _second_order(
+    capability: Capability, gradient: Tree, problem: Problem, parameters: Tree, slopes: Tree
+) -> Capability:
+    """What is not linear in the gradient, by u."""
+    match capability:
+        case Variance(values):
+            return Variance({k: v * slopes[k] * slopes[k] if k in slopes else v for k, v in values.items()})
+        case Hessian(matrix):
+            J, bend = _flat(slopes, parameters), _bend(gradient, problem, parameters)
+            full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(bend)
+            return Hessian(full)
+        case HessianProduct(apply):
+            curvatures = problem.coordinates.curvatures(parameters)
+
+            def product(v: Tree) -> Tree:
+                found = apply({k: x * slopes[k] if k in slopes else x for k, x in v.items()})
+                return {
+                    k: x * slopes[k] + gradient[k] * curvatures[k] * v[k] if k in slopes else x
+                    for k, x in found.items()
+                }
+
+            return HessianProduct(product)
+        case LossFunction(evaluate):
+            transforms = problem.coordinates.transforms
+
+            def losses(points: np.ndarray) -> np.ndarray:
+                split = vectors.parts(points, parameters)
+                found = [transforms[k].forward(u) if k in transforms else u for k, u in split.items()]
+                return evaluate(np.concatenate([x.reshape(len(points), -1) for x in found], axis=1))
+
+            return LossFunction(losses)
+        case Smoothing(sigma):
+            shapes = trees.shapes(parameters)
+            return Smoothing(
+                {
+                    k: value / arrays.numpy(slopes[k]).reshape(shapes[k]) if k in slopes else value
+                    for k, value in sigma.items()
+                }
+            )
+    return capability
+
+
+def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:
+    """All elements in key order, (n,); `missing` for the parameters that the tree does not have."""
+    return np.concatenate(
+        [
+            arrays.numpy(tree[key]).astype(np.float64).ravel()
+            if key in tree
+            else np.full(int(np.prod(arrays.shape(x))), missing)
+            for key, x in parameters.items()
+        ]
+    )
+
+
+def _bend(gradient: Tree, problem: Problem, parameters: Tree) -> np.ndarray:
+    """g φ'', (n,)."""
+    curvatures = problem.coordinates.curvatures(parameters)
+    return _flat({key: gradient[key] * x for key, x in curvatures.items()}, parameters, missing=0.0)
