@@ -297,7 +297,7 @@ def test_what_auto_chose_names_it() -> None:
 
 @pytest.mark.parametrize("name", ["identity", "log", "logit", "softplus"])
 def test_each_is_registered(name: str) -> None:
-    made = registry.components("parameterisation")[name]
+    made = registry.components("parameterisation")[name.capitalize()]
     assert made in (Identity, Log, Logit, Softplus)
     assert problem(made(), (0, 2)).parameterisations["map"] == made()
 
@@ -305,14 +305,14 @@ def test_each_is_registered(name: str) -> None:
 @pytest.mark.parametrize(
     ("given", "bounds", "message"),
     [
-        ("lgo", (0, 1), r'expected "identity" or "log" or "logit" or "softplus", got "lgo"; did you mean log'),
+        ("lgo", (0, 1), r"unknown 'lgo'; did you mean log"),
         ("log", (None, 1), r"log needs a lower bound, got bounds open to 1; give bounds, such as \[0, inf\]"),
         ("softplus", None, r"softplus needs a lower bound, got bounds open to open"),
         ("logit", (0, None), r"logit needs a lower and an upper bound, got bounds 0 to open; give bounds, such as \[0, 1\]"),
         (3, (0, 1), "expected one of unrender.parameterisations, or its name, got 3"),
         (Log, (0, 1), "expected one of unrender.parameterisations"),
-        ({"type": "softplus", "scale": -1}, (0, 1), r"softplus: scale must be .* > 0, got -1"),
-        ({"type": "softplus", "skale": 1}, (0, 1), "softplus has no option skale; did you mean"),
+        ("softplus(-1)", (0, 1), r"Softplus: scale must be .* > 0, got -1"),
+        ({"type": "Softplus", "skale": 1}, (0, 1), "Softplus has no option skale; did you mean"),
     ],
 )  # fmt: skip
 def test_bad_ones_are_one_line(given: Any, bounds: Any, message: str) -> None:

@@ -25,6 +25,8 @@ from unrender.core.suggestions import did_you_mean
 __all__ = ["NotStorable", "build", "component", "fields", "table"]
 
 _TYPE, _NONE = "type", "none"
+_IN_SHORT = ("parameterisation", "schedule")
+"""Kinds that have a short text form, "name(number, ...)" (`core.short_forms`)."""
 _DEEPEST = 16
 _LONGEST_LIST = 4096
 _T = TypeVar("_T")
@@ -62,7 +64,7 @@ def component(given: Any, kind: str | None = None, where: str = "", folder: Path
     """The component that a table, or the short text form of its kind, describes.
 
     Args:
-        given: {"type": name, field: value, ...}; where `kind` is known also "name", or a schedule's short form.
+        given: {"type": name, field: value, ...}; where `kind` is known also "name", or the short form of a kind that has one.
         kind: of `registry.KINDS`; None takes any that stands in tables.
         where: what a message begins with.
         folder: what the relative paths in it start from; None leaves them.
@@ -86,7 +88,7 @@ def build(made_by: type[_T], given: Mapping[str, Any]) -> _T:
 def _component(given: Any, kind: str | None, folder: Path | None, depth: int) -> Any:
     if depth > _DEEPEST:
         raise InputError("nested too deeply")
-    if kind == "schedule" and isinstance(given, str):
+    if kind in _IN_SHORT and isinstance(given, str):
         return short_forms.parse(given, kind)
     given = {_TYPE: given} if kind is not None and isinstance(given, str) else given
     known = registry.table_components() if kind is None else registry.components(kind)

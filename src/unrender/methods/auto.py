@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from unrender import pixels
-from unrender.core import arrays, registry
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
@@ -194,8 +194,7 @@ def _is_map(shape: tuple[int, ...]) -> bool:
 
 def _parameterised(problem: Problem) -> str:
     """Which parameterisations parameters were given: "log (lamp.radiance)"; "" for none."""
-    found = {key: registry.component_of(type(given)) for key, given in problem.parameterisations.items()}
-    return ", ".join(f"{known.name if known else 'its own'} ({key})" for key, known in found.items())
+    return ", ".join(f"{type(given).__name__.lower()} ({key})" for key, given in problem.parameterisations.items())
 
 
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:

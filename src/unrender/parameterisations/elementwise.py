@@ -23,7 +23,7 @@ _SMALL = 0.01
 """e^-|u| below which log(1 + e^-|u|) is: relative error 2.5e-7 there."""
 
 
-@register(name="identity", kind="parameterisation", position=0)
+@register(position=0)
 @dataclass(frozen=True)
 class Identity:
     """u = x: steps are in units of the parameter."""
@@ -33,7 +33,7 @@ class Identity:
         del bounds, initial
 
 
-@register(name="log", kind="parameterisation", position=1)
+@register(position=1)
 @dataclass(frozen=True)
 class Log:
     """u = log(x − low): a step η multiplies the distance from the lower bound by e^η, about a change by the share η.
@@ -49,7 +49,7 @@ class Log:
         return _Log(_lower("log", bounds))
 
 
-@register(name="logit", kind="parameterisation", position=2)
+@register(position=2)
 @dataclass(frozen=True)
 class Logit:
     """u = log(t / (1 − t)) of the place t = (x − low) / (high − low) between two bounds.
@@ -68,7 +68,7 @@ class Logit:
         return _Logit(low, high - low)
 
 
-@register(name="softplus", kind="parameterisation", position=3)
+@register(position=3)
 @dataclass(frozen=True)
 class Softplus:
     """x = low + s log(1 + e^u): `log` where x − low is below the scale s, and steps of η s where it is well above.
@@ -84,7 +84,7 @@ class Softplus:
 
     def __post_init__(self):
         if self.scale is not None:
-            checks.number("softplus", "scale", self.scale, above=0.0)
+            checks.number("Softplus", "scale", self.scale, above=0.0)
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
         """See `Parameterisation.transform`."""

@@ -30,9 +30,9 @@ class Parameter:
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
         coarse_to_fine: `CoarseToFine`, or its steps alone, for a texture or grid that is coarse at first; None for one resolution.
-        parameterisation: "identity", "log", "logit", "softplus", or one of `unrender.parameterisations`: what the optimizer moves in place
-            of the values, see there. Its learning rate is then that of u. None is the identity. Preconditioners and the optimizer act on
-            u; values, bounds and results are the parameter's own.
+        parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`: what the
+            optimizer moves in place of the values, and what the learning rate is of. Preconditioner and optimizer act on that; values,
+            bounds and results are the parameter's own. None for the identity.
     """
 
     key: str

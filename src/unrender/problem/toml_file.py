@@ -68,7 +68,7 @@ class _Parameter(_Model):
     )
     parameterisation: StrictStr | dict[str, Any] | None = Field(
         None,
-        description='"identity", "log", "logit" or "softplus", or a table such as { type = "softplus", scale = 0.1 }',
+        description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"

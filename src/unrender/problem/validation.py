@@ -186,7 +186,10 @@ def _parameterisation(
     given = parameter.parameterisation
     if given is None:
         return None, None
-    made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
+    try:
+        made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
+    except InputError as error:
+        raise InputError(str(error).removeprefix("parameterisation: ")) from error
     if isinstance(made, type) or not isinstance(made, _Parameterisation):
         raise InputError(f"expected one of unrender.parameterisations, or its name, got {shorten(repr(given), 60)}")
     return made, made.transform(bounds, initial)
