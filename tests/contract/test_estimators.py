@@ -95,6 +95,8 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
+    "DoWG": lambda: ur.optimizers.DoWG(),
+    "Prodigy": lambda: ur.optimizers.Prodigy(schedule=ur.optimizers.schedules.Exponential(100)),
     "ScheduleFree": lambda: ur.optimizers.ScheduleFree(0.03),
     "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, step_scale=0.1),
     "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, step_scale=0.1),

@@ -497,3 +497,32 @@ def test_a_schedule_that_makes_no_sense_is_told_with_its_line(folder: Path) -> N
     (folder / "problem.toml").write_text(PROBLEM.replace("[2, 4]", "2"))
     with pytest.raises(InputError, match=r"problem\.toml:6: parameters\[0\]\.coarse_to_fine: expected a list of steps"):
         ur.Problem.from_file(folder / "problem.toml")
+
+
+# ------------------------------------------- parameterisations
+
+
+@pytest.mark.parametrize(
+    "states", ["estimator", *(pytest.param(name, marks=pytest.mark.slow) for name in ("carry", "reset"))]
+)
+@pytest.mark.parametrize(
+    ("estimator", "optimizer"),
+    [
+        (ur.PathGradient(image=rcv(), spp=2), ur.optimizers.ScheduleFree(0.2)),
+        (ur.MetaEstimator(coupled=True), ur.optimizers.MetaAdam(0.004)),
+        (ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=2, denoiser="none"), spp=2), ur.optimizers.Prodigy()),
+        (ur.PathGradient(spp=2), ur.optimizers.DoWG()),
+    ],
+    ids=["rcv", "coupled", "adaptive", "dowg"],
+)
+def test_a_parameterised_run_comes_to_its_resolution_and_repeats_when_resumed(
+    estimator: Any, optimizer: Any, states: str, tmp_path: Path
+) -> None:
+    def fresh() -> ur.Problem:
+        return problem({"steps": (3, 6), "states": states}, parameterisation="logit")
+
+    whole = ur.optimize(fresh(), estimator, optimizer, steps=12)
+    assert whole.parameters[KEY].shape == TRUTH.shape
+    assert np.abs(whole.parameters[KEY] - TRUTH).mean() < np.abs(0.5 - TRUTH).mean() * 1.1
+    ur.optimize(fresh(), estimator, optimizer, steps=5, run_directory=tmp_path)
+    np.testing.assert_array_equal(ur.resume(tmp_path, fresh(), steps=12).parameters[KEY], whole.parameters[KEY])

@@ -181,6 +181,30 @@ MISTAKES = [
         5,
         'parameters[0].preconditioner: expected "LargeSteps" or "Sobolev", got "LargeStep"; did you mean LargeSteps?',
     ),
+    (
+        "[[views]]",
+        "parameterisation = 'lgo'\n[[views]]",
+        5,
+        "parameters[0].parameterisation: unknown 'lgo'; did you mean log?",
+    ),
+    (
+        "[[views]]",
+        "bounds = [-inf, 1]\nparameterisation = 'logit'\n[[views]]",
+        6,
+        "parameters[0].parameterisation: logit needs a lower and an upper bound, got bounds open to 1; give bounds, such as [0, 1]",
+    ),
+    (
+        "[[views]]",
+        "parameterisation = 3\n[[views]]",
+        5,
+        'parameters[0].parameterisation: expected "identity", "log", "logit", "softplus" or',
+    ),
+    (
+        "[[views]]",
+        "parameterisation = 'softplus(x)'\n[[views]]",
+        5,
+        "parameters[0].parameterisation: expected a number, got 'x'",
+    ),
     ("[[views]]", "preconditioner = 'LargeSteps'\ninitial = 'no.png'\n[[views]]", 6, "parameters[0].initial: "),
     (
         "photo.exr",

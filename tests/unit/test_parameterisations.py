@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -91,6 +92,7 @@ def test_far_away_nothing_overflows(name: str) -> None:
     assert x[0] >= (bounds[0] if bounds[0] is not None else -np.inf)
 
 
+@pytest.mark.mitsuba
 @pytest.mark.parametrize("name", MAPS)
 def test_the_device_agrees(name: str) -> None:
     given, bounds, _ = MAPS[name]
@@ -280,6 +282,20 @@ def test_meta_estimates_are_of_the_variable(coupled: bool) -> None:
         for key, value in exact.items():
             np.testing.assert_allclose(estimate.gradient[key], value, rtol=1e-4, atol=1e-9)
         x = {key: value * 1.1 for key, value in x.items()}
+
+
+@pytest.mark.parametrize(
+    "optimizer", [ur.optimizers.ScheduleFree(0.1), ur.optimizers.Adam(0.05), ur.optimizers.Prodigy()], ids=repr
+)
+def test_a_resumed_run_is_the_uninterrupted_one(optimizer: Any, tmp_path: Path) -> None:
+    chosen = {"estimator": ur.PathGradient(spp=2), "optimizer": optimizer, "seed": 3}
+    whole = ur.optimize(problem("logit", (0, 2), noise=0.5), steps=9, **chosen)
+    ur.optimize(problem("logit", (0, 2), noise=0.5), steps=4, run_directory=tmp_path / "run", **chosen)
+    with pytest.raises(ur.InputError, match="parameterisation"):
+        ur.resume(tmp_path / "run", problem("log", (0, 2), noise=0.5), steps=9)
+    again = ur.resume(tmp_path / "run", problem("logit", (0, 2), noise=0.5), steps=9)
+    for key, values in whole.parameters.items():
+        np.testing.assert_array_equal(again.parameters[key], values)
 
 
 def test_the_fingerprint_has_it() -> None:
