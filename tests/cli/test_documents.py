@@ -219,7 +219,8 @@ def test_the_fields_of_the_documented_problem_file_exist(tmp_path: Path, monkeyp
 
 PUBLIC_MODULES = {
     "images": "unrender.images", "pixels": "unrender.pixels", "losses": "unrender.losses", "optimizers": "unrender.optimizers",
-    "schedules": "unrender.schedules", "preconditioners": "unrender.preconditioners", "smoothed": "unrender.smoothing",
+    "schedules": "unrender.schedules", "preconditioners": "unrender.preconditioners",
+    "parameterisations": "unrender.parameterisations", "smoothed": "unrender.smoothing",
     "statistics": "unrender.statistics", "metrics": "unrender.evaluation.metrics", "report": "unrender.report",
     "gallery": "unrender.gallery", "protocols": "unrender.protocols",
 }  # fmt: skip

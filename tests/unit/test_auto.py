@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -93,12 +94,38 @@ def test_textures_are_smoothed_unless_they_have_a_preconditioner() -> None:
 
 
 def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
-    _, optimizer = chosen(problem())
+    _, optimizer = chosen(problem(), parameterise=False)
     assert optimizer.learning_rate == pytest.approx({"*": 0.1, "map": 0.1, "gain": 10.0})
-    _, optimizer = chosen(problem(), learning_rate=0.02)
+    assert optimizer.parameterisations == {}
+    _, optimizer = chosen(problem(), learning_rate=0.02, parameterise=False)
     assert optimizer.learning_rate == pytest.approx({"*": 0.02, "map": 0.02, "gain": 2.0})
     state = optimizer.init(problem(learning_rate=0.5).initial(), problem(learning_rate=0.5).learning_rates)
     assert state.learning_rates == pytest.approx({"map": 0.5, "gain": 2.0})
+
+
+def test_positive_numbers_move_as_logarithms() -> None:
+    _, optimizer = chosen(problem())
+    assert optimizer.parameterisations == {"gain": "log"}
+    assert optimizer.learning_rate == pytest.approx({"*": 0.1, "map": 0.1, "gain": 0.1})
+    for change in (
+        {"bounds": (0, 500)},
+        {"bounds": None},
+        {"learning_rate": 1.0},
+        {"initial": 1e-4},
+        {"parameterisation": "identity"},
+    ):
+        base = problem()
+        parameters = [dataclasses.replace(p, **change) if p.key == "gain" else p for p in base.parameters]
+        other = Problem(base.renderer, parameters, base.given_views)
+        assert other.reparameterised(chosen(other)[1].parameterisations).coordinates.transforms == {}, change
+
+
+def test_a_run_with_logarithms_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
+    whole = optimize(problem(), "auto", steps=9)
+    optimize(problem(), "auto", steps=4, run_directory=tmp_path)
+    assert any(line == "moved as log (gain)" for line in whole.choices)
+    for key, value in resume(tmp_path, problem(), steps=9).parameters.items():
+        np.testing.assert_array_equal(value, whole.parameters[key])
 
 
 def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +148,8 @@ def test_it_says_what_it_has_chosen_and_why() -> None:
     assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
     assert said[1] == "L1 damped where noise exceeds the residual"
     assert said[2] == "Sobolev gradients of map"
-    assert said[3] == "schedule-free Adam, first rate 0.1 (map), 10 (gain)"
+    assert said[3] == "moved as log (gain)"
+    assert said[4] == "schedule-free Adam, first rate 0.1 (map), 0.1 (gain)"
     assert method("rcv").choose(problem()).reasons == ()
 
 

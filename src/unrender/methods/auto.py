@@ -23,6 +23,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
 from unrender.preconditioners import Sobolev
+from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
 
@@ -40,6 +41,8 @@ _FIREFLIES = 0.8
 """Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
 _PILOT_SPP, _PILOT_VIEWS = 16, 4
 """Of the images that the share is measured on."""
+_MOST_NUMBERS, _MOST_MARGINS = 4, 10
+"""Elements of a number or colour that moves as its logarithm; and the distance from its bound that it has at least, in margins."""
 _FRESH_FROM = 16
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _MOST_PIXELS = 1 << 19
@@ -77,6 +80,9 @@ class AutoMethod(Options):
     tolerance: NonNegativeFloat = Field(
         _TOLERANCE, description="times its noise, within which L1 and Huber count a residual by its size, not its sign"
     )
+    parameterise: bool = Field(
+        True, description="whether positive numbers and colours without an upper bound move as logarithms"
+    )
     smooth: bool = Field(True, description="whether textures and grids move along Sobolev gradients")
     learning_rate: PositiveFloat = Field(
         _RATE,
@@ -98,11 +104,14 @@ class AutoMethod(Options):
         sampler, drawn = self._sampler(problem)
         image = self._image(problem, isinstance(sampler, pixels.All))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
+        moved = _logarithms(problem) if self.parameterise else {}
+        problem = problem.reparameterised(moved)
         rates = _rates(problem, self.learning_rate)
         optimizer = ScheduleFree(
             {"*": self.learning_rate, **rates},
             preconditioner=Sobolev() if smoothed else None,
             preconditioned=smoothed,
+            parameterisations=moved,
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
         tolerance = self.tolerance if biased and isinstance(sampler, pixels.All) else 0.0
@@ -113,7 +122,7 @@ class AutoMethod(Options):
             drawn,
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
-            f"moved as {moved}" if (moved := _parameterised(problem)) else "",
+            f"moved as {named}" if (named := _parameterised(problem)) else "",
             f"schedule-free Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
@@ -192,8 +201,23 @@ def _is_map(shape: tuple[int, ...]) -> bool:
     return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
 
 
+def _logarithms(problem: Problem) -> dict[str, str]:
+    """{key: "log"} of single numbers and colours that are positive, without an upper bound: radiances, extinctions. Not where a learning
+    rate is given, which is in the parameter's units; nor of textures and grids, parts of which may have to be 0."""
+    return {
+        key: "log"
+        for key, value in problem.initial_values().items()
+        if (low := problem.bounds[key][0]) is not None
+        and problem.bounds[key][1] is None
+        and key not in problem.learning_rates
+        and value.ndim <= 1
+        and value.size <= _MOST_NUMBERS
+        and (value > low + _MOST_MARGINS * MARGIN).all()
+    }
+
+
 def _parameterised(problem: Problem) -> str:
-    """Which parameterisations parameters were given: "log (lamp.radiance)"; "" for none."""
+    """Which parameterisations parameters have: "log (lamp.radiance)"; "" for none."""
     return ", ".join(f"{type(given).__name__.lower()} ({key})" for key, given in problem.parameterisations.items())
 
 

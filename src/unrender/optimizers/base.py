@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 
-__all__ = ["Choosing", "Optimizer"]
+__all__ = ["Choosing", "Optimizer", "Reparameterising"]
 
 
 class Optimizer(Protocol):
@@ -29,6 +29,16 @@ class Optimizer(Protocol):
 
     def update(self, estimate: Estimate, state: Any, parameters: Tree) -> tuple[Tree, Any]:
         """The steps to add to the parameters, and the next state."""
+        ...
+
+
+@runtime_checkable
+class Reparameterising(Protocol):
+    """An optimizer that has parameterisations for parameters without one of their own."""
+
+    @property
+    def parameterisations(self) -> Mapping[str, Any]:
+        """{key: parameterisation, or its name}; keys that the problem does not have, or that have their own, are left out."""
         ...
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -141,6 +141,7 @@ class ScheduleFree:
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
             The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
+        parameterisations: {key: name} for parameters without one of their own, such as "log"; see `unrender.parameterisations`.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -153,6 +154,7 @@ class ScheduleFree:
     schedule: Schedule | None = None
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
+    parameterisations: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
         given = self._given_rates

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from unrender.problem.validation import (
     check_loss_function,
     check_max_depth,
     check_parameter,
+    check_parameterisation,
     check_sequence,
     check_truth,
     check_view,
@@ -133,6 +136,24 @@ class Problem:
         from unrender.problem.toml_file import read
 
         return read(path)
+
+    def reparameterised(self, given: Mapping[str, Any]) -> Problem:
+        """The same problem with these parameterisations, {key: one, or its name}, for the parameters that have none of their own.
+
+        Raises `InputError` where bounds do not suit.
+        """
+        missing = {p.key: given[p.key] for p in self.parameters if p.key in given and p.parameterisation is None}
+        if not missing:
+            return self
+        found = copy.copy(self)
+        made = {k: check_parameterisation(g, self.bounds[k], self._initial[k]) for k, g in missing.items()}
+        found.parameters = tuple(
+            replace(p, parameterisation=made[p.key][0]) if p.key in made else p for p in self.parameters
+        )
+        found.parameterisations = self.parameterisations | {key: one for key, (one, _) in made.items()}
+        transforms = {key: transform for key, (_, transform) in made.items() if transform is not None}
+        found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
+        return found
 
     def __repr__(self) -> str:
         return notebook.line(self)

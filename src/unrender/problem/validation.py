@@ -33,6 +33,7 @@ __all__ = [
     "check_loss_function",
     "check_max_depth",
     "check_parameter",
+    "check_parameterisation",
     "check_sequence",
     "check_truth",
     "check_view",
@@ -170,7 +171,9 @@ def check_parameter(
         raise wrong("initial", error) from error
     initial, clipped = _clip_to_bounds(start, bounds)
     try:
-        parameterisation, transform = _parameterisation(parameter, bounds, initial)
+        parameterisation, transform = None, None
+        if parameter.parameterisation is not None:
+            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
     except InputError as error:
         raise wrong("parameterisation", error) from error
     notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
@@ -180,12 +183,10 @@ def check_parameter(
     )
 
 
-def _parameterisation(
-    parameter: Parameter, bounds: Bounds, initial: np.ndarray
-) -> tuple[Parameterisation | None, Transform | None]:
-    given = parameter.parameterisation
-    if given is None:
-        return None, None
+def check_parameterisation(
+    given: Any, bounds: Bounds, initial: np.ndarray
+) -> tuple[Parameterisation, Transform | None]:
+    """A parameterisation, made of its name or table, and its φ. Raises `InputError`."""
     try:
         made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
     except InputError as error:
