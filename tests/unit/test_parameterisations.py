@@ -304,11 +304,10 @@ def test_the_fingerprint_has_it() -> None:
     assert not any("parameterisation" in part for part in fingerprint(problem(None)))
 
 
-def test_what_auto_chose_names_it() -> None:
-    found = problem("softplus")
-    assert any(
-        "moved as softplus (colour), softplus (map)" in line for line in ur.optimize(found, "auto", steps=1).choices
-    )
+@pytest.mark.parametrize("method", ["auto", "plain"])
+def test_what_a_method_chose_names_it(method: str) -> None:
+    said = ur.optimize(problem("softplus"), method, steps=1).choices
+    assert "moved as softplus (colour), softplus (map)" in said
 
 
 @pytest.mark.parametrize("name", ["identity", "log", "logit", "softplus"])

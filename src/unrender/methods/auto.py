@@ -18,7 +18,7 @@ from unrender.estimators.path import PathGradient
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.base import Choice, Options, method
+from unrender.methods.base import Choice, Options, method, parameterised
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
@@ -122,7 +122,7 @@ class AutoMethod(Options):
             drawn,
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
-            f"moved as {named}" if (named := _parameterised(problem)) else "",
+            *parameterised(problem),
             f"schedule-free Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
@@ -214,11 +214,6 @@ def _logarithms(problem: Problem) -> dict[str, str]:
         and value.size <= _MOST_NUMBERS
         and (value > low + _MOST_MARGINS * MARGIN).all()
     }
-
-
-def _parameterised(problem: Problem) -> str:
-    """Which parameterisations parameters have: "log (lamp.radiance)"; "" for none."""
-    return ", ".join(f"{type(given).__name__.lower()} ({key})" for key, given in problem.parameterisations.items())
 
 
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:

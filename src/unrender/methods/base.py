@@ -18,7 +18,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.schedules.functions import Schedule
 
-__all__ = ["SCHEDULE_HELP", "Choice", "Method", "Options", "method", "methods", "parse_schedule"]
+__all__ = ["SCHEDULE_HELP", "Choice", "Method", "Options", "method", "methods", "parameterised", "parse_schedule"]
 
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 
@@ -51,8 +51,7 @@ class Options(BaseModel):
 
     def choose(self, problem: Problem) -> Choice:
         """The two parts that suit a problem. Methods that look at no problem choose what `build` makes."""
-        del problem
-        return Choice(*self.build())
+        return Choice(*self.build(), parameterised(problem))
 
 
 @dataclass(frozen=True)
@@ -117,6 +116,13 @@ class Method:
             yield
         except InputError as error:
             raise InputError(f"method {self.name}: {error}") from error
+
+
+def parameterised(problem: Problem) -> tuple[str, ...]:
+    """A line on which parameterisations parameters have: "moved as log (lamp.radiance)"; none where none has one."""
+    found = problem.parameterisations.items()
+    named = ", ".join(f"{type(given).__name__.lower()} ({key})" for key, given in found)
+    return (f"moved as {named}",) if named else ()
 
 
 def methods() -> dict[str, Method]:
