@@ -238,6 +238,15 @@ def test_values_on_a_bound_come_off_it(name: str, start: Any) -> None:
     np.testing.assert_allclose(result.parameters["x"], truth["x"], atol=0.02)
 
 
+def test_a_start_on_a_bound_is_told_of() -> None:
+    found = problem("log", initial=0.0)
+    assert found.notices == [
+        "parameter colour: 3 of 3 initial values are at a bound, which log leaves slowly",
+        "parameter map: 4 of 4 initial values are at a bound, which log leaves slowly",
+    ]
+    assert problem("log").notices == problem(None, initial=0.0).notices == []
+
+
 def test_a_single_number() -> None:
     renderer = AnalyticRenderer({"x": np.array(5000.0)}, np.ones((48, 1)) / 5000, 0.0, 0.0, shape=(4, 4))
     one = ur.Parameter("x", 50, (0, None), parameterisation="log")

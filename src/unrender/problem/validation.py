@@ -19,6 +19,7 @@ from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem import coarse_to_fine
+from unrender.problem.bounds import project
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.errors import FieldError
 from unrender.problem.key_hints import instead_of, near_key
@@ -177,10 +178,18 @@ def check_parameter(
     except InputError as error:
         raise wrong("parameterisation", error) from error
     notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
+    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     own_rate = None if rate is None else float(rate)
     return CheckedParameter(
         key, bounds, own_rate, preconditioner, schedule, parameterisation, transform, initial, tuple(notices)
     )
+
+
+def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
+    """A line where values start on a bound that a parameterisation leaves slowly; none otherwise."""
+    count = 0 if transform is None else int(np.sum(project(initial, *bounds) != initial))
+    slowly = f"at a bound, which {type(given).__name__.lower()} leaves slowly"
+    return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
 
 
 def check_parameterisation(
