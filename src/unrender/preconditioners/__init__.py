@@ -1,7 +1,8 @@
 """Linear maps that turn one parameter's gradient into a better direction."""
 
 from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.laplacian_pyramid import LaplacianPyramid
 from unrender.preconditioners.large_steps import LargeSteps
 from unrender.preconditioners.sobolev import Sobolev
 
-__all__ = ["LargeSteps", "Preconditioner", "Sobolev"]
+__all__ = ["LaplacianPyramid", "LargeSteps", "Preconditioner", "Sobolev"]

@@ -26,6 +26,7 @@ __all__ = [
     "Transform",
     "TransformSolver",
     "check",
+    "is_map",
     "laplacian",
     "per_axis",
     "solver",
@@ -149,6 +150,11 @@ def check(owner: str, key: str, shape: tuple[int, ...], wrap: bool | tuple[bool,
             f"{key}: preconditioner {owner}: wrap must have {len(shape) - 1} entries for shape {tuple(shape)}, "
             f"got {len(wrap)}"
         )
+
+
+def is_map(shape: tuple[int, ...]) -> bool:
+    """Whether a shape is that of a texture (H, W, C) or a grid (Z, Y, X, C) with neighbours to average with."""
+    return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
 
 
 def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
