@@ -22,7 +22,7 @@ from unrender.methods.base import Choice, Options, method, parameterised
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
-from unrender.preconditioners import Sobolev
+from unrender.preconditioners import Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
@@ -166,7 +166,7 @@ class AutoMethod(Options):
         if not self.smooth:
             return ()
         return tuple(
-            key for key, shape in problem.shapes().items() if key not in problem.preconditioners and _is_map(shape)
+            key for key, shape in problem.shapes().items() if key not in problem.preconditioners and grid.is_map(shape)
         )
 
 
@@ -194,11 +194,6 @@ def _firefly_share(problem: Problem) -> float:
     found = np.sort(np.concatenate(noise))[::-1]
     whole = found.sum()
     return float(found[: max(1, len(found) // 100)].sum() / whole) if len(found) >= 1000 and whole > 0 else 0.0
-
-
-def _is_map(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is that of a texture (H, W, C) or a grid (Z, Y, X, C) with neighbours to average with."""
-    return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
 
 
 def _logarithms(problem: Problem) -> dict[str, str]:
