@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from unrender.core.random import Key
     from unrender.core.registry import register
     from unrender.estimators.base import Estimate
+    from unrender.estimators.filtered import FilteredGradient
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
@@ -81,6 +82,7 @@ _HOMES = {
     "Callback": "runs.callbacks",
     "CoarseToFine": "problem.coarse_to_fine",
     "Estimate": "estimators.base",
+    "FilteredGradient": "estimators.filtered",
     "Grid": "io.volumes",
     "Key": "core.random",
     "Live": "runs.live",
@@ -115,6 +117,7 @@ __all__ = [
     "Callback",
     "CoarseToFine",
     "Estimate",
+    "FilteredGradient",
     "Grid",
     "InputError",
     "Key",

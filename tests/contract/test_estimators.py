@@ -66,6 +66,9 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
     "stock": lambda: ur.StockGradient(spp=2),
+    "filtered": lambda: ur.FilteredGradient(ur.PathGradient(spp=2)),
+    "filtered, control variate": lambda: ur.FilteredGradient(ur.PathGradient(CV(), spp=2)),
+    "filtered, coupled": lambda: ur.FilteredGradient(ur.MetaEstimator(coupled=True, spp=3)),
     "denoised": lambda: ur.PathGradient(Denoised(by="variation"), spp=4),
     "denoised control variate": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=6),
     "denoised, own paths": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=1),
@@ -83,12 +86,13 @@ BIASED = {
     "coupled",
     "coupled, own paths",
     "coupled, control variate",
+    "filtered, coupled",
 }
 # A black box's loss is that of noisy images: a test of its own.
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
 BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
 BIASED |= set(others("estimator"))
-DEAR = {"meta, other statistics", "meta, adaptive pixels, other statistics", "coupled, other statistics"}
+DEAR = {"meta, other statistics", "meta, adaptive pixels, other statistics", "coupled, other statistics", "filtered, control variate"}
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),

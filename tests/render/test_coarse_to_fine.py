@@ -17,6 +17,7 @@ from resizable import KEY, FieldRenderer, upsampled
 import unrender as ur
 from unrender.core import arrays
 from unrender.core.errors import InputError
+from unrender.estimators.filtered import FilteredGradientState
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
@@ -31,6 +32,7 @@ PAIRS: dict[str, tuple[Any, Any]] = {
     "meta": (ur.MetaEstimator(), ur.optimizers.MetaAdam(0.002)),
     "coupled": (ur.MetaEstimator(coupled=True, image=rcv()), ur.optimizers.MetaAdam(0.002)),
     "adaptive": (ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=4, denoiser="none"), spp=2), ur.optimizers.Adam(0.02)),
+    "filtered": (ur.FilteredGradient(ur.PathGradient(image=rcv(), spp=2)), ur.optimizers.Adam(0.02)),
     "momentum": (ur.PathGradient(spp=2), ur.optimizers.SGD(0.5, momentum=0.9)),
 }  # fmt: skip
 
@@ -154,6 +156,11 @@ def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any
     return *before, run, memory
 
 
+def innermost(state: Any) -> Any:
+    """The state itself; of a filtered gradient that of its second half."""
+    return state.halves[1] if isinstance(state, FilteredGradientState) else state
+
+
 def by_hand(value: np.ndarray, power: float = 0.0) -> np.ndarray:
     return upsampled(value, TRUTH.shape[:-1]) / 4**power
 
@@ -172,9 +179,9 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         np.testing.assert_allclose(new.first_moment[KEY], by_hand(old.first_moment[KEY], 1), rtol=1e-10, atol=1e-18)
         np.testing.assert_allclose(new.second_moment[KEY], by_hand(old.second_moment[KEY], SQUARES), rtol=1e-10)
         assert new.begun == 0
-    old, new = before.estimator, memory.estimator
+    old, new = innermost(before.estimator), innermost(memory.estimator)
     image, past = new.image, old.image
-    if name in ("rcv", "coupled"):
+    if name in ("rcv", "coupled", "filtered"):
         np.testing.assert_allclose(image.parameters[KEY], by_hand(past.parameters[KEY]), rtol=1e-12)
         assert image.views is past.views
     if name == "adaptive":
@@ -220,7 +227,8 @@ def test_reset_states_know_nothing_but_the_step(name: str) -> None:
     for field in ("first_moment", "second_moment", "velocity"):
         if hasattr(fresh, field):
             np.testing.assert_array_equal(getattr(memory.optimizer, field)[KEY], np.zeros(TRUTH.shape))
-    assert repr(memory.estimator.image) == repr(estimator.init(run.problem, run.parameters).image)
+    fresh = innermost(estimator.init(run.problem, run.parameters))
+    assert repr(innermost(memory.estimator).image) == repr(fresh.image)
     if isinstance(memory.estimator, MetaState):
         assert memory.estimator.parameters is None
         assert not memory.estimator.elements

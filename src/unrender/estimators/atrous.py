@@ -24,9 +24,7 @@ def levels_of(grid: tuple[int, ...]) -> int:
     return max(1, int(np.log2(max(grid))) - 1)
 
 
-def shrunk(
-    x: np.ndarray, noise: np.ndarray, guide: np.ndarray, wrap: Sequence[bool]
-) -> tuple[np.ndarray, list[float]]:
+def shrunk(x: np.ndarray, noise: np.ndarray, guide: np.ndarray, wrap: Sequence[bool]) -> tuple[np.ndarray, list[float]]:
     """`x` with its details shrunk, and the mean share of each level that is kept, from the finest.
 
     With x_0 = x and F_l the smoothing at spacing 2^l, x_{l+1} = F_l x_l, the details d_l = x_l − x_{l+1} and what is left sum up to x:
@@ -61,9 +59,7 @@ def shrunk(
     return result + both[..., :channels], shares
 
 
-def details(
-    x: np.ndarray, guide: np.ndarray, wrap: Sequence[bool]
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def details(x: np.ndarray, guide: np.ndarray, wrap: Sequence[bool]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """(spacing in texels, the detail at this spacing, what is left) from the finest; x is all details and the last that is left."""
     for level in range(levels_of(x.shape[:-1])):
         spacing = 1 << level

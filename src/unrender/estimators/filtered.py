@@ -126,7 +126,11 @@ class FilteredGradient:
                 noise = self._noise(estimates, name, key.fold(_SIGNS + index))
                 filtered[name], kept[name] = self._filtered(name, value, noise, parameters[name])
         fresh = [each.values for each in (estimate.get(FreshGradient) for estimate in estimates) if each is not None]
-        info = {**first.info, "samples": sum(int(estimate.info.get("samples", 0)) for estimate in estimates), "kept": kept}
+        info = {
+            **first.info,
+            "samples": sum(int(estimate.info.get("samples", 0)) for estimate in estimates),
+            "kept": kept,
+        }
         whole = replace(
             first,
             loss=float(np.mean([estimate.loss for estimate in estimates])),
