@@ -92,7 +92,12 @@ BIASED = {
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
 BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
 BIASED |= set(others("estimator"))
-DEAR = {"meta, other statistics", "meta, adaptive pixels, other statistics", "coupled, other statistics", "filtered, control variate"}
+DEAR = {
+    "meta, other statistics",
+    "meta, adaptive pixels, other statistics",
+    "coupled, other statistics",
+    "filtered, control variate",
+}
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""
 OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Adam": lambda: ur.optimizers.Adam(learning_rate=0.02, schedule=ur.optimizers.schedules.Exponential(100)),

@@ -164,14 +164,17 @@ def test_black_images_and_samples_that_are_no_numbers_are_passed_on() -> None:
     assert np.isnan(broken.gradient["map"]).all()
 
 
+made: Any = ur.FilteredGradient
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ur.FilteredGradient(ur.PathGradient), "inner must be an estimator, such as PathGradient"),
-        (lambda: ur.FilteredGradient(3), "inner must be an estimator, such as PathGradient"),
+        (lambda: made(ur.PathGradient), "inner must be an estimator, such as PathGradient"),
+        (lambda: made(3), "inner must be an estimator, such as PathGradient"),
         (lambda: ur.FilteredGradient(ur.LossValues()), "LossValues provides no gradient to be filtered"),
-        (lambda: ur.FilteredGradient(wrap=True), "wrap must be {key: true or false}, got True"),
-        (lambda: ur.FilteredGradient(wrap={"map": 2}), "wrap must be true, false, or one of these per axis, got 2"),
+        (lambda: made(wrap=True), "wrap must be {key: true or false}, got True"),
+        (lambda: made(wrap={"map": 2}), "wrap must be true, false, or one of these per axis, got 2"),
         (lambda: ur.estimate(problem(), ur.FilteredGradient(wrap={"mop": True})), 'wrap: unknown parameter "mop"'),
         (lambda: ur.estimate(problem(), ur.FilteredGradient(wrap={"map": (True,)})), "wrap must have 2 entries"),
     ],

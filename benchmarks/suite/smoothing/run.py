@@ -1,9 +1,9 @@
 """What shares a gradient among neighbouring texels, compared by equal steps and samples.
 
 `auto` as it is, with Sobolev gradients whose strength it fits, against `auto` without smoothing, with a Laplacian pyramid in place of
-Sobolev, and with gradients filtered by their noise (`FilteredGradient`, two halves of the samples), with Sobolev and alone. All else is as `auto` chooses. The problems are those of `suite` whose unknown is a
-texture, and a checkerboard of one-texel squares, where there is nothing to share. Errors are of the elements that the views see, as in
-`suite`, after tenths of the steps.
+Sobolev, and with gradients filtered by their noise (`FilteredGradient`, two halves of the samples), with Sobolev and alone. All else is as
+`auto` chooses. The problems are those of `suite` whose unknown is a texture, and a checkerboard of one-texel squares, where there is
+nothing to share. Errors are of the elements that the views see, as in `suite`, after tenths of the steps.
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ def parts(problem: ur.Problem, smoothing: str) -> tuple[Any, Any]:
     """Estimator and optimizer of `auto`, but for the smoothing."""
     chosen = method("auto").choose(problem, {"smooth": "sobolev" in smoothing or smoothing == "pyramid"})
     estimator, optimizer = chosen.estimator, chosen.optimizer
+    if not (isinstance(estimator, ur.PathGradient) and isinstance(optimizer, ur.optimizers.ScheduleFree)):
+        raise ur.InputError(f"{problem.name}: auto chooses no path gradients")
     if smoothing == "pyramid":
         optimizer = replace(optimizer, preconditioner=ur.preconditioners.LaplacianPyramid())
     if "filter" in smoothing:

@@ -46,8 +46,9 @@ def shrunk(x: np.ndarray, noise: np.ndarray, guide: np.ndarray, wrap: Sequence[b
     pooled = channels * _POOLED ** sum(size > 1 for size in grid)
     factor = max(0.0, pooled - 2.0) / (pooled + 2.0)
     result, shares = np.zeros_like(x), []
-    both = np.concatenate([x, noise], axis=-1)
-    for spacing, detail, both in details(both, guide, wrap):  # noqa: B020
+    left = np.concatenate([x, noise], axis=-1)
+    for spacing, detail, smooth in details(left, guide, wrap):
+        left = smooth
         d, e = detail[..., :channels], detail[..., channels:]
         energy = np.stack([np.square(d).mean(axis=-1), np.square(e).mean(axis=-1)], axis=-1)
         for _ in range(2):
@@ -56,7 +57,7 @@ def shrunk(x: np.ndarray, noise: np.ndarray, guide: np.ndarray, wrap: Sequence[b
         share = np.clip(1.0 - factor * noisy / np.where(whole > 0, whole, 1.0), 0.0, 1.0)
         result += share * d
         shares.append(float(share.mean()))
-    return result + both[..., :channels], shares
+    return result + left[..., :channels], shares
 
 
 def details(x: np.ndarray, guide: np.ndarray, wrap: Sequence[bool]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:

@@ -49,15 +49,20 @@ class FilteredGradient:
     """The gradient of another estimator, smoothed over neighbouring texels as far as it is noise.
 
     An edge-aware à-trous filter, guided by the parameter's current values, divides the gradient of a texture or grid into details of each
-    scale; each detail is shrunk, place by place, towards 0 by James and Stein's factor (`atrous.shrunk`, which has the formulas). So the
-    result is the unbiased gradient where that is hardly noisy, and its cross-bilateral mean where it is noise. The ideas are those of Chang et
-    al. 2024, "Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering", and of Gu and Moon 2025, "James–Stein Gradient Combiner
-    for Inverse Monte Carlo Rendering"; here filter width, strength and mixture follow from the noise, and nothing is to be tuned.
+    scale, d_l, with x = x_L + Σ d_l for the gradient x and its smoothest version x_L. Each is shrunk by James and Stein's factor, place by
+    place:
 
-    The noise is that of two halves A and B, two estimates of the inner estimator that never share samples, each with a memory of its own where the
-    estimator has one: the gradient is (A + B) / 2, and (A − B) / 2 is a sample of its noise, with all correlations between texels and
-    whatever the halves remember. So give `inner` half of the samples that a step shall have. Where the inner estimator provides the variance,
-    there is one estimate, and the sample is of independent noise: its root with random signs.
+        x̂ = x_L + Σ_l α_l d_l,   α_l = max(0, 1 − (p − 2) / (p + 2) · S² e_l² / S² d_l²)
+
+    with the details e_l of a sample of the noise, and means S² over p numbers nearby. So the result is the unbiased gradient where that is
+    hardly noisy, and its cross-bilateral mean where it is noise. The ideas are those of Chang et al. 2024, "Spatiotemporal Bilateral
+    Gradient Filtering for Inverse Rendering", and of Gu and Moon 2025, "James–Stein Gradient Combiner for Inverse Monte Carlo Rendering";
+    here filter width, strength and mixture follow from the noise, and nothing is to be tuned.
+
+    The noise is that of two halves A and B, two estimates of the inner estimator that never share samples, each with a memory of its own
+    where the estimator has one: the gradient is (A + B) / 2, and (A − B) / 2 is a sample of its noise, with all correlations between texels
+    and whatever the halves remember. So give `inner` half of the samples that a step shall have. Where the inner estimator provides the
+    variance, there is one estimate, and the sample is of independent noise: its root with random signs.
 
     Why an estimator, not a preconditioner: a preconditioner is one linear, symmetric map of gradients and steps; this filter depends
     on the gradient itself, on its noise and on the parameter's values, and steps are not to be filtered. Preconditioners, and the

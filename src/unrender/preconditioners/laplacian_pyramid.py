@@ -33,8 +33,9 @@ class LaplacianPyramid:
 
     A texture that is the sum Σ_l U_l p_l of a pyramid of levels p_l, each half as fine as the one before and interpolated linearly by U_l
     to the texture's resolution, moves along Σ_l U_l U_lᵀ g when the levels descend in place of texels: all that a coarse texel covers moves
-    together, while level 0, U_0 = I, leaves all detail within reach. D_l, the diagonal matrix of the sums U_lᵀ 1, makes of U_lᵀ g a mean over what the
-    coarse texel covers, so that constants pass unchanged whatever the shares a_l. S is symmetric, its eigenvalues lie in [a_0, 1].
+    together, while level 0, U_0 = I, leaves all detail within reach. D_l, the diagonal matrix of the sums U_lᵀ 1, makes of U_lᵀ g a mean
+    over what the coarse texel covers, so that constants pass unchanged whatever the shares a_l. S is symmetric, its eigenvalues lie in
+    [a_0, 1].
 
     Adam stands between gradient and step here, as with the other preconditioners: it normalises per texel what all levels together make
     of a gradient. Weier et al. have it normalise the coefficients of each level apart, which no map from texels to texels can.
@@ -104,7 +105,7 @@ def _pyramid(size: int, wraps: bool, levels: int | None) -> tuple[_Level, ...]:
 
 
 def _interpolation(size: int, wraps: bool) -> scipy.sparse.csr_matrix:
-    """Linear interpolation between the centres of ⌈n/2⌉ texels at those of n, (n, ⌈n/2⌉); its rows sum to 1, its columns to 2 for even n."""
+    """Linear interpolation between the centres of ⌈n/2⌉ texels, at those of n: (n, ⌈n/2⌉), of rows that sum to 1."""
     import scipy.sparse
 
     coarse = (size + 1) // 2
@@ -113,7 +114,7 @@ def _interpolation(size: int, wraps: bool) -> scipy.sparse.csr_matrix:
     share = at - before
     ends = [end % coarse if wraps else np.clip(end, 0, coarse - 1) for end in (before, before + 1)]
     entries = np.concatenate([1.0 - share, share]), (np.tile(np.arange(size), 2), np.concatenate(ends))
-    return scipy.sparse.coo_matrix(entries, (size, coarse), np.float32).tocsr()
+    return scipy.sparse.csr_matrix(entries, (size, coarse), np.float32)
 
 
 def _sum_over_levels(x: np.ndarray, axes: Sequence[tuple[_Level, ...]], falloff: float) -> np.ndarray:
