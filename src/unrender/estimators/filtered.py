@@ -61,8 +61,9 @@ class FilteredGradient:
 
     The noise is that of two halves A and B, two estimates of the inner estimator that never share samples, each with a memory of its own
     where the estimator has one: the gradient is (A + B) / 2, and (A − B) / 2 is a sample of its noise, with all correlations between texels
-    and whatever the halves remember. So give `inner` half of the samples that a step shall have. Where the inner estimator provides the
-    variance, there is one estimate, and the sample is of independent noise: its root with random signs.
+    and whatever the halves remember. So give `inner` half of the samples that a step shall have, and 2 per pixel at least where it divides
+    them into groups. Where the inner estimator provides the variance, there is one estimate, and the sample is of independent noise: its
+    root with random signs.
 
     Why an estimator, not a preconditioner: a preconditioner is one linear, symmetric map of gradients and steps; this filter depends
     on the gradient itself, on its noise and on the parameter's values, and steps are not to be filtered. Preconditioners, and the
