@@ -43,6 +43,8 @@ _PILOT_SPP, _PILOT_VIEWS = 16, 4
 """Of the images that the share is measured on."""
 _MOST_NUMBERS, _MOST_MARGINS = 4, 10
 """Elements of a number or colour that moves as its logarithm; and the distance from its bound that it has at least, in margins."""
+_TEXTURE = 3
+"""Dimensions of a texture, (H, W, C)."""
 _FRESH_FROM = 16
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _MOST_PIXELS = 1 << 19
@@ -81,7 +83,7 @@ class AutoMethod(Options):
         _TOLERANCE, description="times its noise, within which L1 and Huber count a residual by its size, not its sign"
     )
     parameterise: bool = Field(
-        True, description="whether positive numbers and colours without an upper bound move as logarithms"
+        True, description="whether positive numbers, colours and textures without an upper bound move as logarithms"
     )
     smooth: bool = Field(True, description="whether textures and grids move along Sobolev gradients")
     learning_rate: PositiveFloat = Field(
@@ -197,16 +199,15 @@ def _firefly_share(problem: Problem) -> float:
 
 
 def _logarithms(problem: Problem) -> dict[str, str]:
-    """{key: "log"} of single numbers and colours that are positive, without an upper bound: radiances, extinctions. Not where a learning
-    rate is given, which is in the parameter's units; nor of textures and grids, parts of which may have to be 0."""
+    """{key: "log"} of single numbers, colours and textures that are positive, without an upper bound: radiances, environment maps,
+    extinctions. Not where a learning rate is given, which is in the parameter's units; nor of grids, parts of which may have to be 0."""
     return {
         key: "log"
         for key, value in problem.initial_values().items()
         if (low := problem.bounds[key][0]) is not None
         and problem.bounds[key][1] is None
         and key not in problem.learning_rates
-        and value.ndim <= 1
-        and value.size <= _MOST_NUMBERS
+        and (value.ndim == _TEXTURE or (value.ndim <= 1 and value.size <= _MOST_NUMBERS))
         and (value > low + _MOST_MARGINS * MARGIN).all()
     }
 

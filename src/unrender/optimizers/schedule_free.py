@@ -112,7 +112,7 @@ class ScheduleFree:
         log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + 10)
 
     with `growth` q, `decay` p and the mean correlation ρ of successive gradients of each parameter by itself, of n elements: while they
-    agree, the rate grows, up to 3 η_0 times what the parameter itself has grown by; where they contradict one another, as after steps
+    agree, the rate grows, up to 3 η_0 times what the parameter itself has grown by (3 η_0 in `parameterisations`); where they contradict one another, as after steps
     too long, it shrinks; once they are noise it falls as t^-0.6. Of single numbers the last nine gradients may agree by chance, hence
     s = 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and averages of iterates take the noise
     away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
@@ -272,7 +272,8 @@ class ScheduleFree:
             rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
             fit, shape = strengths.get(key, _NOT_FITTED), arrays.shape(gradient[key])
             change = self._change(min(rho, rho * fit.confirmed), shape, state.step - state.begun)
-            most = math.log(_MOST_GROWTH * max(1.0, size / state.sizes[key])) if fit.gain == 1.0 else 0.0
+            grown = 1.0 if key in self.parameterisations else max(1.0, size / state.sizes[key])
+            most = math.log(_MOST_GROWTH * grown) if fit.gain == 1.0 else 0.0
             log_rate[key] = min(state.log_rate[key] + change, most)
         return correlation, log_rate
 
