@@ -225,7 +225,7 @@ def test_the_unit_would_matter_without() -> None:
 
 
 @pytest.mark.parametrize("name", ["log", "logit", "softplus"])
-@pytest.mark.parametrize("start", [0.0, 2.0, 1, "edges"])
+@pytest.mark.parametrize("start", ["edges", *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 2.0, 1))])
 def test_values_on_a_bound_come_off_it(name: str, start: Any) -> None:
     """Where u is infinite, the loop's margin keeps it finite."""
     random = np.random.default_rng(3)
