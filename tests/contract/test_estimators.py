@@ -96,6 +96,7 @@ DEAR = {
     "meta, other statistics",
     "meta, adaptive pixels, other statistics",
     "coupled, other statistics",
+    "filtered",
     "filtered, control variate",
 }
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""
