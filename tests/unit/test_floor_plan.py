@@ -24,7 +24,7 @@ FLOORS = (
         "preconditioners",
     ),
     *("problem", "pixels", "images", "smoothing", "estimators", "optimizers", "methods", "gallery", "runs", "loops"),
-    *("report", "exporting", "watch", "cli"),
+    *("report", "exporting", "capture", "watch", "cli"),
 )
 """From low to high: a floor imports itself and what is below it."""
 

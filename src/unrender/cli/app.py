@@ -10,6 +10,7 @@ import typer
 from unrender.cli.compare import compare
 from unrender.cli.export import export
 from unrender.cli.gallery import gallery
+from unrender.cli.import_ import import_
 from unrender.cli.methods import methods
 from unrender.cli.report import report
 from unrender.cli.resume import resume
@@ -31,6 +32,7 @@ app.command()(watch)
 app.command()(compare)
 app.command()(report)
 app.command()(export)
+app.command("import")(import_)
 app.command()(gallery)
 app.command()(methods)
 

@@ -1,0 +1,140 @@
+"""Cameras: a lens, and where points of the world fall in its picture.
+
+A camera's axes are x right, y up, z backwards (it looks along -z), right-handed, as in OpenGL. Positions in a picture are in pixels from its
+upper left corner, x to the right and y down, so that the middle of the first pixel is (0.5, 0.5). In coordinates x/z, y/z of a camera that
+looks along +z with y down, OpenCV's models of distortion apply.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+
+__all__ = ["FISHEYE", "MODELS", "RADIAL_TANGENTIAL", "Lens", "opencv", "project", "rigid"]
+
+RADIAL_TANGENTIAL, FISHEYE = "radial-tangential", "fisheye"
+MODELS = (RADIAL_TANGENTIAL, FISHEYE)
+_MOST_COEFFICIENTS = {RADIAL_TANGENTIAL: 8, FISHEYE: 4}
+_NARROWEST, _WIDEST = 1e-3, 1e6
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A perspective camera with OpenCV's distortion.
+
+    Attributes:
+        width, height: of the picture in pixels.
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point, in pixels from the upper left corner.
+        model: "radial-tangential" (k1, k2, p1, p2, k3, k4, k5, k6) or "fisheye" (k1, k2, k3, k4).
+        distortion: the model's coefficients; fewer are followed by zeros.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: str = RADIAL_TANGENTIAL
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(math.isfinite(number) for number in numbers):
+            raise InputError("camera: expected finite numbers")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: expected a width and height of at least 1, got {self.width} x {self.height}")
+        for name, value, side in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
+            if not _NARROWEST < value / side < _WIDEST:
+                raise InputError(f"camera: {name}: expected a focal length in pixels, got {value:g} for {side} pixels")
+        if self.model not in MODELS:
+            raise InputError(f"camera: model: expected one of {', '.join(MODELS)}, got {self.model!r}")
+        if len(self.distortion) > _MOST_COEFFICIENTS[self.model]:
+            raise InputError(f"camera: at most {_MOST_COEFFICIENTS[self.model]} coefficients of a {self.model} lens")
+
+    @property
+    def distorts(self) -> bool:
+        """Whether straight lines are curved in its picture."""
+        return self.model == FISHEYE or any(self.distortion)
+
+    def scaled(self, width: int, height: int) -> Lens:
+        """The lens of the same picture at another size of the same proportions."""
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+
+    @classmethod
+    def of_field_of_view(cls, radians: float, width: int, height: int) -> Lens:
+        """Square pixels, principal point in the middle, `radians` from the left edge to the right."""
+        if not 0 < radians < math.pi:
+            raise InputError(f"camera: expected a horizontal angle of view of 0 to π radians, got {radians:g}")
+        focal = width / (2 * math.tan(radians / 2))
+        return cls(width, height, focal, focal, width / 2, height / 2)
+
+
+def project(lens: Lens, camera_to_world: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where points of the world fall: (N, 2) in pixels, and their depths (N,) along the view, positive in front of the camera.
+
+    Positions of points that are not in front mean nothing.
+    """
+    local = (np.asarray(points, float) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
+    depth = -local[:, 2]
+    safe = np.where(depth > 0, depth, 1.0)
+    normalised = np.stack([local[:, 0] / safe, -local[:, 1] / safe], 1)
+    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    if not lens.distorts:
+        return normalised * focal + centre, depth
+    cv2 = opencv()
+    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
+    if lens.model == FISHEYE:
+        coefficients = np.array([*lens.distortion, 0, 0, 0, 0][:4], float)
+        return cv2.fisheye.distortPoints(normalised[None], matrix, coefficients)[0], depth
+    rays = np.concatenate([normalised, np.ones((len(normalised), 1))], 1)
+    none = np.zeros(3)
+    return cv2.projectPoints(rays, none, none, matrix, _coefficients(lens))[0].reshape(-1, 2), depth
+
+
+def _coefficients(lens: Lens) -> np.ndarray:
+    """Of a radial-tangential lens, (8,), as OpenCV orders them."""
+    return np.array([*lens.distortion, *[0.0] * 8][:8], float)
+
+
+def rigid(matrix: Any, where: str) -> np.ndarray:
+    """A 3 x 4 or 4 x 4 matrix as a rotation and a position, (4, 4).
+
+    A uniform scale of the axes is taken out: it changes no picture.
+
+    Raises:
+        InputError: not finite, or its axes are not orthogonal and equally long to 2 %, or mirrored.
+    """
+    try:
+        given = np.asarray(matrix, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where}: expected a matrix of numbers") from error
+    if given.shape not in ((3, 4), (4, 4)) or not np.isfinite(given).all():
+        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 finite numbers, got shape {given.shape}")
+    axes = given[:3, :3]
+    determinant = float(np.linalg.det(axes))
+    length = abs(determinant) ** (1 / 3)
+    if length == 0 or np.abs(axes.T @ axes / length**2 - np.eye(3)).max() > 0.02:
+        raise InputError(f"{where}: its first three columns are no rotation")
+    if determinant < 0:
+        raise InputError(f"{where}: its axes are left-handed (determinant {determinant:.3g}): one axis is mirrored")
+    u, _, v = np.linalg.svd(axes)
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = u @ v, given[:3, 3]
+    return found
+
+
+def opencv() -> Any:
+    """The module `cv2`. Raises `InputError` that says how to install it."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise InputError(f"photographs need OpenCV ({error}): pip install 'unrender[capture]'") from error
+    return cv2

@@ -1,0 +1,59 @@
+"""Which format a folder of posed photographs has, and reading it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from unrender.capture.capture import Capture
+from unrender.capture.formats import colmap, llff, transforms
+from unrender.core.errors import InputError
+from unrender.io import bounded_files
+
+__all__ = ["FORMATS", "read"]
+
+
+@dataclass(frozen=True)
+class _Format:
+    recognise: Callable[[Path], bool]
+    read: Callable[[Path, Path | None], Capture]
+    files: str
+
+
+FORMATS = {
+    "transforms": _Format(transforms.recognise, transforms.read, "transforms.json or transforms_train.json"),
+    "colmap": _Format(colmap.recognise, colmap.read, "cameras and images (.bin or .txt), here or in sparse/0"),
+    "llff": _Format(llff.recognise, llff.read, "poses_bounds.npy"),
+}
+"""By name, in the order in which a folder that has several is read."""
+
+
+def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Capture:
+    """The capture in a folder.
+
+    Args:
+        folder: where it is.
+        kind: a key of `FORMATS`; None for the first whose files are there.
+        masks: a folder of masks named like the photographs; None for those that the format names or that lie beside the photographs.
+
+    Raises:
+        InputError: no such folder, none of the formats, or files that cannot be read; which file, and what was expected.
+    """
+    for given, name in ((folder, "FOLDER"), (masks, "--masks")):
+        if given is not None and bounded_files.kind(given) != "folder":
+            found = "not a folder" if bounded_files.exists(given) else "no such folder"
+            raise InputError(f"{given}: {found}" if name == "FOLDER" else f"{name} {given}: {found}")
+    if kind is not None and kind not in FORMATS:
+        raise InputError(f"--format {kind}: expected one of {', '.join(FORMATS)}")
+    for name, each in FORMATS.items():
+        if kind in (None, name) and each.recognise(folder):
+            capture = each.read(folder, masks)
+            if not capture.photographs:
+                raise InputError(f"{folder}: none of its photographs is there")
+            return capture
+    if kind is not None:
+        raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
+    if (folder / "lights.txt").is_file():
+        raise InputError(f"{folder}: one camera under several lights (lights.txt) is not supported yet")
+    raise InputError(f"{folder}: no camera poses: expected {'; '.join(each.files for each in FORMATS.values())}")

@@ -1,0 +1,86 @@
+"""Finding photographs and their masks by the names that formats give them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+
+__all__ = ["PICTURES", "find_mask", "find_picture", "left_out", "pictures", "without_pose"]
+
+PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".tga", ".bmp", ".hdr", ".ppm", ".pfm")
+"""Endings of photographs."""
+_WITHOUT_ENDING = (*PICTURES, ".PNG", ".JPG", ".JPEG", "_rgb.exr", "_rgba.png")
+"""Tried in turn where a format names a photograph without its ending."""
+_MASK_FOLDERS = ("masks", "mask")
+
+
+def pictures(folder: Path) -> list[Path]:
+    """The pictures of a folder in the order of their names, none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
+
+
+def find_picture(folder: Path, name: str) -> Path | None:
+    """The file of a photograph that a format calls `name`, relative to `folder`; None where there is none."""
+    name = name.replace("\\", "/")
+    for candidate in (folder / name, *(folder / f"{name}{ending}" for ending in _WITHOUT_ENDING)):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | None = None) -> Path | None:
+    """The mask of a photograph; None where there is none.
+
+    Looked for in this order: in the folder `given`, and nowhere else where there is one; the file that the format names; beside the
+    photograph as NAME_mask.png; in a folder beside the photograph's that is called after it, as train_mask is after train; in masks or mask,
+    in `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own.
+    """
+    if given is not None:
+        return _of_name(given, photograph)
+    if named is not None:
+        path = folder / named
+        if not path.is_file():
+            raise InputError(f"{path}: no such file, and {printable(photograph.name)} names it as its mask")
+        return path
+    stem = photograph.stem.removesuffix("_rgb").removesuffix("_rgba")
+    for ending in PICTURES:
+        if (beside := photograph.with_name(f"{stem}_mask{ending}")).is_file():
+            return beside
+    own = photograph.parent.with_name(f"{photograph.parent.name}_mask") if photograph.parent.name else folder / "mask"
+    places = [own, *(place / name for place in (folder, photograph.parent.parent) for name in _MASK_FOLDERS)]
+    return next((found for place in places if (found := _of_name(place, photograph)) is not None), None)
+
+
+def _of_name(folder: Path, photograph: Path) -> Path | None:
+    names = (
+        photograph.name,
+        *(f"{photograph.stem}{e}" for e in PICTURES),
+        *(f"{photograph.name}{e}" for e in PICTURES),
+    )
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def left_out(missing: list[str], count: int) -> tuple[str, ...]:
+    """A notice on photographs whose poses are known and whose files are not there."""
+    if not missing:
+        return ()
+    return (f"{len(missing)} of {count} photographs are missing and left out, the first {printable(missing[0])}",)
+
+
+def without_pose(folders: Iterable[Path], used: Collection[Path]) -> tuple[str, ...]:
+    """A notice on pictures that lie beside the photographs and have no pose."""
+    known = {path.resolve() for path in used}
+    rest = [
+        path
+        for folder in sorted(set(folders))
+        for path in pictures(folder)
+        if path.resolve() not in known and not path.stem.endswith("_mask")
+    ]
+    if not rest:
+        return ()
+    return (f"{len(rest)} pictures have no pose and are left out, the first {printable(rest[0].name)}",)

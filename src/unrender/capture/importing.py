@@ -1,0 +1,214 @@
+"""A folder of posed photographs becomes a problem folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unrender.backend import variant
+from unrender.capture import atlas, flips, formats, hull, mesh as meshes, overlays, problem_folder
+from unrender.capture.capture import Capture
+from unrender.capture.conventions import reinterpreted
+from unrender.capture.mesh import Mesh
+from unrender.capture.silhouettes import Silhouettes, overlap
+from unrender.capture.views import CapturedView, prepare
+from unrender.core import phases
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.exporting.ready_made import file_name
+from unrender.io import files
+
+__all__ = ["CHECK", "PROBLEM", "SHEET", "Imported", "Options", "check", "import_capture"]
+
+CHECK, SHEET = "check", "check.png"
+PROBLEM = problem_folder.PROBLEM
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a capture is read.
+
+    Attributes:
+        mesh: a PLY or OBJ file in the cameras' world; None for a hull of the masks.
+        masks: a folder of masks named like the photographs; None for those that the capture has.
+        kind: a key of `formats.FORMATS`; None for what is found.
+        axes: a key of `conventions.AXES`, where the files have others than their format; None for the format's.
+        world_to_camera: whether matrices are inverse poses; None for as the format has them.
+        resolution: pixels along the longer side of a view, at most.
+        scale: in place of `resolution`, a factor of the photograph's own; None for `resolution`.
+        hold_out: every so many photographs one is held out; 0 for none; None for the capture's own split, or 8.
+        voxels: along the longest side of the hull.
+        faces: of the hull, about.
+        texture: texels along the sides of the base colour.
+    """
+
+    mesh: Path | None = None
+    masks: Path | None = None
+    kind: str | None = None
+    axes: str | None = None
+    world_to_camera: bool | None = None
+    resolution: int = 256
+    scale: float | None = None
+    hold_out: int | None = None
+    voxels: int = 96
+    faces: int = 10_000
+    texture: int = 512
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What an import found.
+
+    Attributes:
+        folder: what was written.
+        kind: the capture's format.
+        views: count of training views.
+        held_out: count of held-out views.
+        size: width and height of the largest view.
+        faces: of the mesh.
+        overlaps: of the mesh's silhouettes with the masks, in order of the views; none where there are no masks.
+        notices: one line for each thing that was left out or changed.
+    """
+
+    folder: Path
+    kind: str
+    views: int
+    held_out: int
+    size: tuple[int, int]
+    faces: int
+    overlaps: tuple[float, ...]
+    notices: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Read:
+    capture: Capture
+    views: list[CapturedView]
+    mesh: Mesh
+    silhouettes: Silhouettes
+    overlaps: list[float]
+    notices: tuple[str, ...]
+    refusal: str
+
+
+def import_capture(folder: Path, out: Path, options: Options) -> Imported:
+    """Write the problem of a folder of posed photographs: scene.xml, problem.toml, held-out.toml, references, masks, mesh, and check.png.
+
+    What stands at `out` is replaced in one instant, and only when all is written.
+
+    Raises:
+        InputError: which file, and what was expected; nothing is written then.
+    """
+    found = _read(folder, options)
+    if found.refusal:
+        raise InputError(f"{folder}: {found.refusal}")
+    mesh = found.mesh
+    if mesh.uv is None:
+        with phases.phase("atlas"):
+            mesh = atlas.unwrap(mesh, options.texture)
+
+    def fill(place: Path) -> None:
+        with phases.phase("problem"):
+            problem_folder.write(place, folder.resolve().name, found.views, mesh, options.texture)
+            (place / SHEET).write_bytes(_sheet(found, list(_overlays(found))))
+
+    _write_folder(out, fill)
+    return _imported(found, out, mesh)
+
+
+def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
+    """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
+
+    Returns what was found, and in one line which convention looks wrong, "" where none does.
+
+    Raises:
+        InputError: which file, and what was expected; nothing is written then.
+    """
+    found = _read(folder, options)
+
+    def fill(place: Path) -> None:
+        with phases.phase("pictures"):
+            pictures = list(_overlays(found))
+            (place / CHECK).mkdir()
+            for index, (view, picture) in enumerate(zip(found.views, pictures, strict=True)):
+                name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
+                (place / CHECK / name).write_bytes(overlays.png(picture))
+            (place / SHEET).write_bytes(_sheet(found, pictures))
+
+    _write_folder(out, fill)
+    return _imported(found, out, found.mesh), found.refusal
+
+
+def _read(folder: Path, options: Options) -> _Read:
+    variant.ensure()
+    capture = formats.read(folder, options.kind, options.masks)
+    if options.axes is not None or options.world_to_camera is not None:
+        inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
+        capture = reinterpreted(capture, options.axes or capture.axes, inverse)
+    given = None if options.mesh is None else meshes.read(options.mesh)
+    if given is None and not _has_masks(capture):
+        raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
+    with phases.phase("photographs") as advance:
+        views, notices = prepare(
+            capture, options.resolution, options.scale, options.hold_out, lambda done, count: advance(done / count)
+        )
+    if given is None and any(view.mask is None for view in views):
+        raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
+    masked = all(view.mask is not None for view in views)
+    training = [view for view in views if not view.held_out]
+    with phases.phase("shape"):
+        try:
+            mesh = given or hull.shape(training, options.voxels, options.faces)
+            silhouettes = Silhouettes(mesh)
+            overlaps = overlap(silhouettes, views) if masked else []
+        except InputError as error:
+            if str(error) != hull.EMPTY:
+                raise
+            raise InputError(f"{folder}: {error}; {flips.explain(capture, training, None, 0.0)}") from error
+        mean = float(np.mean(overlaps)) if masked else 1.0
+        refusal = "" if mean >= flips.SUFFICIENT else flips.explain(capture, training, given, mean)
+    return _Read(capture, views, mesh, silhouettes, overlaps, (*capture.notices, *notices), refusal)
+
+
+def _has_masks(capture: Capture) -> bool:
+    """Whether there are masks as files, or may be some in alpha channels."""
+    return any(
+        p.mask is not None or p.file.suffix.lower() in (".png", ".tif", ".tiff", ".webp") for p in capture.photographs
+    )
+
+
+def _overlays(found: _Read) -> Sequence[np.ndarray]:
+    return [overlays.overlay(view, found.silhouettes) for view in found.views]
+
+
+def _sheet(found: _Read, pictures: Sequence[np.ndarray]) -> bytes:
+    overlaps = [f"IoU {value:.3f}  " for value in found.overlaps] or [""] * len(found.views)
+    return overlays.contact_sheet(
+        pictures, [f"{value}{printable(view.name)}" for value, view in zip(overlaps, found.views, strict=True)]
+    )
+
+
+def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:
+    held_out = sum(view.held_out for view in found.views)
+    size = max((view.lens.width, view.lens.height) for view in found.views)
+    counts = len(found.views) - held_out, held_out
+    return Imported(out, found.capture.kind, *counts, size, len(mesh.faces), tuple(found.overlaps), found.notices)
+
+
+def _write_folder(out: Path, fill: Callable[[Path], None]) -> None:
+    files.remove_leftovers(out.parent, (out.name,))
+    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
+    try:
+        try:
+            files.make_folder(partial)
+            fill(partial)
+            files.replace_folder(partial, out)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,137 @@
+"""Triangle meshes as arrays: normals, smoothing, decimation, PLY files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.io import bounded_files, mesh_files
+
+__all__ = ["Mesh", "decimate", "normals", "ply", "read", "smooth", "without_crumbs"]
+
+_SHRINK, _GROW = 0.5, -0.53
+_KINDS = (".ply", ".obj")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh.
+
+    Attributes:
+        vertices: (V, 3).
+        faces: (F, 3) integers, counter-clockwise seen from outside.
+        uv: (V, 2) in [0, 1]; None where there are none.
+        normals: (V, 3) unit; None for those of `normals`.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None = None
+    normals: np.ndarray | None = None
+
+
+def normals(mesh: Mesh) -> np.ndarray:
+    """Of the vertices, (V, 3) unit: means of the faces' normals weighted by their areas."""
+    corners = mesh.vertices[mesh.faces]
+    weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(mesh.vertices, dtype=float)
+    for corner in range(3):
+        np.add.at(total, mesh.faces[:, corner], weighted)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0])
+
+
+def smooth(mesh: Mesh, steps: int) -> Mesh:
+    """Taubin's smoothing, which does not shrink: so many pairs of steps of the umbrella operator, λ = .5 and µ = -.53.
+
+    G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
+    """
+    from scipy import sparse
+
+    count = len(mesh.vertices)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacency = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), (count, count))
+    adjacency.data[:] = 1.0
+    mean = sparse.diags(1 / np.maximum(np.asarray(adjacency.sum(1)).ravel(), 1)) @ adjacency
+    vertices = np.asarray(mesh.vertices, float)
+    for _ in range(steps):
+        for factor in (_SHRINK, _GROW):
+            vertices = vertices + factor * (mean @ vertices - vertices)
+    return replace(mesh, vertices=vertices, normals=None)
+
+
+def without_crumbs(mesh: Mesh, share: float) -> Mesh:
+    """Without connected parts that have less than `share` of the largest part's faces."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    count = len(mesh.vertices)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    graph = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count))
+    _, parts = csgraph.connected_components(graph, directed=False)
+    sizes = np.bincount(parts[mesh.faces[:, 0]], minlength=parts.max() + 1)
+    kept = mesh.faces[sizes[parts[mesh.faces[:, 0]]] >= share * sizes.max()]
+    used, faces = np.unique(kept, return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
+
+
+def decimate(mesh: Mesh, faces: int) -> Mesh:
+    """At most about so many faces, by quadric error. Raises `InputError` where the package for it is missing."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise InputError(
+            f"a first shape needs fast-simplification ({error}): pip install 'unrender[capture]'"
+        ) from error
+    # Single precision inside: about the middle, in units of the extent.
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
+    vertices, kept, *_ = fast_simplification.simplify(local, mesh.faces.astype(np.int32), target_count=faces)
+    return Mesh(np.asarray(vertices, float) * extent + middle, np.asarray(kept, np.int64))
+
+
+def read(path: Path) -> Mesh:
+    """The mesh in a PLY or OBJ file, with its texture coordinates where it has them. Raises `InputError`."""
+    if (found := bounded_files.kind(path)) != "file":
+        raise InputError(f"--mesh {path}: {'not a file' if found else 'no such file'}")
+    if path.suffix.lower() not in _KINDS:
+        raise InputError(f"--mesh {path}: expected a {' or '.join(_KINDS)} file")
+    import mitsuba as mi
+
+    if path.suffix.lower() == ".ply":
+        mesh_files.check_ply(path)
+    else:
+        mesh_files.check_obj(path)
+    try:
+        loaded = mi.load_dict({"type": path.suffix.lower()[1:], "filename": str(path)})
+    except Exception as error:
+        raise InputError(f"--mesh {path}: Mitsuba could not read it: {' '.join(str(error).split())[:300]}") from error
+    parameters = mi.traverse(loaded)
+    vertices = np.array(parameters["vertex_positions"], float).reshape(-1, 3)
+    faces = np.array(parameters["faces"], np.int64).reshape(-1, 3)
+    uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2)
+    given = np.array(parameters["vertex_normals"], float).reshape(-1, 3)
+    if not len(faces) or not np.isfinite(vertices).all() or not np.ptp(vertices, axis=0).max() > 0:
+        raise InputError(f"--mesh {path}: expected triangles with some extent and finite vertices")
+    return Mesh(vertices, faces, uv if len(uv) else None, given if len(given) else None)
+
+
+def ply(mesh: Mesh) -> bytes:
+    """The mesh as a binary PLY file with normals, and u and v where it has them."""
+    columns = [("xyz", mesh.vertices), (("nx", "ny", "nz"), normals(mesh) if mesh.normals is None else mesh.normals)]
+    columns += [] if mesh.uv is None else [("uv", mesh.uv)]
+    names = [name for group, _ in columns for name in group]
+    table = np.concatenate([values for _, values in columns], 1).astype("<f4")
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    lines += [f"property float {name}" for name in names]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(lines).encode() + table.tobytes() + faces.tobytes()

@@ -1,0 +1,162 @@
+"""Views and a mesh as a problem: a Mitsuba scene, its files, and TOML files for training and held-out views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import tomli_w
+
+from unrender.backend import variant
+from unrender.capture.mesh import Mesh, ply
+from unrender.capture.overlays import png
+from unrender.capture.silhouettes import Silhouettes
+from unrender.capture.views import CapturedView
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.exporting.ready_made import file_name
+
+__all__ = ["HELD_OUT", "PROBLEM", "to_world", "write"]
+
+PROBLEM, HELD_OUT, SCENE, MESH = "problem.toml", "held-out.toml", "scene.xml", "asset.ply"
+TEXTURE, LIGHT = "textures/base-colour.exr", "textures/light.exr"
+BASE_COLOUR_KEY, LIGHT_KEY = "asset.bsdf.base_color.data", "light.data"
+_LIGHT_SIZE = 16, 32
+_BASE_COLOUR, _ROUGHNESS = 0.4, 0.6
+_MAX_DEPTH = 3
+_WHOLE = 0.999
+_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""A camera's axes left, up, forwards, which are Mitsuba's, in those of `cameras`: right, up, backwards."""
+
+
+def write(folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, texture: int) -> None:
+    """Write the problem to an empty folder.
+
+    Args:
+        folder: exists.
+        name: of the problem.
+        views: of photographs.
+        mesh: with texture coordinates.
+        texture: texels along the sides of the base colour.
+
+    Raises:
+        InputError: a mask leaves no whole pixel.
+    """
+    stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
+    (folder / MESH).write_bytes(ply(mesh))
+    (folder / SCENE).write_bytes(_scene(views, stems, mesh))
+    for part in ("references", "masks", "textures"):
+        (folder / part).mkdir()
+    silhouettes = Silhouettes(mesh)
+    level = []
+    for view, stem in zip(views, stems, strict=True):
+        mask = _loss_mask(view, silhouettes)
+        level.append(float(view.values[mask].mean()))
+        _write_exr(view.values, folder / "references" / f"{stem}.exr", half=True)
+        (folder / "masks" / f"{stem}.png").write_bytes(png(np.repeat(mask[..., None], 3, 2)))
+    _write_exr(np.full((texture, texture, 3), _BASE_COLOUR, np.float32), folder / TEXTURE)
+    # Under an even light, a surface shows its base colour times the light's radiance.
+    radiance = max(float(np.median(level)) / _BASE_COLOUR, 1e-4)
+    _write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
+    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
+        chosen = [index for index, view in enumerate(views) if view.held_out == held_out]
+        if chosen:
+            (folder / file).write_text(_toml(name, [stems[i] for i in chosen], chosen, held_out), encoding="utf-8")
+
+
+def to_world(camera_to_world: np.ndarray) -> np.ndarray:
+    """The pose of a camera as `to_world` of Mitsuba's sensors, (4, 4)."""
+    return camera_to_world @ _FROM_MITSUBA
+
+
+def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
+    """Which pixels count: wholly covered by the object, the mesh and the photograph, and so are their eight neighbours."""
+    from scipy import ndimage
+
+    inside = (view.shown > _WHOLE) & silhouettes.mask(view.lens, view.camera_to_world)
+    if view.mask is not None:
+        inside &= view.mask > _WHOLE
+    found = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
+    found = found if found.any() else inside
+    if not found.any():
+        raise InputError(f"{printable(view.name)}: mesh and mask share no whole pixel; give a larger --resolution")
+    return found
+
+
+def _toml(name: str, stems: Sequence[str], sensors: Sequence[int], held_out: bool) -> str:
+    document: dict[str, Any] = {
+        "scene": SCENE,
+        "name": f"{name} (held out)"[:200] if held_out else name[:200],
+        "max_depth": _MAX_DEPTH,
+        "loss": "L1",
+        "parameters": [
+            {"key": BASE_COLOUR_KEY, "bounds": [0.0, 1.0]},
+            {"key": LIGHT_KEY, "bounds": [0.0, math.inf]},
+        ],
+        "views": [
+            {"reference": f"references/{stem}.exr", "sensor": sensor, "mask": f"masks/{stem}.png"}
+            for stem, sensor in zip(stems, sensors, strict=True)
+        ],
+    }
+    what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
+    return f"# {what} Written by `unrender import`.\n\n{tomli_w.dumps(document)}"
+
+
+def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh) -> bytes:
+    root = Xml.Element("scene", version="3.0.0")
+    corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
+    radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
+    for view, stem in zip(views, stems, strict=True):
+        distance = float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0)))
+        root.append(_sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius)))
+    shape = Xml.SubElement(root, "shape", type="ply", id="asset")
+    _value(shape, "string", "filename", MESH)
+    bsdf = Xml.SubElement(shape, "bsdf", type="principled")
+    texture = Xml.SubElement(bsdf, "texture", type="bitmap", name="base_color")
+    for key, value in (("filename", TEXTURE), ("format", "variant"), ("wrap_mode", "clamp")):
+        _value(texture, "string", key, value)
+    _value(bsdf, "float", "roughness", _ROUGHNESS)
+    light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    _value(light, "string", "filename", LIGHT)
+    Xml.indent(root)
+    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _sensor(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+    lens = view.lens
+    sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
+    _value(sensor, "string", "fov_axis", "x")
+    _value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
+    # Mitsuba moves the picture against the principal point, in units of its sides.
+    _value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
+    _value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
+    _value(sensor, "float", "near_clip", near)
+    _value(sensor, "float", "far_clip", far)
+    transform = Xml.SubElement(sensor, "transform", name="to_world")
+    numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
+    Xml.SubElement(transform, "matrix", value=numbers)
+    film = Xml.SubElement(sensor, "film", type="hdrfilm")
+    _value(film, "integer", "width", lens.width)
+    _value(film, "integer", "height", lens.height)
+    _value(film, "string", "pixel_format", "rgb")
+    Xml.SubElement(film, "rfilter", type="box")
+    return sensor
+
+
+def _value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
+    text = repr(value) if isinstance(value, float) else str(value)
+    Xml.SubElement(parent, kind, name=name, value=text)
+
+
+def _write_exr(values: np.ndarray, path: Path, half: bool = False) -> None:
+    import mitsuba as mi
+
+    with variant.two_threads():
+        bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
+        if half:
+            bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False)
+        bitmap.write(str(path))

@@ -1,0 +1,147 @@
+"""The views of a problem: photographs without distortion, their masks, and which of them are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.capture import pictures
+from unrender.capture.cameras import Lens
+from unrender.capture.capture import Capture, Photograph
+from unrender.capture.undistortion import Resampling, pinhole
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+
+__all__ = ["CapturedView", "prepare"]
+
+_EMPTY = 1e-4
+_FULL_BORDER = 0.5
+
+
+@dataclass(frozen=True)
+class CapturedView:
+    """One photograph, ready to be compared with a render.
+
+    Attributes:
+        name: of the photograph.
+        lens: a pinhole with square pixels.
+        camera_to_world: (4, 4), axes right, up, backwards.
+        values: (H, W, 3) float32, linear.
+        mask: (H, W) in [0, 1], which part of each pixel the object covers; None where there is no mask.
+        shown: (H, W) in [0, 1], which part of each pixel the photograph shows: less than 1 where undistorting leaves the picture.
+        held_out: whether it is for judging alone.
+    """
+
+    name: str
+    lens: Lens
+    camera_to_world: np.ndarray
+    values: np.ndarray
+    mask: np.ndarray | None
+    shown: np.ndarray
+    held_out: bool
+
+
+def prepare(
+    capture: Capture,
+    resolution: int,
+    scale: float | None,
+    hold_out: int | None,
+    progress: Callable[[int, int], None] = lambda done, count: None,
+) -> tuple[list[CapturedView], list[str]]:
+    """Read, undistort and check all photographs; only results of the chosen resolution are kept in memory.
+
+    Args:
+        capture: what the folder holds.
+        resolution: pixels along a view's longer side, at most.
+        scale: in place of `resolution`, a factor of each photograph's own, at most 1.
+        hold_out: every so many photographs one is held out, the first among them; 0 for none; None for the capture's own split, or 8.
+        progress: called with how many are done, and how many there are.
+
+    Returns:
+        The views in the capture's order, and notices.
+
+    Raises:
+        InputError: a photograph or mask cannot be read or does not fit its camera, some photographs have masks and others do not, or a mask
+            is empty or inverted.
+    """
+    if scale is not None and not 0 < scale <= 1:
+        raise InputError(f"--scale {scale:g}: expected more than 0 and at most 1")
+    held_out = _split(capture.photographs, hold_out)
+    views: list[CapturedView] = []
+    turned: list[str] = []
+    for index, photograph in enumerate(capture.photographs):
+        view, was_turned = _view(photograph, resolution, scale, held_out[index])
+        views.append(view)
+        turned += [photograph.name] if was_turned else []
+        progress(index + 1, len(capture.photographs))
+    without = [view.name for view in views if view.mask is None]
+    if without and len(without) < len(views):
+        raise InputError(f"{len(without)} of {len(views)} photographs have no mask, the first {printable(without[0])}")
+    _check_masks(views)
+    notices = []
+    if turned:
+        notices.append(f"{len(turned)} photographs turned upright as EXIF says, the first {printable(turned[0])}")
+    return views, notices
+
+
+def _split(photographs: Sequence[Photograph], every: int | None) -> list[bool]:
+    own = [photograph.held_out for photograph in photographs]
+    if every is None and any(own) and not all(own):
+        return [bool(held) for held in own]
+    every = 8 if every is None else every
+    if every == 1 or every < 0:
+        raise InputError(
+            f"--hold-out {every}: expected 0 for none, or at least 2: one of so many photographs is held out"
+        )
+    return [every > 0 and len(photographs) > every and index % every == 0 for index in range(len(photographs))]
+
+
+def _view(photograph: Photograph, resolution: int, scale: float | None, held_out: bool) -> tuple[CapturedView, bool]:
+    width, height, orientation = pictures.upright(photograph.file, photograph.lens)
+    lens = photograph.lens or Lens.of_field_of_view(photograph.field_of_view, width, height)
+    lens = lens.scaled(width, height)
+    longest = max(lens.width, lens.height)
+    target = pinhole(lens, min(1.0, resolution / longest) if scale is None else scale)
+    read = pictures.read(photograph.file, orientation)
+    if read.values.shape[:2] != (height, width):
+        have = f"{read.values.shape[1]} x {read.values.shape[0]}"
+        raise InputError(f"{photograph.file}: holds {have} pixels where its header says {width} x {height}")
+    values, shown = Resampling(lens, target).apply(read.values)
+    mask = None
+    if photograph.mask is not None:
+        mask = _mask(photograph, lens, target, orientation)
+    elif read.alpha is not None:
+        mask = Resampling(lens, target).apply(read.alpha[..., None])[0][..., 0]
+    view = CapturedView(photograph.name, target, photograph.camera_to_world, values, mask, shown, held_out)
+    return view, orientation != 1
+
+
+def _mask(photograph: Photograph, lens: Lens, target: Lens, orientation: int) -> np.ndarray:
+    assert photograph.mask is not None
+    values = pictures.read_mask(photograph.mask, 1)
+    height, width = values.shape
+    if orientation != 1 and abs(width / height - lens.width / lens.height) > 0.02 * lens.width / lens.height:
+        values = pictures.read_mask(photograph.mask, orientation)  # as the photograph is
+        height, width = values.shape
+    if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height, width, height):
+        has = f"{width} x {height} pixels, and its photograph {lens.width} x {lens.height}"
+        raise InputError(f"{photograph.mask}: {has}: other proportions")
+    return np.clip(Resampling(lens.scaled(width, height), target).apply(values[..., None])[0][..., 0], 0, 1)
+
+
+def _check_masks(views: Sequence[CapturedView]) -> None:
+    """Raise `InputError` for masks that are empty or inverted: the object touches more than half of the picture's edge."""
+    masked = [(view.name, view.mask) for view in views if view.mask is not None]
+    empty = [name for name, mask in masked if mask.mean() < _EMPTY]
+    if empty:
+        raise InputError(f"mask of {printable(empty[0])}: empty (black); {len(empty)} of {len(masked)} masks are so")
+    border = {name: np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).mean() for name, m in masked}
+    full = [name for name, share in border.items() if share > _FULL_BORDER]
+    if full:
+        many = f"{len(full)} of {len(masked)} masks are so"
+        what = (
+            f"white along {100 * border[full[0]]:.0f} % of the picture's edge: inverted? expected white on the object"
+        )
+        raise InputError(f"mask of {printable(full[0])}: {what}; {many}")

@@ -1,0 +1,107 @@
+"""`unrender import`: a folder of posed photographs as a problem."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.cli import arguments
+from unrender.cli.arguments import Overwrite, Variant
+from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    from unrender.capture.importing import Imported
+    from unrender.display.terminal import Console
+
+__all__ = ["import_"]
+
+
+def import_(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model or poses_bounds.npy.")
+    ],
+    mesh: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
+    ] = None,
+    masks: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="The problem folder. Default: a new one in out/.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and judge them.")
+    ] = False,
+    resolution: Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")] = 256,
+    scale: Annotated[
+        float | None, typer.Option(help="In place of --resolution: 0.5 for half as many pixels a side.")
+    ] = None,
+    hold_out: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. [default: own split, or 8]"),
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--format", help="transforms, colmap or llff, where several are there.")
+    ] = None,
+    axes: Annotated[
+        str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")
+    ] = None,
+    world_to_camera: Annotated[
+        bool | None,
+        typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
+    ] = None,
+    voxels: Annotated[int, typer.Option(min=16, max=512, help="Of the carved shape, along its longest side.")] = 96,
+    faces: Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")] = 10_000,
+    texture: Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the base colour.")] = 512,
+    overwrite: Overwrite = False,
+    variant: Variant = "auto",
+) -> None:
+    """Write a problem from posed photographs: scene, references without distortion, masks, a first shape, problem.toml and held-out.toml."""
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console = Console(highlight=False)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'not a folder' if folder.exists() else 'no such folder'}")
+    from unrender.capture import importing
+
+    options = importing.Options(
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture
+    )
+    mark = importing.SHEET
+    place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, mark)
+    refusal = ""
+    try:
+        with Progress(console):
+            arguments.use_variant(variant)
+            if check:
+                found, refusal = importing.check(folder, place, options)
+            else:
+                found = importing.import_capture(folder, place, options)
+    finally:
+        arguments.remove_if_empty(place)
+    _tell(console, found)
+    written = place / (mark if check else importing.PROBLEM)
+    console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
+    if refusal:
+        raise InputError(f"{folder}: {refusal}")
+    if not check:
+        console.print(f"to look at: {place / mark}", soft_wrap=True, markup=False)
+        console.print(f"next: unrender run {shlex.quote(str(written))} --seconds 60", soft_wrap=True, markup=False)
+
+
+def _tell(console: Console, found: Imported) -> None:
+    from statistics import mean
+
+    for notice in found.notices:
+        console.print(f"note: {notice}", soft_wrap=True, markup=False)
+    counts = f"{found.views} photographs and {found.held_out} held out"
+    console.print(
+        f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}; a mesh of {found.faces} faces", markup=False
+    )
+    if found.overlaps:
+        worst = min(found.overlaps)
+        console.print(
+            f"the mesh covers the masks with IoU {mean(found.overlaps):.3f}, {worst:.3f} at worst", markup=False
+        )
