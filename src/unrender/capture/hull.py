@@ -93,9 +93,8 @@ def _distance(view: CapturedView) -> np.ndarray:
 
     assert view.mask is not None
     inside = view.mask > 0.5
-    found = np.where(
-        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
-    )
+    within, beyond = (np.asarray(ndimage.distance_transform_edt(part)) for part in (inside, ~inside))
+    found = np.where(inside, within - 0.5, 0.5 - beyond)
     if inside.all():
         found = np.full(inside.shape, _UNKNOWN)
     edge = np.abs(found) <= 0.5

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from unrender.backend import variant
-from unrender.capture import atlas, flips, formats, hull, mesh as meshes, overlays, problem_folder
+from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder
+from unrender.capture import mesh as meshes
 from unrender.capture.capture import Capture
 from unrender.capture.conventions import reinterpreted
 from unrender.capture.mesh import Mesh

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -92,7 +93,7 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     # Single precision inside: about the middle, in units of the extent.
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
+    local: Any = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
     vertices, kept, *_ = fast_simplification.simplify(local, mesh.faces.astype(np.int32), target_count=faces)
     return Mesh(np.asarray(vertices, float) * extent + middle, np.asarray(kept, np.int64))
 

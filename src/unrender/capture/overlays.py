@@ -96,7 +96,7 @@ def _creases(normals: np.ndarray, distances: np.ndarray, inside: np.ndarray) -> 
 
 
 def _latin(text: str) -> str:
-    return printable(text).encode("latin-1", "replace").decode("latin-1")[:38]
+    return str(printable(text)).encode("latin-1", "replace").decode("latin-1")[:38]
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:

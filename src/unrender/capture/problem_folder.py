@@ -88,22 +88,24 @@ def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
 
 
 def _toml(name: str, stems: Sequence[str], sensors: Sequence[int], held_out: bool) -> str:
-    document: dict[str, Any] = {
+    head = {
         "scene": SCENE,
         "name": f"{name} (held out)"[:200] if held_out else name[:200],
         "max_depth": _MAX_DEPTH,
         "loss": "L1",
-        "parameters": [
-            {"key": BASE_COLOUR_KEY, "bounds": [0.0, 1.0]},
-            {"key": LIGHT_KEY, "bounds": [0.0, math.inf]},
-        ],
-        "views": [
-            {"reference": f"references/{stem}.exr", "sensor": sensor, "mask": f"masks/{stem}.png"}
-            for stem, sensor in zip(stems, sensors, strict=True)
-        ],
     }
+    tables: list[tuple[str, dict[str, Any]]] = [
+        ("parameters", {"key": BASE_COLOUR_KEY, "bounds": [0.0, 1.0]}),
+        ("parameters", {"key": LIGHT_KEY, "bounds": [0.0, math.inf]}),
+    ]
+    for stem, sensor in zip(stems, sensors, strict=True):
+        view = {"reference": f"references/{stem}.exr", "sensor": sensor, "mask": f"masks/{stem}.png"}
+        tables.append(("views", view))
     what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
-    return f"# {what} Written by `unrender import`.\n\n{tomli_w.dumps(document)}"
+    # A table under a heading of its own for each, as people write them; tomli_w would put them into one line each.
+    parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
+    parts += [f"[[{heading}]]\n{tomli_w.dumps(table)}" for heading, table in tables]
+    return "\n".join(parts)
 
 
 def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh) -> bytes:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from unrender.capture.cameras import Lens
-from unrender.capture.mesh import Mesh, ply
+from unrender.capture.mesh import Mesh
 from unrender.capture.views import CapturedView
 
 __all__ = ["Silhouettes", "overlap"]

@@ -1,7 +1,7 @@
 """Photographs as a pinhole camera with square pixels would have taken them, at a chosen resolution: what Mitsuba's `perspective` renders.
 
-Every pixel of the result is divided into n x n, n the pixels of the photograph along one of its sides; each part is looked up where the lens
-has it (bicubic), and the mean of the parts is taken, in linear values. Without distortion and by a whole factor that is the mean of the
+Every pixel of the result is divided into n x n, n the pixels of the photograph along one of its sides; each part is looked up where the
+lens has it (bicubic), and the mean of the parts is taken, in linear values. Without distortion and by a whole factor that is the mean of the
 photograph's own pixels.
 """
 

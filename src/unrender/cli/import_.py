@@ -57,7 +57,7 @@ def import_(
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
-    """Write a problem from posed photographs: scene, references without distortion, masks, a first shape, problem.toml and held-out.toml."""
+    """Write a problem from posed photographs: scene, undistorted references, masks, a first shape, problem.toml, held-out.toml."""
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 

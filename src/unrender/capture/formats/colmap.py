@@ -136,7 +136,8 @@ def _lens(model: str, width: int, height: int, parameters: Numbers, where: str) 
         raise InputError(f"{where}: {model} has {MODELS[model].count} parameters, got {len(parameters)}")
     pinhole, kind, distortion = MODELS[model].parts(parameters)
     try:
-        return Lens(width, height, *pinhole, kind, distortion)
+        fx, fy, cx, cy = pinhole
+        return Lens(width, height, fx, fy, cx, cy, kind, distortion)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 

@@ -37,8 +37,8 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
     """The mask of a photograph; None where there is none.
 
     Looked for in this order: in the folder `given`, and nowhere else where there is one; the file that the format names; beside the
-    photograph as NAME_mask.png; in a folder beside the photograph's that is called after it, as train_mask is after train; in masks or mask,
-    in `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own.
+    photograph as NAME_mask.png; in a folder that is called after the photograph's, as train_mask is after train; in masks or mask, in
+    `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own.
     """
     if given is not None:
         return _of_name(given, photograph)
