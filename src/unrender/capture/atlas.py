@@ -26,7 +26,9 @@ _COMMAND = (sys.executable, "-m", "unrender.capture.atlas")
 
 
 def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
-    """The mesh with texture coordinates: one atlas without overlaps, charts about 2 texels apart. Vertices on seams are doubled, normals kept.
+    """The mesh with texture coordinates: one atlas without overlaps, charts about 2 texels apart.
+
+    Vertices on seams are doubled, normals are kept.
 
     Args:
         mesh: at most 2^31 faces.

@@ -1,8 +1,8 @@
 """Cameras: a lens, and where points of the world fall in its picture.
 
 A camera's axes are x right, y up, z backwards (it looks along -z), right-handed, as in OpenGL. Positions in a picture are in pixels from
-its upper left corner, x to the right and y down, so that the middle of the first pixel is (0.5, 0.5). In coordinates x/z, y/z of a camera that
-looks along +z with y down, OpenCV's models of distortion apply.
+its upper left corner, x to the right and y down, so that the middle of the first pixel is (0.5, 0.5). In coordinates x/z, y/z of a camera
+that looks along +z with y down, OpenCV's models of distortion apply.
 """
 
 from __future__ import annotations

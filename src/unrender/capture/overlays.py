@@ -57,7 +57,7 @@ def contact_sheet(pictures: Sequence[np.ndarray], labels: Sequence[str]) -> byte
         small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
         left, top = place % columns * _CELL, place // columns * (_CELL + _LABEL) + _LABEL
         sheet.paste(small, (left + 2, top + _LABEL))
-        draw.text((left + 3, top + 1), _latin(labels[index]), fill=(220, 220, 220))
+        draw.text((left + 3, top + 1), _latin(labels[int(index)]), fill=(220, 220, 220))
     return _encoded(sheet)
 
 
@@ -96,7 +96,7 @@ def _creases(normals: np.ndarray, distances: np.ndarray, inside: np.ndarray) -> 
 
 
 def _latin(text: str) -> str:
-    return str(printable(text)).encode("latin-1", "replace").decode("latin-1")[:38]
+    return printable(text).encode("latin-1", "replace").decode("latin-1")[:38]
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from unrender.capture.cameras import Lens, opencv
 from unrender.core.errors import InputError
@@ -44,15 +48,12 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
 
     Raises `InputError` where the file is no picture, or too large a one.
     """
-    from PIL import Image, UnidentifiedImageError
-
     if path.suffix.lower() in _RAW:
         raise InputError(f"{path}: camera raw files are not read; develop them to .tif, .png or .exr, linear or sRGB")
     if (found := bounded_files.kind(path)) != "file":
         raise InputError(f"{path}: {'not a file' if found else 'no such file'}")
     try:
-        with Image.open(path) as picture:
-            _check_size(path, picture.width, picture.height)
+        with _opened(path) as picture:
             return picture.width, picture.height, int(picture.getexif().get(_ORIENTATION, 1))
     except UnidentifiedImageError:
         height, width = _by_mitsuba(path).values.shape[:2]  # OpenEXR, which Pillow does not know
@@ -147,6 +148,16 @@ def _decode(path: Path) -> np.ndarray | None:
     return _decode_pillow(path) if ending in _BY_PILLOW else None
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The file as Pillow sees it, whose header says no more than is read here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is as large
+        with Image.open(path) as picture:
+            _check_size(path, picture.width, picture.height)
+            yield picture
+
+
 def _is_16_bit(path: Path) -> bool:
     """Whether a PNG file has 16 bits a channel, which Pillow would cut to 8."""
     with bounded_files.open_regular(path) as file:
@@ -156,11 +167,8 @@ def _is_16_bit(path: Path) -> bool:
 
 def _decode_pillow(path: Path) -> np.ndarray:
     """(H, W, 3 or 4) uint8."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as picture:
-            _check_size(path, picture.width, picture.height)
+        with _opened(path) as picture:
             transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
             return np.array(picture.convert("RGBA" if transparent else "RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:

@@ -1,8 +1,8 @@
 """Photographs as a pinhole camera with square pixels would have taken them, at a chosen resolution: what Mitsuba's `perspective` renders.
 
 Every pixel of the result is divided into n x n, n the pixels of the photograph along one of its sides; each part is looked up where the
-lens has it (bicubic), and the mean of the parts is taken, in linear values. Without distortion and by a whole factor that is the mean of the
-photograph's own pixels.
+lens has it (bicubic), and the mean of the parts is taken, in linear values. Without distortion and by a whole factor that is the mean of
+the photograph's own pixels.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ __all__ = ["Resampling", "pinhole"]
 
 _MARGIN = 0.5
 """In pixels of the photograph: how far a position may lie outside the middle of its outermost pixels."""
+_SAMPLES = 4096
 _SIDE = 8192
 """OpenCV's `remap` takes pictures of less than 2^15 a side; larger results are made in parts."""
 
@@ -107,12 +108,25 @@ class Resampling:
         inside = (
             (x >= -_MARGIN) & (x <= source.width - 1 + _MARGIN) & (y >= -_MARGIN) & (y <= source.height - 1 + _MARGIN)
         )
-        return x, y, inside & _unfolded(x, y) if source.distorts else inside
+        if source.distorts:
+            column = (np.arange(size[0]) + 0.5) / n + columns.start
+            row = (np.arange(size[1]) + 0.5) / n + rows.start
+            radius = np.hypot((column - target.cx) / target.fx, ((row - target.cy) / target.fy)[:, None])
+            inside &= radius < _farthest(source, float(radius.max()))
+        return x, y, inside
 
 
-def _unfolded(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Where neighbours keep their order: a polynomial fitted to a lens turns back outside its picture, and shows it a second time there."""
-    if min(x.shape) < 2:
-        return np.ones(x.shape, bool)
-    determinant = np.gradient(x, axis=1) * np.gradient(y, axis=0) - np.gradient(x, axis=0) * np.gradient(y, axis=1)
-    return determinant > 0
+def _farthest(lens: Lens, within: float) -> float:
+    """The tangent of the angle to the axis, at most `within`, up to which a lens's picture grows with it.
+
+    A polynomial fitted to a lens turns back somewhere outside its picture, and would show the picture a second time there.
+    """
+    r = np.linspace(0, within, _SAMPLES)
+    k = [*lens.distortion, *[0.0] * 8]
+    if lens.model == FISHEYE:
+        angle = np.arctan(r)
+        image = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8)
+    else:
+        image = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6) / (1 + k[5] * r**2 + k[6] * r**4 + k[7] * r**6)
+    turns = np.flatnonzero(np.diff(image) <= 0)
+    return float(r[turns[0]]) if len(turns) else math.inf

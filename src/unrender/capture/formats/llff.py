@@ -1,8 +1,8 @@
 """LLFF's `poses_bounds.npy`: a row of 17 numbers for each picture of `images/`, in the order of their names.
 
 The first 15 are a matrix of 3 x 5: [R | t | (height, width, focal)]. R's columns are the camera's axes down, right, backwards in the
-world, t is its position; the focal length is in pixels of a picture of that height and width, of which the files may be smaller copies. Then
-nearest and farthest depth, which are not needed. The principal point is in the middle.
+world, t is its position; the focal length is in pixels of a picture of that height and width, of which the files may be smaller copies.
+Then nearest and farthest depth, which are not needed. The principal point is in the middle.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from unrender.capture.cameras import FISHEYE, Lens
 
-PARTS = 6
+PARTS = 4
 """Rays a side of a pixel."""
 # From Mitsuba's axes of a camera (left, up, forwards) to those of the formats.
 GL, CV = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -62,13 +62,18 @@ def look_at(azimuth: float, height: float, distance: float = 4.5) -> np.ndarray:
     return np.array(transform.matrix, float)
 
 
-def shots(file: Path, lens: Lens, count: int = 4, names: Sequence[str] = ()) -> list[Shot]:
-    """Pictures of the mesh in a file, from around it."""
-    scene: Any = mi.load_dict({"type": "scene", "mesh": {"type": file.suffix[1:], "filename": str(file)}})
+def shots(file: Path | None, lens: Lens, count: int = 4, names: Sequence[str] = ()) -> list[Shot]:
+    """Pictures of the mesh in a file, from around it; black ones without a file."""
+    scene: Any = (
+        None
+        if file is None
+        else mi.load_dict({"type": "scene", "mesh": {"type": file.suffix[1:], "filename": str(file)}})
+    )
     found = []
     for index in range(count):
         to_world = look_at(0.4 + 2 * np.pi * index / count, 0.9 * np.sin(1 + 2.3 * index))
-        picture, mask = _trace(scene, lens, to_world)
+        black = np.zeros((lens.height, lens.width, 3), np.float32)
+        picture, mask = (black, black[..., :1]) if scene is None else _trace(scene, lens, to_world)
         found.append(Shot(names[index] if names else f"view_{index}", to_world, picture, mask))
     return found
 
@@ -100,8 +105,12 @@ def _trace(scene: Any, lens: Lens, to_world: np.ndarray) -> tuple[np.ndarray, np
     wanted = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy], -1).reshape(-1, 2)
     normalised = wanted.copy()
     for _ in range(100):
-        normalised += wanted - distorted(lens, normalised)
-    assert np.abs(distorted(lens, normalised) - wanted).max() < 1e-9
+        residual = wanted - distorted(lens, normalised)
+        normalised += residual
+        if np.abs(residual).max() < 1e-7:
+            break
+    else:
+        raise AssertionError("the lens has no inverse in its picture")
     local = np.stack([-normalised[:, 0], -normalised[:, 1], np.ones(len(normalised))])
     directions = to_world[:3, :3] @ local
     directions /= np.linalg.norm(directions, axis=0)
