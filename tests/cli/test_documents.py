@@ -30,6 +30,7 @@ PAGES = [
 SLOW = {
     "README.md",
     "quickstart.md",
+    "photographs.md",
     "pixels.md",
     "own-loop.md",
     "own-estimator.md",

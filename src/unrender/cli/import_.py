@@ -19,41 +19,50 @@ if TYPE_CHECKING:
 __all__ = ["import_"]
 
 
+_Folder = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model or poses_bounds.npy.")
+]
+_Mesh = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
+]
+_Masks = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
+]
+_Check = Annotated[
+    bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and judge them.")
+]
+_Resolution = Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")]
+_Scale = Annotated[float | None, typer.Option(help="In place of --resolution: 0.5 for half as many pixels a side.")]
+_HoldOut = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
+]
+_Kind = Annotated[str | None, typer.Option("--format", help="transforms, colmap or llff, where several are there.")]
+_Axes = Annotated[str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")]
+_Direction = Annotated[
+    bool | None,
+    typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
+]
+_Voxels = Annotated[int, typer.Option(min=16, max=512, help="Of the carved shape, along its longest side.")]
+_Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
+_Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the base colour.")]
+
+
 def import_(
-    folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model or poses_bounds.npy.")
-    ],
-    mesh: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
-    ] = None,
-    masks: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
-    ] = None,
+    folder: _Folder,
+    mesh: _Mesh = None,
+    masks: _Masks = None,
     out: Annotated[Path | None, typer.Option(help="The problem folder. Default: a new one in out/.")] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and judge them.")
-    ] = False,
-    resolution: Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")] = 256,
-    scale: Annotated[
-        float | None, typer.Option(help="In place of --resolution: 0.5 for half as many pixels a side.")
-    ] = None,
-    hold_out: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. [default: own split, or 8]"),
-    ] = None,
-    kind: Annotated[
-        str | None, typer.Option("--format", help="transforms, colmap or llff, where several are there.")
-    ] = None,
-    axes: Annotated[
-        str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")
-    ] = None,
-    world_to_camera: Annotated[
-        bool | None,
-        typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
-    ] = None,
-    voxels: Annotated[int, typer.Option(min=16, max=512, help="Of the carved shape, along its longest side.")] = 96,
-    faces: Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")] = 10_000,
-    texture: Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the base colour.")] = 512,
+    check: _Check = False,
+    resolution: _Resolution = 256,
+    scale: _Scale = None,
+    hold_out: _HoldOut = None,
+    kind: _Kind = None,
+    axes: _Axes = None,
+    world_to_camera: _Direction = None,
+    voxels: _Voxels = 96,
+    faces: _Faces = 10_000,
+    texture: _Texture = 512,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
