@@ -70,7 +70,7 @@ def _seen(lens: Lens, local: np.ndarray) -> np.ndarray:
     return made.distorted(lens, -local[:, :2] / local[:, 2:3]) * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
-@pytest.mark.parametrize("name", quick(CASES, "instant-ngp, OpenCV", "LLFF"))
+@pytest.mark.parametrize("name", quick(CASES, "instant-ngp, OpenCV"))
 def test_the_imported_scene_renders_what_the_photographs_show(name: str, mesh: Path, tmp_path: Path) -> None:
     """Normals in place of colours: no noise of light. To a tenth of a pixel."""
     lens, write = CASES[name]
@@ -138,6 +138,7 @@ def test_the_layout_of_stanford_orb(mesh: Path, tmp_path: Path) -> None:
     _check_split(tmp_path, "orb", mesh)
 
 
+@pytest.mark.slow
 def test_the_layout_of_synthetic4relight(mesh: Path, tmp_path: Path) -> None:
     """train/NAME_rgb.exr and train/NAME_mask.png, test/NAME_rgba.png; frames are called train/NAME."""
     shots = made.shots(mesh, CENTRED)

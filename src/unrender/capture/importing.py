@@ -170,7 +170,7 @@ def _read(folder: Path, options: Options) -> _Read:
         except InputError as error:
             if str(error) != hull.EMPTY:
                 raise
-            raise InputError(f"{folder}: {error}; {flips.explain(capture, training, None, 0.0)}") from error
+            raise InputError(f"{folder}: {flips.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
         refusal = "" if mean >= flips.SUFFICIENT else flips.explain(capture, training, given, mean)
     return _Read(capture, views, mesh, silhouettes, overlaps, (*capture.notices, *notices), refusal)

@@ -113,7 +113,9 @@ def read(path: Path) -> Mesh:
     try:
         loaded = mi.load_dict({"type": path.suffix.lower()[1:], "filename": str(path)})
     except Exception as error:
-        raise InputError(f"--mesh {path}: Mitsuba could not read it: {' '.join(str(error).split())[:300]}") from error
+        raise InputError(
+            f"--mesh {path}: Mitsuba could not read it (has it faces?): {' '.join(str(error).split())[:300]}"
+        ) from error
     parameters = mi.traverse(loaded)
     vertices = np.array(parameters["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(parameters["faces"], np.int64).reshape(-1, 3)
