@@ -173,7 +173,10 @@ class AutoMethod(Options):
 
 
 def _unreachable(problem: Problem) -> str:
-    """Why there are no path gradients of the parameters; "" where there are."""
+    """Why path gradients of the parameters do not serve; "" where they do."""
+    known = problem.renderer.parameters()
+    if rigid := next((key for key in problem.shapes() if known[key].rigid), ""):
+        return f"parameter {rigid} moves a shape or sensor as a whole, with plateaus of the loss; --method plain has path gradients"
     try:
         problem.renderer.prepare(list(problem.shapes()), None)
     except InputError as error:

@@ -47,6 +47,7 @@ class ParameterInfo:
         highest: the largest, or None.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
+        rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
     """
 
@@ -59,6 +60,7 @@ class ParameterInfo:
     perturbable: bool = True
     compiled: bool = False
     resizable: bool = False
+    rigid: bool = False
 
 
 @dataclass(frozen=True)

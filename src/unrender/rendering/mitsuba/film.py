@@ -35,12 +35,14 @@ class RepeatingSampler:
         state, sequence = mi.sample_tea_32(seed, lane)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
 
-    def next_1d(self) -> Any:
-        """A uniform number per lane."""
+    def next_1d(self, active: Any = True) -> Any:
+        """A uniform number per lane, in lanes that are not active, too."""
+        del active
         return self.rng.next_float32()
 
-    def next_2d(self) -> Any:
+    def next_2d(self, active: Any = True) -> Any:
         """Two of them."""
+        del active
         first = self.rng.next_float32()
         return mi.Point2f(first, self.rng.next_float32())
 

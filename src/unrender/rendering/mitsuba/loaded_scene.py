@@ -18,6 +18,7 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
@@ -102,7 +103,10 @@ class LoadedScene:
             value = self.parameters[key]
             if _is_array(value):
                 self._own[key] = _reference(value)
+        self.poses = RigidMotions(self.scene, self._own)
+        self._own |= self.poses.loaded()
         self._settings: dict[str, _Setting] = {}
+        self._posed: dict[str, Any] = {}
         self._held: dict[str, Any] = {}  # as the scene has them after an update; a texture keeps a copy
         _registry.add(self)
 
@@ -133,18 +137,24 @@ class LoadedScene:
             if attached:
                 dr.enable_grad(leaf)
                 self.leaves[key] = leaf
-            self.parameters[key] = leaf
             self._settings[key] = _Setting(mi.TensorXf(value), attached)
-        if changed:
+            if key in self.poses:
+                self._posed[key] = leaf
+            else:
+                self.parameters[key] = leaf
+        if any(key in self.poses for key in changed):
+            self.poses.write(self.parameters, self._posed)
+        elif changed:
             self.parameters.update()
-            if self._shared:
-                self._held = {key: _reference(dr.detach(self.parameters[key])) for key in self._settings}
+        if changed and self._shared:
+            plain = [key for key in self._settings if key not in self.poses]
+            self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
 
     def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
         """Whether the parameter was set to this, and the scene still holds it."""
         if key not in self._settings or not self._settings[key].is_of(value, attached):
             return False
-        if not self._shared:
+        if not self._shared or key in self.poses:
             return True
         return key in self._held and _index(self.parameters[key]) == _index(self._held[key])
 
@@ -155,10 +165,13 @@ class LoadedScene:
             del self._settings[key]
             self._held.pop(key, None)
             self.leaves.pop(key, None)
-            self.parameters[key] = _reference(self._own[key])
+            self._posed.pop(key, None)
+            for name in self.poses.written(key):
+                self.parameters[name] = _reference(self._own[name])
         self.parameters.update()
         # A mesh whose vertices were set computes its normals anew, also where it was loaded with others.
-        normals = [name for name in map(normals_key, keys) if name in self._own and name not in self._settings]
+        written = [name for key in keys for name in self.poses.written(key)]
+        normals = [name for name in map(normals_key, written) if name in self._own and name not in self._settings]
         for name in normals:
             self.parameters[name] = _reference(self._own[name])
         if normals:

@@ -28,7 +28,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["Assembly", "Pose", "PoseKey", "PosedScene", "info", "keys", "matrices"]
+__all__ = ["Assembly", "Pose", "PoseKey", "PosedScene", "centres", "info", "keys", "matrices", "slots"]
 
 _AXES = ("x", "y", "z")
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+")
@@ -75,11 +75,13 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     return found
 
 
-def info(key: PoseKey) -> ParameterInfo:
-    """What the renderer says of a pose parameter."""
-    why = "it moves a shape or sensor as a whole, which path replay has no derivative of; SmoothedDerivatives has"
+def info(key: PoseKey, obstacle: str) -> ParameterInfo:
+    """What the renderer says of a pose parameter; `obstacle`: why path gradients do not serve, "" where they do."""
+    why = "it moves a shape as a whole"
+    if obstacle:
+        why = f"it moves a shape or sensor as a whole, and {obstacle}; SmoothedDerivatives has its derivative"
     low = 1e-3 if key.part == "scale" else None
-    return ParameterInfo(key.shape, differentiable=False, shares_paths=False, reason=why, lowest=low)
+    return ParameterInfo(key.shape, not obstacle, shares_paths=False, reason=why, lowest=low, rigid=True)
 
 
 class Pose:
@@ -109,12 +111,19 @@ class Pose:
         """Where a point goes."""
         return self.centre + self.translation + self.scale * (self.matrix @ (p - self.centre))  # pyright: ignore[reportOperatorIssue]
 
+    def transform(self) -> Any:
+        """As a matrix of homogeneous coordinates."""
+        linear = self.scale * self.matrix
+        shift = self.point(mi.Point3f(0))
+        rows = [[*(linear[row, column] for column in range(3)), shift[row]] for row in range(3)]
+        return mi.Transform4f(mi.Matrix4f(*rows[0], *rows[1], *rows[2], 0, 0, 0, 1))
+
 
 def _rotation(vector: Any) -> Any:
     """The matrix of a rotation vector (Rodrigues)."""
     square = dr.squared_norm(vector)
-    angle = dr.sqrt(square)
     small = square < 1e-8
+    angle = dr.sqrt(dr.select(small, 1, square))  # the root has no derivative at 0
     a = dr.select(small, 1 - square / 6, dr.sin(angle) / dr.select(small, 1, angle))
     b = dr.select(small, 0.5 - square / 24, (1 - dr.cos(angle)) / dr.select(small, 1, square))
     x, y, z = vector
@@ -137,7 +146,7 @@ class PosedScene:
     """
 
     def __init__(self, scene: Any, chosen: Mapping[str, PoseKey]):
-        self._slots = _slots(chosen)
+        self._slots = slots(chosen)
         targets = {key.target for key in chosen.values()}
         shapes = scene.shapes()
         posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
@@ -149,7 +158,7 @@ class PosedScene:
         sensors = [sensor if carried[sensor.id()] is None else carried[sensor.id()] for sensor in scene.sensors()]
         self.static = _scene([*(item for item in rest if item.id() not in carriers), *sensors])
         self.parts = {name: _scene([shape]) for name, shape in posed.items()}
-        self._centres = _centres(scene, targets)
+        self._centres = centres(scene, targets)
 
     def scenes(self) -> list[Any]:
         """All scenes, to hand to frozen kernels."""
@@ -237,9 +246,9 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
     known = keys(scene)
     found = {}
     chosen = {key: known[key] for key in parameters}
-    for target, centre in _centres(scene, {key.target for key in chosen.values()}).items():
+    for target, centre in centres(scene, {key.target for key in chosen.values()}).items():
         numbers = np.array([0, 0, 0, 0, 0, 0, 1.0])
-        for key, (owner, first, size) in _slots(chosen).items():
+        for key, (owner, first, size) in slots(chosen).items():
             if owner == target:
                 numbers[first : first + size] = np.reshape(parameters[key], -1)
         linear = numbers[6] * Rotation.from_rotvec(numbers[3:6]).as_matrix()
@@ -249,7 +258,7 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
     return found
 
 
-def _centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
+def centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
     """What each of the targets turns about, shapes before sensors."""
     found = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
     for sensor in scene.sensors():
@@ -259,10 +268,10 @@ def _centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
     return found
 
 
-def _slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
+def slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
     """{key: (target, first of the 7 numbers, how many)}."""
     taken: dict[tuple[str, int], str] = {}
-    slots: dict[str, tuple[str, int, int]] = {}
+    found: dict[str, tuple[str, int, int]] = {}
     for name, key in chosen.items():
         first = {"translation": 0, "rotation": 3, "scale": 6}[key.part] + (key.axis or 0)
         size = int(np.prod(key.shape))
@@ -270,8 +279,8 @@ def _slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
             if other := taken.get((key.target, slot)):
                 raise InputError(f"parameter {name}: {other} stands for the same coordinate")
             taken[key.target, slot] = name
-        slots[name] = (key.target, first, size)
-    return slots
+        found[name] = (key.target, first, size)
+    return found
 
 
 def _scene(objects: list[Any]) -> Any:

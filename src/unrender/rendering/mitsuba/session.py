@@ -14,6 +14,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -30,7 +31,7 @@ from unrender.rendering.mitsuba.passes import (
     PosesPass,
     TangentPass,
 )
-from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
+from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import Rendering, SampleRequest, Space
@@ -94,6 +95,12 @@ class MitsubaSession:
             raise InputError(
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
+        shapes = {moved_shape(pair.loaded(), key) for key in (*keys, *poses)} - {""} if derivatives else set()
+        self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
+        if derivatives and poses:
+            # Path gradients move the shapes of the scene itself.
+            slots(poses)
+            keys, poses, moving = [*keys, *poses], {}, next(iter(poses))
         self._pair, self._keys, self._poses, self._attached = pair, keys, poses, derivatives
         self._posed = PosedScene(pair.current, poses) if poses else None
         self._max_depth, self._sampler = max_depth, sampler
@@ -180,7 +187,7 @@ class MitsubaSession:
             return self.adjoint_pair(parameters, paths.previous, paths, weights, nothing)[0]
         self._set_parameters(parameters)
         self._run(AdjointPass(), paths.request, paths.radiance, weights)
-        return self._gradients()
+        return self._gradients(paths.request, weights)
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
@@ -192,9 +199,9 @@ class MitsubaSession:
         request = paths.request
         if paths.space == "primary":
             self._run(AdjointPass(), request, paths.radiance, weights)
-            gradient = self._gradients()
+            gradient = self._gradients(request, weights)
             self._run(AdjointPass(previous=True), request, paths.radiance_previous, weights_previous)
-            return gradient, self._gradients(previous=True)
+            return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self._run(AdjointPairPass(), request, *states)
         gradient = self._pair.loaded().gradients(), self._pair.loaded(previous=True).gradients()
@@ -209,8 +216,12 @@ class MitsubaSession:
         dr.eval(squares)
         return self._develop(squares, paths.request)[0]
 
-    def _gradients(self, previous: bool = False) -> Tree:
-        found = self._pair.loaded(previous).gradients()
+    def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
+        """Of the last adjoint pass, and of the borders of what is visible where shapes move."""
+        scene = self._pair.loaded(previous)
+        if self._boundary is not None:
+            self._boundary.accumulate(scene, request, weights)
+        found = scene.gradients()
         dr.eval(found)
         return found
 

@@ -1,0 +1,92 @@
+"""Rigid poses of meshes, written into the scene: what path gradients of the keys of `poses.py` are taken through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.poses import Pose, PoseKey
+
+__all__ = ["RigidMotions"]
+
+
+class RigidMotions:
+    """The pose parameters of a loaded scene's meshes.
+
+    Args:
+        scene: as loaded.
+        own: {key: value} of the parameters that Mitsuba has, as loaded. Kept, not copied.
+    """
+
+    def __init__(self, scene: Any, own: Mapping[str, Any]):
+        meshes = {shape.id() for shape in scene.shapes() if shape.is_mesh()}
+        self._own = own
+        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in meshes}
+        self._worlds = {
+            shape.id(): parameters["to_world"]
+            for shape in scene.shapes()
+            if shape.id() in meshes and "to_world" in (parameters := mi.traverse(shape))
+        }
+        self._centres = poses.centres(scene, {pose.target for pose in self._keys.values()})
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._keys
+
+    def key(self, key: str) -> PoseKey:
+        """What a key stands for."""
+        return self._keys[key]
+
+    def loaded(self) -> dict[str, Any]:
+        """{key: `mi.Float`}: the values at which nothing moves."""
+        return {key: mi.Float(pose.loaded().reshape(-1).tolist()) for key, pose in self._keys.items()}
+
+    def written(self, key: str) -> list[str]:
+        """The parameters of Mitsuba that a parameter is written to: itself, where it is one of them."""
+        if key not in self._keys:
+            return [key]
+        target = self._keys[key].target
+        names = (f"{target}.vertex_positions", f"{target}.to_world")
+        return [name for name in names if name in self._own]
+
+    def write(self, parameters: mi.SceneParameters, values: Mapping[str, Any]) -> None:
+        """Move the meshes, as derivatives of the poses or not, and update the scene.
+
+        Args:
+            parameters: of the scene.
+            values: {key: `mi.Float`} of all the poses that are set.
+        """
+        turned: dict[str, Any] = {}
+        for target, pose in self._poses(values).items():
+            positions = f"{target}.vertex_positions"
+            if positions not in self._own:
+                parameters[f"{target}.to_world"] = pose.transform() @ self._worlds[target]
+                continue
+            points = dr.unravel(mi.Point3f, self._own[positions])
+            parameters[positions] = dr.ravel(pose.point(points))
+            normals = f"{target}.vertex_normals"
+            if dr.width(self._own.get(normals, 0)) == dr.width(self._own[positions]):
+                turned[normals] = dr.ravel(pose.matrix @ dr.unravel(mi.Vector3f, self._own[normals]))
+        parameters.update()
+        # In a second update: Mitsuba computes normals anew whenever positions change.
+        for name, value in turned.items():
+            parameters[name] = value
+        if turned:
+            parameters.update()
+
+    def _poses(self, values: Mapping[str, Any]) -> dict[str, Pose]:
+        """{target: its pose}."""
+        found = {}
+        chosen = {key: self._keys[key] for key in values}
+        slots = poses.slots(chosen)
+        for target in {pose.target for pose in chosen.values()}:
+            numbers: list[Any] = [mi.Float(0)] * 6 + [mi.Float(1)]
+            for key, (owner, first, size) in slots.items():
+                if owner == target:
+                    for k in range(size):
+                        numbers[first + k] = dr.gather(mi.Float, values[key], k)
+            found[target] = Pose(self._centres[target], numbers[0:3], numbers[3:6], numbers[6])
+        return found
