@@ -26,6 +26,7 @@ __all__ = [
     "integer",
     "is_drjit",
     "is_finite",
+    "largest",
     "like",
     "like_integers",
     "log",
@@ -151,6 +152,11 @@ def concatenate(parts: list[Array]) -> Array:
     if len(parts) == 1:
         return parts[0]
     return dr.concat(parts, axis=0) if is_drjit(parts[0]) else np.concatenate(parts)
+
+
+def largest(x: Array) -> Array:
+    """The largest element, left lazy on Dr.Jit."""
+    return dr.max(x, axis=None) if is_drjit(x) else np.max(x)
 
 
 def total(x: Array) -> Array:

@@ -15,6 +15,7 @@ from unrender.core.registry import register
 from unrender.gallery import fields, mesh_files, meshes, parts, staging, textures
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
@@ -33,7 +34,7 @@ class SphereToMesh:
 
     Several views; the unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, from a sphere at the body's
     middle. Their truth is unknown: vertices may slide along the surface. What is hard is their number, that most of what pictures tell
-    of a shape is in its silhouette, which path gradients do not see, and that nothing keeps the mesh smooth.
+    of a shape is in its silhouettes and shadows, and that nothing keeps the mesh smooth but large steps (`strength`).
     """
 
     resolution: int = fields.resolution(48)
@@ -42,6 +43,7 @@ class SphereToMesh:
     mesh: str = mesh_files.option("PLY or OBJ file of the body, in place of the one made by code")
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(2, at_least=2)
+    strength: int = fields.integer(0, "λ of large steps (LargeSteps) on the mesh, 0 for none; 19 is usual", at_least=0)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
@@ -58,7 +60,8 @@ class SphereToMesh:
 
     def parameters(self) -> tuple[Parameter, ...]:
         """The vertices, where the sphere has them."""
-        return (Parameter("sphere.vertex_positions"),)
+        smooth = LargeSteps(float(self.strength)) if self.strength else None
+        return (Parameter("sphere.vertex_positions", preconditioner=smooth),)
 
     def problem(self, name: str) -> Problem:
         """The problem: the sphere's scene, and the body's pictures by Mitsuba's own `path` integrator."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from unrender.core import arrays, checks, trees
+from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -61,6 +62,8 @@ class Adam:
         beta_2: decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
+        uniform: whether all elements of a parameter share one rate: √v̂ is that of the element with the largest v̂ (Nicolet et al. 2021).
+            For vertices of a mesh with `preconditioners.LargeSteps`, whose steps stay as smooth as their gradients.
     """
 
     learning_rate: float = 0.01
@@ -68,12 +71,15 @@ class Adam:
     beta_2: float = 0.999
     epsilon: float = 1e-8
     schedule: Schedule | None = None
+    uniform: bool = False
 
     def __post_init__(self):
         rates.check("Adam", self.learning_rate, self.schedule)
         checks.number("Adam", "beta_1", self.beta_1, above=0.0, below=1.0, inclusive=True)
         checks.number("Adam", "beta_2", self.beta_2, above=0.0, below=1.0, inclusive=True)
         checks.number("Adam", "epsilon", self.epsilon, above=0.0)
+        if not isinstance(self.uniform, bool):
+            raise InputError(f"Adam: uniform must be true or false, got {self.uniform!r}")
 
     @property
     def requires(self) -> Capabilities:
@@ -97,7 +103,8 @@ class Adam:
 
         def step(key: str):
             rate = arrays.scalar(-state.learning_rates[key] * factor, first[key])
-            root = arrays.sqrt(second[key]) * arrays.scalar(debias, first[key])
+            square = arrays.largest(second[key]) if self.uniform else second[key]
+            root = arrays.sqrt(square) * arrays.scalar(debias, first[key])
             return rate * (first[key] / (root + self.epsilon))
 
         return {key: step(key) for key in first}, replace(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from unrender.core.arrays import Array
+from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Preconditioner"]
+__all__ = ["MeshPreconditioner", "Preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -21,4 +22,13 @@ class Preconditioner(Protocol):
 
     def apply(self, x: Array) -> Array:
         """S x, of the shape and kind of `x`."""
+        ...
+
+
+@runtime_checkable
+class MeshPreconditioner(Protocol):
+    """A preconditioner that suits vertex positions, once it knows their mesh."""
+
+    def on_mesh(self, topology: MeshTopology) -> Preconditioner:
+        """The same for the vertex positions (3 V,) of a mesh."""
         ...

@@ -17,7 +17,8 @@ from unrender.core.text import shorten
 from unrender.io import bounded_files, images, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
-from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import coarse_to_fine
 from unrender.problem.bounds import project
 from unrender.problem.coarse_to_fine import CoarseToFine
@@ -211,6 +212,8 @@ def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner
         return None
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
+    if info.mesh is not None and isinstance(preconditioner, MeshPreconditioner):
+        preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh()))
     try:
         preconditioner.check(parameter.key, info.shape)
     except InputError as error:

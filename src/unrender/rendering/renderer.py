@@ -7,7 +7,7 @@ own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -48,6 +48,7 @@ class ParameterInfo:
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
+        mesh: of vertex positions (3 V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
     """
 
@@ -61,6 +62,7 @@ class ParameterInfo:
     compiled: bool = False
     resizable: bool = False
     rigid: bool = False
+    mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -250,8 +251,20 @@ class ScenePair:
         if not traits.replayable:
             return ParameterInfo(shape, False, False, traits.reason, low, high)
         return ParameterInfo(
-            shape, True, traits.shares_paths, traits.reason, low, high, resizable=self._resizable(key, shape)
+            shape,
+            True,
+            traits.shares_paths,
+            traits.reason,
+            low,
+            high,
+            resizable=self._resizable(key, shape),
+            mesh=partial(self._mesh, key) if key.endswith(".vertex_positions") else None,
         )
+
+    def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
+        """The mesh whose vertex positions a parameter has, as loaded."""
+        faces = self.current_parameters[f"{key.rpartition('.')[0]}.faces"]
+        return self._current.value(key).numpy().reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
 
     def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
         """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
