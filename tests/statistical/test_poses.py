@@ -128,7 +128,9 @@ def test_what_poses_refuse() -> None:
     assert known["block.scale"].shape == ()
     with pytest.raises(ur.InputError, match=r"block\.rotation stands for the same coordinate"):
         renderer.prepare(["block.rotation", "block.rotation.y"], None, derivatives=False)
-    with pytest.raises(ur.InputError, match=r"cannot be recovered by path gradients.*SmoothedDerivatives"):
-        renderer.prepare(["block.rotation"], None)
+    assert known["block.rotation"].differentiable
+    for key, why in (("ball.rotation", "ball is no mesh"), ("sensor.translation", "do not move sensors")):
+        with pytest.raises(ur.InputError, match=rf"cannot be recovered by path gradients.*{why}.*SmoothedDerivatives"):
+            renderer.prepare([key], None)
     with pytest.raises(ur.InputError, match="cannot go with the pose"):
         renderer.prepare(["block.rotation", "sensor.x_fov"], None, derivatives=False)

@@ -96,6 +96,7 @@ class BoundaryTerm:
         for group in range(groups):
             mean += dr.gather(mi.Float, weights.array, lane + group * size)
         mean /= groups
+        dr.eval(mean)
         if request.pixels is None:
             return [(request.sensor, mi.TensorXf(mean, (*self._resolutions[request.sensor], 3)))]
         which = np.full(size // 3, request.sensor) if request.sensors is None else np.array(request.sensors)

@@ -14,11 +14,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["EdgePoints", "EdgeTable"]
+__all__ = ["EdgePoints", "EdgeTable", "MeshEdges", "edges_of"]
 
 
 @dataclass(frozen=True)
-class _MeshEdges:
+class MeshEdges:
     """Of one mesh: two ends, the third corner of two adjacent faces (E,), and whether the edge is one."""
 
     ends: np.ndarray
@@ -77,7 +77,7 @@ class EdgeTable:
         self.moving = 0
         for name in self._order:
             mesh = by_id[name]
-            found = _edges_of(mesh, (loaded or {}).get(name))
+            found = edges_of(mesh, (loaded or {}).get(name))
             parts.append((found, first))
             first += mesh.vertex_count()
             if name in moving:
@@ -107,7 +107,7 @@ class EdgeTable:
         return EdgePoints(start, end, dr.detach(third), dr.detach(other), always, crease)
 
 
-def _edges_of(mesh: Any, positions: np.ndarray | None) -> _MeshEdges:
+def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     """The edges of a mesh, each once."""
     points = np.array(mesh.vertex_positions_buffer() if positions is None else positions).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3).astype(np.int64)
@@ -131,4 +131,4 @@ def _edges_of(mesh: Any, positions: np.ndarray | None) -> _MeshEdges:
     flat = bool(mesh.has_face_normals())
     torn = (ends[first] != ends[second]).any(axis=1)
     thirds = np.stack([thirds[first], thirds[second]], axis=-1)
-    return _MeshEdges(ends[first], thirds, faces_at != 2, (torn | flat) & (faces_at > 1))
+    return MeshEdges(ends[first], thirds, faces_at != 2, (torn | flat) & (faces_at > 1))

@@ -64,6 +64,8 @@ class BoundaryIntegrator:
         with dr.resume_grad():
             positions = self._table.positions(scene)
         picture = _Picture(scene, sensor, weights, samples)
+        if self._table.moving == 0:
+            return mi.Float(0)
         found = self._primary(picture, positions, seed)
         if self._max_depth >= 2 and len(scene.emitters()) > 0:
             found += self._shadows(picture, positions, seed ^ 0x5BD1E995)
@@ -105,9 +107,7 @@ class BoundaryIntegrator:
             moved = picture.project_motion(dr.detach(point), uv, point)
             return picture.scale * dr.sum(scale * dr.dot(normal, moved))
 
-    def _picture_jump(
-        self, picture: _Picture, uv: Any, normal: Any, distance: Any, active: Any, seed: int
-    ) -> Any:
+    def _picture_jump(self, picture: _Picture, uv: Any, normal: Any, distance: Any, active: Any, seed: int) -> Any:
         """Radiance before an edge on the picture (against its normal) less radiance beyond it."""
         count = picture.samples
         number = dr.arange(mi.UInt32, 2 * count)
@@ -196,7 +196,9 @@ class BoundaryIntegrator:
                 total += dr.sum(weighted * dr.dot(segment.normal, point - ratio * eye.moved))
             return picture.scale * total
 
-    def _both_sides(self, scene: Any, segment: _BoundarySegment, eye: _EyePath, seed: int) -> tuple[list[Any], list[Any]]:
+    def _both_sides(
+        self, scene: Any, segment: _BoundarySegment, eye: _EyePath, seed: int
+    ) -> tuple[list[Any], list[Any]]:
         """Reflected radiance that arrives at x_a from the inner and from the outer side of an edge, and from what distances."""
         count = dr.width(segment.point)
         number = dr.arange(mi.UInt32, 2 * count)
@@ -224,9 +226,7 @@ class BoundaryIntegrator:
         """The radiance along rays that meet `si`, of which `depth` segments came before; the same random numbers after `period` lanes."""
         sampler = _sampler(seed, period, dr.width(ray.o))
         with dr.suspend_grad():
-            return self._radiance.sample(
-                dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si
-            )[0]
+            return self._radiance.sample(dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si)[0]
 
 
 class _Picture:
@@ -244,7 +244,6 @@ class _Picture:
                 sensor.world_transform().inverse().matrix
             )
         self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
-        self._clip = sensor.near_clip()
 
     def _row(self, number: int, v: Any, last: float) -> Any:
         row = self._rows[number]
@@ -283,9 +282,19 @@ class _BoundarySegment:
         self.valid = (self.length > 0) & (self.sine > 1e-6)
         across = across / dr.maximum(self.sine, 1e-20)
         self.normal = mi.Vector3f(dr.select(dr.dot(across, edge.third - point) > 0, -across, across))
-        shift = _OFFSET * (1 + dr.max(dr.abs(point)))
+        shift = self.shift = _OFFSET * (1 + dr.max(dr.abs(point)))
+        self._edge, self._along = edge, (end - start) / dr.maximum(self.length, 1e-20)
         self.outside = mi.Point3f(point + shift * self.normal)
         self.inside = mi.Point3f(point - shift * self.normal)
+
+    def is_behind(self, origin: Any) -> Any:
+        """Whether a point lies on one of the edge's own faces: those are in the way, where both look away."""
+        from_edge, found = origin - self.point, mi.Bool(False)
+        for third in (self._edge.third, self._edge.other_third):
+            normal = dr.cross(self._along, third - self.point)
+            height = dr.abs(dr.dot(normal, from_edge)) / dr.maximum(dr.norm(normal), 1e-20)
+            found |= height < 2 * self.shift
+        return found & (self._edge.crease | self._edge.always)
 
 
 class _EyePath:
@@ -306,7 +315,7 @@ class _EyePath:
             ray = mi.Ray3f(segment.outside, -segment.direction)
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            active = active & si.is_valid()
+            active = active & si.is_valid() & ~segment.is_behind(si.p)
             self.first = si
             self.bounces, probability = _geometric(sampler.next_1d(), most)
             walk = _walk(scene, si, sampler, self.bounces, most, active)
@@ -505,7 +514,15 @@ def _emitter_points(emitter: Any, seed: int, count: int) -> tuple[Any, ...]:
     pointer = dr.repeat(mi.EmitterPtr(emitter), count)
     if shape is not None:
         ps = shape.sample_position(0.0, sample)
-        return mi.Point3f(ps.p), mi.Normal3f(ps.n), mi.Vector3f(zero), ps.uv, ps.pdf + zero, mi.UInt32(zero) + _AREA, pointer
+        return (
+            mi.Point3f(ps.p),
+            mi.Normal3f(ps.n),
+            mi.Vector3f(zero),
+            ps.uv,
+            ps.pdf + zero,
+            mi.UInt32(zero) + _AREA,
+            pointer,
+        )
     ds, _ = emitter.sample_direction(it, sample)
     distant = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) or mi.has_flag(
         emitter.flags(), mi.EmitterFlags.DeltaDirection

@@ -1,0 +1,123 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false
+
+"""Path gradients of shapes as a user asks for them: what is refused, mini-batches, broken meshes, recovery by large steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from kernels import on_device, recorded
+
+import unrender as ur
+from unrender.gallery import meshes
+from unrender.methods.base import method
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+SIZE = 16
+KEY = "thing.vertex_positions"
+
+
+def scene(faces: np.ndarray | None = None, **more: Any) -> dict[str, Any]:
+    points, whole = meshes.icosphere(1)
+    thing = meshes.triangles("thing", 0.4 * points, whole if faces is None else faces, {"type": "diffuse"})
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    place = mi.ScalarTransform4f().look_at([0, 0.5, 3], [0, 0, 0], [0, 1, 0])
+    floor = mi.ScalarTransform4f().translate([0, -0.6, 0]).rotate([1, 0, 0], -90).scale(3)
+    return {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 30, "to_world": place, "film": film},
+        "light": {"type": "directional", "direction": [-0.3, -1, -0.5]},
+        "floor": {"type": "rectangle", "to_world": floor},
+        "thing": thing,
+    } | more
+
+
+def gradient(description: Any, key: str = KEY, request: SampleRequest | None = None) -> np.ndarray:
+    renderer = MitsubaRenderer(description, 2)
+    session, values = renderer.prepare([key], None), renderer.values([key])
+    rendering = session.image(values, request or SampleRequest(0, 16, 3))
+    return np.array(session.adjoint(values, rendering.paths, renderer.array(np.ones(rendering.images.shape)))[key])
+
+
+@pytest.mark.parametrize(
+    ("more", "key", "message"),
+    [
+        ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors, and camera is another"),
+        ({"camera": {"type": "orthographic"}}, "thing.rotation", r"limited to perspective sensors"),
+        ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is no mesh \(Sphere\)"),
+        ({}, "camera.translation", "do not move sensors"),
+        ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
+        ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not move emitters"),
+    ],
+)
+def test_what_has_no_boundary_is_refused_in_one_line(more: dict[str, Any], key: str, message: str) -> None:
+    renderer = MitsubaRenderer(lambda: scene(**more), 2)
+    with pytest.raises(ur.InputError, match=message) as caught:
+        renderer.prepare([key], None)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"parameter {key}: it cannot be recovered by path gradients, since")
+
+
+def test_where_there_is_no_boundary_auto_is_smoothed_and_says_why() -> None:
+    reference = np.full((SIZE, SIZE, 3), 0.2, np.float32)
+    ball = {"type": "sphere", "radius": 0.1}
+    for key, why in (("ball.translation", "plateaus"), ("thing.translation", "--method plain has path gradients")):
+        problem = ur.Problem(lambda: scene(ball=ball), [ur.Parameter(key)], [ur.View(reference)], max_depth=2)
+        choice = method("auto").choose(problem)
+        assert isinstance(choice.estimator, ur.SmoothedDerivatives)
+        assert why in choice.reasons[0]
+
+
+@pytest.mark.parametrize("broken", ["open", "fin", "slivers"])
+def test_broken_meshes_have_finite_gradients(broken: str) -> None:
+    _, faces = meshes.icosphere(1)
+    faces = {
+        "open": faces[:-7],
+        "fin": np.concatenate([faces, [[faces[0, 0], faces[0, 1], 30]]]),
+        "slivers": np.concatenate([faces, [[3, 3, 4], [5, 6, 5]]]),
+    }[broken]
+    found = gradient(lambda: scene(faces))
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() > 0
+
+
+def test_slivers_change_nothing() -> None:
+    _, faces = meshes.icosphere(1)
+    with_slivers = gradient(lambda: scene(np.concatenate([faces, [[3, 3, 4], [5, 6, 5]]])))
+    np.testing.assert_allclose(with_slivers, gradient(lambda: scene(faces)), rtol=1e-3, atol=1e-3)
+
+
+def test_a_mini_batch_of_all_pixels_is_the_whole_view() -> None:
+    """The boundary's numbers are the same where pixels are drawn: the same gradient, but for the order of sums."""
+    every = SampleRequest(0, 16, 3, pixels=mi.UInt32(np.arange(SIZE * SIZE)))
+    whole, batch = gradient(scene), gradient(scene, request=every)
+    np.testing.assert_allclose(batch, whole, rtol=1e-3, atol=1e-3 * np.abs(whole).max())
+    none = gradient(scene, request=SampleRequest(0, 16, 3, pixels=mi.UInt32([0, 1])))
+    assert np.abs(none).max() < 0.2 * np.abs(whole).max()
+
+
+def test_steps_compile_nothing_new() -> None:
+    renderer = MitsubaRenderer(scene, 3)
+    session = renderer.prepare([KEY], None)
+    start, weights = np.array(renderer.values([KEY])[KEY]), renderer.array(np.ones((1, SIZE, SIZE, 3)))
+    for step in range(5):
+        values = {KEY: on_device(start * (1 + 0.01 * step))}
+        with recorded() as found:
+            session.adjoint(values, session.image(values, SampleRequest(0, 4, step)).paths, weights)
+        if step >= 3:
+            assert not any(found), f"{sum(found)} new kernels at step {step}"
+
+
+@pytest.mark.slow
+def test_a_sphere_becomes_the_body_by_large_steps() -> None:
+    """And not without the borders of what is visible."""
+    options = {"resolution": 24, "views": 3, "subdivisions": 2, "reference_spp": 64, "strength": 10}
+    problem = ur.gallery.problem("sphere-to-mesh", **options)
+    result = ur.optimize(problem, ur.PathGradient(spp=8), ur.optimizers.Adam(0.03, uniform=True), steps=25)
+    assert result.history[-1]["loss"] < 0.5 * result.history[0]["loss"]
+    assert result.skipped == 0

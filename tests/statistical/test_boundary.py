@@ -1,0 +1,123 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+
+"""Path gradients of moving meshes, boundaries included, against finite differences of renders with the geometry moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unrender.gallery import meshes
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+SIZE, RUNS, STEP = 20, 8, 0.01
+LIMIT = 4.5
+"""Of a score with the noise measured in 8 runs each: one in 2000 or so."""
+
+
+def weights() -> np.ndarray:
+    """Of the pixels: different everywhere, so that no motion cancels."""
+    noise = np.random.default_rng(0).uniform(0.5, 1.5, (SIZE, SIZE, 3))
+    return noise * np.linspace(0, 1, SIZE)[None, :, None] * np.linspace(1, 0.2, SIZE)[:, None, None]
+
+
+def room(**more: Any) -> dict[str, Any]:
+    """A Cornell box with other things in it."""
+    described = mi.cornell_box()
+    del described["small-box"], described["large-box"]
+    described["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    return described | more
+
+
+def block() -> dict[str, Any]:
+    place = mi.ScalarTransform4f().translate([0.1, -0.4, 0.1]).rotate([1, 1, 0], 40).scale(0.25)
+    return room(moving={"type": "cube", "to_world": place, "bsdf": {"type": "diffuse"}})
+
+
+def receiver() -> dict[str, Any]:
+    """What moves receives the shadow of a ball that stands still, and casts one."""
+    place = mi.ScalarTransform4f().translate([0.0, -0.6, 0.3]).rotate([1, 0, 0], -90).scale(0.5)
+    plate = {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided", "inner": {"type": "diffuse"}}}
+    points, faces = meshes.icosphere(3)
+    ball = meshes.triangles("ball", 0.25 * points + np.array([0, -0.1, 0.2]), faces, {"type": "diffuse"})
+    return room(moving=plate, ball=ball)
+
+
+def smooth() -> dict[str, Any]:
+    """A smooth ball between a sun, a lamp at a point, and open air: a delta emitter's shadow has a border, too."""
+    points, faces = meshes.icosphere(4)
+    ball = meshes.triangles("moving", 0.3 * points + np.array([0, -0.3, 0.1]), faces, {"type": "diffuse"})
+    described = room(
+        moving=ball,
+        sun={"type": "directional", "direction": [-0.5, -1, -0.3], "irradiance": {"type": "rgb", "value": 3.0}},
+        lamp={"type": "point", "position": [0.5, 0.9, 0.5], "intensity": {"type": "rgb", "value": 0.5}},
+    )
+    for name in ("light", "ceiling", "red-wall", "back"):
+        del described[name]
+    return described
+
+
+def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool = True) -> np.ndarray:
+    """(RUNS, n)."""
+    renderer = MitsubaRenderer(description, depth)
+    session = renderer.prepare([key], None)
+    if not boundary:
+        session._boundary = None
+    values, weight = renderer.values([key]), renderer.array(weights()[None])
+    found = []
+    for run in range(RUNS):
+        paths = session.image(values, SampleRequest(0, spp, run, groups=1)).paths
+        found.append(np.array(session.adjoint(values, paths, weight)[key]).reshape(-1))
+    return np.stack(found).astype(float)
+
+
+def differences(description: Any, key: str, depth: int, spp: int) -> np.ndarray:
+    """(RUNS, n), central, with the same random numbers on both sides."""
+    renderer = MitsubaRenderer(description, depth)
+    session = renderer.prepare([key], None, derivatives=False)
+    loaded = np.array(renderer.values([key])[key])
+    steps = np.eye(max(loaded.size, 1)) * STEP
+    states = np.concatenate([loaded + steps.reshape(-1, *loaded.shape), loaded - steps.reshape(-1, *loaded.shape)])
+    found = []
+    for run in range(RUNS):
+        images = np.array(session.image_batch({key: states}, SampleRequest(0, spp, 500 + run))).astype(float)
+        sums = (images * weights()).sum(axis=(1, 2, 3))
+        found.append((sums[: len(steps)] - sums[len(steps) :]) / (2 * STEP))
+    return np.stack(found)
+
+
+def scores(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    error = np.sqrt(a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b))
+    return (a.mean(axis=0) - b.mean(axis=0)) / error
+
+
+def test_the_pose_of_a_block_and_its_planted_faults() -> None:
+    """Without the boundary, or with nine tenths of it, the test fails."""
+    expected = differences(block, "moving.translation.z", 2, 256)
+    found = gradients(block, "moving.translation.z", 2, 48)
+    interior = gradients(block, "moving.translation.z", 2, 48, boundary=False)
+    assert np.abs(scores(found, expected)).max() < LIMIT
+    assert np.abs(scores(interior, expected)).max() > 8
+    assert np.abs(scores(interior + 0.85 * (found - interior), expected)).max() > LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("description", "key", "depth"),
+    [
+        (block, "moving.rotation.x", 2),
+        (block, "moving.scale", 3),
+        (block, "moving.translation.y", 4),
+        (block, "moving.translation.z", 6),
+        (receiver, "moving.translation.y", 2),
+        (smooth, "moving.translation.y", 2),
+    ],
+)
+def test_poses_at_several_depths(description: Any, key: str, depth: int) -> None:
+    found, expected = gradients(description, key, depth, 48), differences(description, key, depth, 256)
+    assert np.abs(scores(found, expected)).max() < LIMIT, (found.mean(axis=0), expected.mean(axis=0))
