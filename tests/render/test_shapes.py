@@ -10,9 +10,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from kernels import on_device, recorded
 
 import unrender as ur
+from kernels import on_device, recorded
 from unrender.gallery import meshes
 from unrender.methods.base import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer

@@ -22,12 +22,12 @@ class AdamOptions(Options):
     beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="Adam's decay of the mean gradient")
     beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="Adam's decay of the mean squared gradient")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)
-    uniform: bool = Field(False, description="whether all elements of a parameter share one rate, as suits vertices")
+    one_rate: bool = Field(False, description="whether all elements of a parameter share one rate, as suits vertices")
 
     def optimizer(self) -> Optimizer:
         """Adam with these options."""
         schedule = parse_schedule(self.schedule)
-        return Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.uniform)
+        return Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.one_rate)
 
 
 class PathOptions(AdamOptions):

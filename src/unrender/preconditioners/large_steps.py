@@ -26,7 +26,8 @@ class LargeSteps:
     its eigenvalues lie in [1/(1 + 4 d λ), 1] on d axes.
 
     Suits textures (H, W, C), grids (Z, Y, X, C) and the vertex positions (3 V,) of meshes, which go with `Adam(uniform=True)` as in the
-    paper: one rate for all vertices keeps smooth steps smooth. Vertices of a mesh at the same place move as one. The result is computed on the host in float32 and has the
+    paper: one rate for all vertices keeps smooth steps smooth. Vertices of a mesh at the same place move as one. The result
+    is computed on the host in float32 and has the
     argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU.
 
     Args:

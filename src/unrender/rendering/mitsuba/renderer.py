@@ -31,8 +31,8 @@ class MitsubaRenderer:
         max_depth: longest path in segments, >= 1.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
-    vertex positions (3 V,). Geometry moves only through Mitsuba's `prb` kernel, whose gradient leaves out visibility. Poses of
-    whole shapes and sensors, see `poses.py`, have no path gradient at all.
+    vertex positions (3 V,). Geometry moves through Mitsuba's `prb` kernel, whose gradient leaves out visibility; where meshes move, by
+    their vertices or as a whole (`poses.py`), `boundary_term.py` adds it. Poses of sensors and other shapes have no path gradient.
 
     Attributes:
         notices: one line for each setting of the scene that is not used.

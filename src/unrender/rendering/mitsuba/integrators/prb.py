@@ -16,7 +16,7 @@ __all__ = ["PrbKernel"]
 
 class PrbKernel:
     """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.
-    Visibility is left out, so those gradients are biased."""
+    Visibility is left out; `BoundaryIntegrator` has it, of meshes."""
 
     def __init__(self, max_depth: int):
         self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth})

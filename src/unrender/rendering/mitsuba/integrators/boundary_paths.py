@@ -1,0 +1,181 @@
+"""Paths through an edge of a mesh: the sensor's picture, the segment that touches the edge, and the way from it to the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.edges import EdgePoints
+
+__all__ = ["OFFSET", "BoundarySegment", "EyePath", "Picture"]
+
+OFFSET = 1e-4
+"""To the two sides of an edge: of the picture's side or, in space, of 1 + the largest coordinate."""
+
+
+class Picture:
+    """A perspective sensor's film, and the weights of its pixels."""
+
+    def __init__(self, scene: Any, sensor: Any, weights: Any, samples: int):
+        size = sensor.film().crop_size()
+        self.scene, self.sensor, self.samples = scene, sensor, samples
+        self.width, self.height = int(size[0]), int(size[1])
+        self.size = mi.Vector2f(self.width, self.height)
+        self.scale = self.width * self.height / samples
+        self._weights = weights.array
+        with dr.suspend_grad():
+            matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
+                sensor.world_transform().inverse().matrix
+            )
+        self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
+
+    def _row(self, number: int, v: Any, last: float) -> Any:
+        row = self._rows[number]
+        return row.x * v.x + row.y * v.y + row.z * v.z + row.w * last
+
+    def project(self, point: Any) -> tuple[Any, Any]:
+        """Where points are on the film, from 0 to 1, and how far in front."""
+        p = dr.detach(point)
+        w = self._row(3, p, 1.0)
+        return mi.Point2f(self._row(0, p, 1.0), self._row(1, p, 1.0)) / w, w
+
+    def project_motion(self, point: Any, uv: Any, motion: Any) -> Any:
+        """The motion on the film of points at `uv` that move in space."""
+        w = self._row(3, dr.detach(point), 1.0)
+        x, y, change = (self._row(number, motion, 0.0) for number in (0, 1, 3))
+        return mi.Vector2f(x - uv.x * change, y - uv.y * change) / w
+
+    def weighted(self, value: Any, position: Any, active: Any) -> Any:
+        """Σ over channels of value times weight of the pixel at `position`, in pixels."""
+        x = dr.clip(mi.Int32(dr.floor(position.x)), 0, self.width - 1)
+        y = dr.clip(mi.Int32(dr.floor(position.y)), 0, self.height - 1)
+        index = mi.UInt32(y * self.width + x) * 3
+        parts = [value[c] * dr.gather(mi.Float, self._weights, index + c, active) for c in range(3)]
+        return parts[0] + parts[1] + parts[2]
+
+
+class BoundarySegment:
+    """A direction through an edge point; its normal points away from the first face. All detached."""
+
+    def __init__(self, edge: EdgePoints, point: Any, direction: Any):
+        start, end = dr.detach(edge.start), dr.detach(edge.end)
+        self.point, self.direction = point, direction
+        self.length = dr.norm(end - start)
+        across = dr.cross(direction, (end - start) / dr.maximum(self.length, 1e-20))
+        self.sine = dr.norm(across)
+        self.valid = (self.length > 0) & (self.sine > 1e-6)
+        across = across / dr.maximum(self.sine, 1e-20)
+        self.normal = mi.Vector3f(dr.select(dr.dot(across, edge.third - point) > 0, -across, across))
+        shift = self.shift = OFFSET * (1 + dr.max(dr.abs(point)))
+        self._edge, self._along = edge, (end - start) / dr.maximum(self.length, 1e-20)
+        self.outside = mi.Point3f(point + shift * self.normal)
+        self.inside = mi.Point3f(point - shift * self.normal)
+
+    def is_behind(self, origin: Any) -> Any:
+        """Whether a point lies on one of the edge's own faces: those are in the way, where both look away."""
+        from_edge, found = origin - self.point, mi.Bool(False)
+        for third in (self._edge.third, self._edge.other_third):
+            normal = dr.cross(self._along, third - self.point)
+            height = dr.abs(dr.dot(normal, from_edge)) / dr.maximum(dr.norm(normal), 1e-20)
+            found |= height < 2 * self.shift
+        return found & (self._edge.crease | self._edge.always)
+
+
+class EyePath:
+    """From x_a, behind an edge point, to the sensor, with a random number of vertices between.
+
+    Attributes:
+        first: x_a, `mi.SurfaceInteraction3f`.
+        moved: x_a as a ray that comes from the sensor's side meets it; attached.
+        throughput: importance over density.
+        position: on the film in pixels.
+        bounces: of it, and hence segments before x_a, less one.
+        active: whether it got there.
+    """
+
+    def __init__(self, picture: Picture, segment: BoundarySegment, sampler: Any, most: int, active: Any):
+        scene = picture.scene
+        with dr.suspend_grad():
+            ray = mi.Ray3f(segment.outside, -segment.direction)
+            pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            active = active & si.is_valid() & ~segment.is_behind(si.p)
+            self.first = si
+            self.bounces, probability = _geometric(sampler.next_1d(), most)
+            walk = _walk(scene, si, sampler, self.bounces, most, active)
+            ds, importance = picture.sensor.sample_direction(walk.si, mi.Point2f(0.5), walk.active)
+            active = walk.active & (ds.pdf > 0) & dr.any(importance > 0)
+            active &= ~scene.ray_test(walk.si.spawn_ray_to(ds.p), active)
+            wo = walk.si.to_local(ds.d)
+            bsdf = walk.si.bsdf()
+            value = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), walk.si, wo, active)
+            value *= _geometric_cosines(walk.si, wo, ds.d)
+            self.throughput = dr.select(active, walk.β * value * importance / (ds.pdf * probability), 0)
+            self.position, self.active = ds.uv, active & dr.any(self.throughput != 0)
+            outgoing = dr.select(self.bounces == 0, ds.d, walk.first_direction)
+            back = mi.Ray3f(si.p + outgoing, -outgoing)
+        with dr.resume_grad():
+            self.moved = pi.compute_surface_interaction(back, mi.RayFlags.Minimal, self.active).p
+
+
+@dataclass
+class _Walk:
+    """Loop state of `_walk`."""
+
+    si: mi.SurfaceInteraction3f
+    β: mi.Spectrum
+    first_direction: mi.Vector3f
+    made: mi.UInt32
+    active: mi.Bool
+
+
+def _walk(scene: Any, si: Any, sampler: Any, bounces: Any, most: int, active: Any) -> _Walk:
+    """Scatter importance at x_a and further vertices, `bounces` times."""
+    state = _Walk(si, mi.Spectrum(1), mi.Vector3f(0, 0, 1), mi.UInt32(0), active)
+    if most <= 0:
+        return state
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+
+    def going(state: _Walk, sampler: Any) -> Any:
+        return state.active & (state.made < bounces)
+
+    def bounce(state: _Walk, sampler: Any) -> tuple[_Walk, Any]:
+        si, active = state.si, state.active
+        bs, weight = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), active)  # pyright: ignore[reportArgumentType]
+        direction = si.to_world(bs.wo)
+        β = state.β * weight * _geometric_cosines(si, bs.wo, direction)
+        following = scene.ray_intersect(si.spawn_ray(direction), mi.RayFlags.All, coherent=False, active=active)
+        first = dr.select(state.made == 0, direction, state.first_direction)
+        active &= following.is_valid() & dr.any(β != 0)
+        return _Walk(following, β, first, state.made + 1, active), sampler
+
+    found, _ = dr.while_loop((state, sampler), going, bounce, label="eye path")  # pyright: ignore[reportArgumentType, reportAssignmentType]
+    # Those that ended before they had made all bounces are inactive; the others stopped with `active` as it was.
+    found.active &= found.made == bounces
+    return found
+
+
+def _geometric_cosines(si: Any, wo: Any, direction: Any) -> Any:
+    """What makes a BSDF's value, times the cosine of the shading normal to where importance goes, the same of radiance (Veach 1997,
+    section 5.3)."""
+    incoming = dr.dot(si.n, si.to_world(si.wi))
+    below = incoming * mi.Frame3f.cos_theta(wo)
+    above = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
+    return dr.select(dr.abs(below) > 1e-12, dr.abs(above / below), 0)
+
+
+def _geometric(sample: Any, most: int) -> tuple[Any, Any]:
+    """A number from 0 to `most` of which each is half as probable as the one before, the last two alike; and its probability."""
+    number, probability, reached = mi.UInt32(0), mi.Float(1), mi.Float(0)
+    if most <= 0:
+        return number, probability
+    probability = mi.Float(0.5)
+    for step in range(1, most + 1):
+        reached += 0.5**step
+        beyond = sample >= reached
+        number = dr.select(beyond, step, number)
+        probability = dr.select(beyond, 0.5 ** min(step + 1, most), probability)
+    return mi.UInt32(number), probability

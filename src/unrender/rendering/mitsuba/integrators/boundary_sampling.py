@@ -1,0 +1,177 @@
+"""What boundary derivatives are sampled by: edges by weight, directions in which an edge is a silhouette, points on emitters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.edges import EdgePoints
+from unrender.rendering.mitsuba.film import RepeatingSampler
+
+__all__ = ["EmitterPoints", "SilhouetteWedge", "WeightedChoice", "coplanar", "lane_sampler"]
+
+_AREA, _POINT, _DISTANT = 0, 1, 2
+"""Kinds of emitters: with a surface, at a point, and those that only have a direction."""
+
+
+class WeightedChoice:
+    """A number by its weight; the probability is 0 where no weight is positive."""
+
+    def __init__(self, weights: Any):
+        self._weights = dr.select(dr.isfinite(weights), weights, 0)
+        dr.eval(self._weights)
+        self._sums = dr.cumsum(self._weights)
+        self._count = dr.width(self._weights)
+        self._total = dr.gather(mi.Float, self._sums, self._count - 1)
+
+    def draw(self, sample: Any) -> tuple[Any, Any]:
+        """Numbers and their probabilities. `sample` is stratified over the lanes."""
+        lanes = dr.width(sample)
+        u = (dr.arange(mi.Float, lanes) + sample) / lanes * self._total
+        index = dr.binary_search(0, self._count - 1, lambda i: dr.gather(mi.Float, self._sums, i) <= u)
+        pmf = dr.gather(mi.Float, self._weights, index) / dr.maximum(self._total, 1e-30)
+        return index, pmf
+
+
+class SilhouetteWedge:
+    """Directions in which an edge is a silhouette: of all directions around it, 4 `angle`; all where shading jumps at it."""
+
+    def __init__(self, edge: EdgePoints):
+        start, end = dr.detach(edge.start), dr.detach(edge.end)
+        self._tangent = dr.normalize(end - start)
+        one, other = (self._across(third - start) for third in (edge.third, edge.other_third))
+        cosine = dr.clip(dr.dot(one, other), -1, 1)
+        everywhere = edge.always | (edge.crease & ~coplanar(edge))
+        self.angle = dr.select(everywhere, dr.pi, dr.pi - dr.safe_acos(cosine))
+        self.angle = dr.select(self.angle > 1e-4, self.angle, 0)
+        beyond = other - cosine * one
+        size = dr.norm(beyond)
+        beyond = dr.select(size > 1e-6, beyond / dr.maximum(size, 1e-20), dr.cross(self._tangent, one))
+        # From the second face's plane, away from the first.
+        self._begin = dr.select(everywhere, 0, dr.safe_acos(cosine))
+        self._one, self._beyond = one, beyond
+
+    def _across(self, v: Any) -> Any:
+        flat = v - dr.dot(v, self._tangent) * self._tangent
+        return flat / dr.maximum(dr.norm(flat), 1e-20)
+
+    def direction(self, first: Any, second: Any) -> Any:
+        """Uniform by solid angle."""
+        cosine = 2 * first - 1
+        sine = dr.safe_sqrt(1 - dr.square(cosine))
+        doubled = 2 * second
+        turned = doubled >= 1
+        φ = self._begin + dr.select(turned, doubled - 1, doubled) * self.angle
+        s, c = dr.sincos(φ)
+        flat = c * self._one + s * self._beyond
+        return mi.Vector3f(cosine * self._tangent + sine * dr.select(turned, -flat, flat))
+
+
+def coplanar(edge: EdgePoints) -> Any:
+    """Whether two faces lie in one plane, and on two sides of the edge."""
+    start = dr.detach(edge.start)
+    a, b, c = dr.detach(edge.end) - start, edge.third - start, edge.other_third - start
+    m, n = dr.cross(a, b), dr.cross(c, a)
+    return (dr.dot(m, n) > 0) & (dr.norm(dr.cross(m, n)) <= 1e-5 * dr.norm(m) * dr.norm(n))
+
+
+class EmitterPoints:
+    """Points on emitters and directions to distant ones, the same number on each emitter."""
+
+    def __init__(self, scene: Any, seed: int, count: int):
+        emitters = scene.emitters()
+        self._each = max(1, count // len(emitters))
+        self.count = self._each * len(emitters)
+        parts = [_emitter_points(emitter, seed + 7919 * i, self._each) for i, emitter in enumerate(emitters)]
+        self._p, self._n, self._d = (
+            type(first)(*(dr.concat([part[k][c] for part in parts]) for c in range(3)))
+            for k, first in enumerate(parts[0][:3])
+        )
+        self._uv = mi.Point2f(*(dr.concat([part[3][c] for part in parts]) for c in range(2)))
+        self._density = dr.concat([part[4] for part in parts])
+        self._kind = dr.concat([part[5] for part in parts])
+        self._emitters = dr.concat([part[6] for part in parts])
+
+    def _gather(self, which: Any) -> tuple[Any, Any, Any, Any]:
+        return (
+            dr.gather(mi.Point3f, self._p, which),
+            dr.gather(mi.Normal3f, self._n, which),
+            dr.gather(mi.Vector3f, self._d, which),
+            dr.gather(mi.UInt32, self._kind, which),
+        )
+
+    def seen_from(self, point: Any, which: Any) -> tuple[Any, Any]:
+        """Direction and distance of a viewpoint."""
+        p, _, d, kind = self._gather(which)
+        towards = p - dr.detach(point)
+        distance = dr.norm(towards)
+        far = kind == _DISTANT
+        return (
+            mi.Vector3f(dr.select(far, d, towards / dr.maximum(distance, 1e-20))),
+            dr.select(far, dr.largest(mi.Float), distance),
+        )
+
+    def measure(self, point: Any, which: Any, distance: Any, direction: Any) -> Any:
+        """Solid angle at the point over the density of the viewpoint; relative radiance is left out."""
+        _, n, _, kind = self._gather(which)
+        density = dr.gather(mi.Float, self._density, which) * self._each
+        cosine = dr.maximum(-dr.dot(n, direction), 0)
+        near = dr.select(kind == _AREA, cosine / dr.square(distance), 1)
+        # Directions to emitters at a point: their radiance falls with the distance by itself.
+        return dr.select(density > 0, near / density, 0)
+
+    def arriving(self, point: Any, which: Any, direction: Any, distance: Any, active: Any) -> Any:
+        """The radiance of the emitter at the viewpoint, times `measure`."""
+        p, n, _, kind = self._gather(which)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(point))
+        ds.p, ds.n, ds.d = dr.select(kind == _DISTANT, point + direction, p), n, direction
+        ds.uv = dr.gather(mi.Point2f, self._uv, which)
+        ds.dist, ds.pdf, ds.delta = distance, 1.0, False  # pyright: ignore[reportAttributeAccessIssue]
+        ds.emitter = dr.gather(mi.EmitterPtr, self._emitters, which)
+        it = dr.zeros(mi.Interaction3f, dr.width(point))
+        it.p = point
+        value = ds.emitter.eval_direction(it, ds, active)
+        return dr.select(active, value * self.measure(point, which, distance, direction), 0)
+
+    def share(self, distance: Any, which: Any) -> Callable[[Any], Any]:
+        """|bc| / |ac| as a function of |ab|, for an emitter at `distance` |bc|."""
+        far = dr.gather(mi.UInt32, self._kind, which) == _DISTANT
+        return lambda near: dr.select(far, 1, distance / (near + distance))
+
+
+def _emitter_points(emitter: Any, seed: int, count: int) -> tuple[Any, ...]:
+    """Points, normals, directions, texture coordinates, densities, kinds and the emitter, `count` lanes."""
+    sampler = lane_sampler(seed & 0xFFFFFFFF, count, count)
+    sample = sampler.next_2d()
+    it = dr.zeros(mi.Interaction3f, count)
+    shape = emitter.get_shape()
+    zero = dr.zeros(mi.Float, count)
+    pointer = dr.repeat(mi.EmitterPtr(emitter), count)
+    if shape is not None:
+        ps = shape.sample_position(0.0, sample)
+        return (
+            mi.Point3f(ps.p),
+            mi.Normal3f(ps.n),
+            mi.Vector3f(zero),
+            ps.uv,
+            ps.pdf + zero,
+            mi.UInt32(zero) + _AREA,
+            pointer,
+        )
+    ds, _ = emitter.sample_direction(it, sample)
+    distant = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) or mi.has_flag(
+        emitter.flags(), mi.EmitterFlags.DeltaDirection
+    )
+    density = dr.select(ds.delta, 1, ds.pdf) + zero
+    kind = mi.UInt32(zero) + (_DISTANT if distant else _POINT)
+    wide = mi.Point3f(zero)
+    return wide + ds.p, mi.Normal3f(zero), mi.Vector3f(zero) + ds.d, mi.Point2f(zero) + ds.uv, density, kind, pointer
+
+
+def lane_sampler(seed: int, period: int, lanes: int) -> RepeatingSampler:
+    sampler = RepeatingSampler(period)
+    sampler.seed(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes)
+    return sampler
