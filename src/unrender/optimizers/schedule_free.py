@@ -113,9 +113,9 @@ class ScheduleFree:
 
     with `growth` q, `decay` p and the mean correlation ρ of successive gradients of each parameter by itself, of n elements: while they
     agree, the rate grows, up to 3 η_0 times what the parameter itself has grown by (without that factor in `parameterisations`); where they
-    contradict one another, as after steps too long, it shrinks; once they are noise it falls as t^-0.6. Of single numbers the last nine gradients may agree by chance, hence
-    s = 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and averages of iterates take the noise
-    away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
+    contradict one another, as after steps too long, it shrinks; once they are noise it falls as t^-0.6. Of single numbers the last nine
+    gradients may agree by chance, hence s = 1/(3 √n), the standard error of ρ. No faster: what is left of the signal has to arrive, and
+    averages of iterates take the noise away at any power between 1/2 and 1 (Polyak and Juditsky 1992).
 
     Each element's step is shortened by the share of its gradient that is signal, as Wiener's filter does,
 
