@@ -82,3 +82,18 @@ def test_values_with_their_errors_in_words(value: float, error: float, text: str
 
 def test_phases_in_words() -> None:
     assert formatting.phases({"loading": 2.123, "page": 0.01, "steps": 83.0}) == "loading 2.1 s, steps 1 min 23 s"
+
+
+def test_a_mask_says_what_counts():
+    """The error of the pixels that count, with its standard error, whatever is elsewhere."""
+    generator = np.random.default_rng(3)
+    first, second = (0.5 + 0.1 * generator.standard_normal((20, 30, 3)) for _ in range(2))
+    black, mask = np.zeros((20, 30, 3)), np.zeros((20, 30))
+    mask[:, :10] = 1.0
+    alone = debiased.rmse(first[:, :10], second[:, :10], black[:, :10])
+    first[:, 10:] = 7.0
+    assert debiased.rmse(first, second, black, mask) == pytest.approx(alone)
+    assert debiased.rmse(first, second, black, 0.5 * mask) == pytest.approx(alone)
+    assert debiased.rmse(first, second, black, 0.0 * mask) == (0.0, 0.0)
+    with pytest.raises(InputError, match="mask"):
+        debiased.rmse(first, second, black, mask[:5])

@@ -118,7 +118,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
     if result.pictures:
         first, last = (image_error(result, which) for which in ("initial", "result"))
-        table.add_row("image error", f"{first} before, {last} after (root mean square, noise removed)")
+        where = " where masks count" if any(view.mask is not None for view in problem.views) else ""
+        table.add_row("image error", f"{first} before, {last} after (root mean square{where}, noise removed)")
     start = problem.parameter_error(result.initial)
     for key, error in problem.parameter_error(result.parameters).items():
         table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")

@@ -57,7 +57,8 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
     """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any; and how
     much the views tell of each element of the parameters.
 
-    Each picture is rendered in two independent halves, which tell its error apart from its noise (`evaluation.debiased`).
+    Each picture is rendered in two independent halves, which tell its error, by the view's mask, apart from its noise
+    (`evaluation.debiased`).
 
     Args:
         problem: what was run.
@@ -102,7 +103,9 @@ def _picture(
     if first == 0:
         return render(problem, values, view, spp, seed), None
     one, other = (render(problem, values, view, first, seed + offset) for offset in (0, _SECOND_HALF))
-    return (one + other) / 2, debiased.rmse(one, other, np.asarray(problem.views[view].reference))
+    seen = problem.views[view]
+    mask = None if seen.mask is None else np.asarray(seen.mask)
+    return (one + other) / 2, debiased.rmse(one, other, np.asarray(seen.reference), mask)
 
 
 def _affordable(problem: Problem, result: Result) -> int:
