@@ -114,6 +114,16 @@ def test_steps_compile_nothing_new() -> None:
 
 
 @pytest.mark.slow
+def test_estimators_follow_one_another_on_a_rectangle() -> None:
+    """The tangents of adaptive pixels must not meet what control variates have left attached in the previous scene."""
+    reference = np.full((SIZE, SIZE, 3), 0.2, np.float32)
+    problem = ur.Problem(scene, [ur.Parameter("floor.translation.y")], [ur.View(reference)], max_depth=2)
+    image = ur.images.RecursiveControlVariate(space="primary")
+    for estimator in (ur.PathGradient(image, spp=4), ur.PathGradient(pixels=ur.pixels.Adaptive(64), spp=4)):
+        assert ur.optimize(problem, estimator, ur.optimizers.Adam(1e-3), steps=2).skipped == 0
+
+
+@pytest.mark.slow
 def test_a_sphere_becomes_the_body_by_large_steps() -> None:
     """And not without the borders of what is visible."""
     options = {"resolution": 24, "views": 3, "subdivisions": 2, "reference_spp": 64, "strength": 10}

@@ -63,6 +63,8 @@ class RigidMotions:
         for target, pose in self._poses(values).items():
             positions = f"{target}.vertex_positions"
             if positions not in self._own:
+                # Mitsuba would keep an equal matrix, and its derivatives with it: another one first.
+                parameters[f"{target}.to_world"] = mi.Transform4f().scale(-1)
                 parameters[f"{target}.to_world"] = pose.transform() @ self._worlds[target]
                 continue
             points = dr.unravel(mi.Point3f, self._own[positions])
