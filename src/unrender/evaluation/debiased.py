@@ -26,11 +26,11 @@ def rmse(
         mask: (H, W), in [0, 1]: by how much each pixel counts. None for all alike.
 
     Returns:
-        The root of that mean, 0 where it is negative or no pixel counts, and its standard error; both infinite where a value is not finite. The variance of
-        the mean is estimated in two ways, neither of which is low, and the smaller one is taken: from ((A + B)/2 - R)·(A - B) of each
-        pixel, too large where noise has heavy tails, and from the spread of (A - R)·(B - R) over pixels, too large where errors differ
-        from pixel to pixel. Where the error is within two standard errors of 0, the second number is the root of two standard errors
-        of the mean square: what the error may well be.
+        The root of that mean, 0 where it is negative or no pixel counts, and its standard error; both infinite where a value is not
+        finite. The variance of the mean is estimated in two ways, neither of which is low, and the smaller one is taken: from
+        ((A + B)/2 - R)·(A - B) of each pixel, too large where noise has heavy tails, and from the spread of (A - R)·(B - R) over pixels,
+        too large where errors differ from pixel to pixel. Where the error is within two standard errors of 0, the second number is the
+        root of two standard errors of the mean square: what the error may well be.
 
     Raises:
         InputError: the pictures, or the mask, have different sizes.
