@@ -109,7 +109,7 @@ def drjit_ours(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: 
 
 def torch_stock(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock) -> None:
     """`dr.wrap` around `mi.render`, PyTorch's Adam."""
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
     params, reference = mi.traverse(scene), torch.from_numpy(task.reference)
@@ -138,7 +138,7 @@ def torch_stock(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock:
 
 def torch_ours(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, **options: Any) -> None:
     """The same: `renderer(texture)` in place of the wrapped function."""
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     renderer = ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, **options)
     reference = torch.from_numpy(task.reference)

@@ -31,6 +31,7 @@ SLOW = {
     "README.md",
     "quickstart.md",
     "photographs.md",
+    "shapes.md",
     "pixels.md",
     "own-loop.md",
     "own-estimator.md",

@@ -183,6 +183,7 @@ def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
     assert np.abs(np.array(both[0][key]) - np.array(both[1][key])).max() > 0
 
 
+@pytest.mark.slow
 def test_meta_estimation_of_moving_geometry_says_that_it_is_in_primary_space() -> None:
     asked = problem(box(), "small-box.vertex_positions")
     found = ur.optimize(asked, ur.MetaEstimator(), ur.optimizers.MetaAdam(1e-3), steps=3)

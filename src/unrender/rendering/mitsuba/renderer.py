@@ -115,4 +115,7 @@ class MitsubaRenderer:
         if not info.perturbable:
             raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")
         if space == "path" and not info.shares_paths:
-            raise InputError(f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"')
+            instead = ", --method plain or --method smoothed" if info.rigid else ""
+            raise InputError(
+                f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"{instead}'
+            )
