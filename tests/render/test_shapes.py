@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from kernels import on_device, recorded
 from tiers import quick
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -92,6 +94,29 @@ def test_slivers_change_nothing() -> None:
     _, faces = meshes.icosphere(1)
     with_slivers = gradient(lambda: scene(np.concatenate([faces, [[3, 3, 4], [5, 6, 5]]])))
     np.testing.assert_allclose(with_slivers, gradient(lambda: scene(faces)), rtol=1e-3, atol=1e-3)
+
+
+def test_points_are_projected_as_the_sensor_does() -> None:
+    """Also where its principal point is beside the middle and its film cropped, as after calibration."""
+    described = scene()
+    film = {"width": 40, "height": 24, "crop_width": 20, "crop_height": 16, "crop_offset_x": 7, "crop_offset_y": 3}
+    described["camera"]["film"] |= film
+    described["camera"] |= {"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1}
+    loaded = mi.load_dict(described)
+    sensor = loaded.sensors()[0]
+    picture = Picture(loaded, sensor, mi.TensorXf(np.zeros((16, 20, 3), np.float32)), 1)
+    points = mi.Point3f(np.random.default_rng(0).uniform(-0.1, 0.1, (3, 8)).astype(np.float32))
+    its = dr.zeros(mi.SurfaceInteraction3f, 8)
+    its.p = points
+    told, _ = sensor.sample_direction(its, mi.Point2f(0.5))
+    uv, depth = picture.project(points)
+    assert (np.array(told.pdf) > 0).any()
+    inside = np.array(told.pdf) > 0
+    np.testing.assert_allclose((np.array(uv) * [[20], [16]])[:, inside], np.array(told.uv)[:, inside], atol=1e-3)
+    assert (np.array(depth) > 0).all()
+    moved = points + mi.Point3f(1e-3, -2e-3, 1e-3)
+    motion = np.array(picture.project_motion(points, uv, mi.Vector3f(1e-3, -2e-3, 1e-3)))
+    np.testing.assert_allclose(motion, np.array(picture.project(moved)[0]) - np.array(uv), rtol=0.02, atol=1e-6)
 
 
 @pytest.mark.slow

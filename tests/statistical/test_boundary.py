@@ -39,6 +39,15 @@ def block() -> dict[str, Any]:
     return room(moving={"type": "cube", "to_world": place, "bsdf": {"type": "diffuse"}})
 
 
+def off_centre() -> dict[str, Any]:
+    """A principal point beside the middle, as calibrated cameras have, and a cropped film."""
+    described = block()
+    film = {"width": SIZE + 8, "height": SIZE + 4, "crop_width": SIZE, "crop_height": SIZE}
+    described["sensor"] |= {"principal_point_offset_x": 0.12, "principal_point_offset_y": -0.08}
+    described["sensor"]["film"] |= {**film, "crop_offset_x": 3, "crop_offset_y": 2}
+    return described
+
+
 def receiver() -> dict[str, Any]:
     """What moves receives the shadow of a ball that stands still, and casts one."""
     place = mi.ScalarTransform4f().translate([0.0, -0.6, 0.3]).rotate([1, 0, 0], -90).scale(0.5)
@@ -111,6 +120,7 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
     ("description", "key", "depth"),
     [
         (block, "moving.rotation.x", 2),
+        (off_centre, "moving.translation.z", 2),
         (block, "moving.scale", 3),
         (block, "moving.translation.y", 4),
         (block, "moving.translation.z", 6),

@@ -21,11 +21,10 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 4], [2, 0, 4]])
 
 def test_large_steps_on_a_mesh_are_a_dense_solve_on_its_places() -> None:
     laplacian = 4 * np.eye(4) - np.ones((4, 4))  # everybody is a neighbour of everybody
-    share = np.zeros((5, 4))
-    share[[0, 1, 2, 3, 4], [0, 1, 2, 3, 3]] = [1, 1, 1, 0.5**0.5, 0.5**0.5]
-    dense = share @ np.linalg.inv(np.eye(4) + 3.0 * laplacian) @ share.T
+    copies = np.zeros((5, 4))
+    copies[[0, 1, 2, 3, 4], [0, 1, 2, 3, 3]] = 1
+    dense = copies @ np.linalg.inv(copies.T @ copies + 3.0 * laplacian) @ copies.T
     x = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
-    # Which place has which number is of no account here: all are alike but for their shares.
     bound = LargeSteps(3.0).on_mesh(MeshTopology.of(POINTS, FACES))
     np.testing.assert_allclose(bound.apply(x.reshape(-1)).reshape(5, 3), dense @ x, atol=1e-6)
     assert repr(bound) == repr(LargeSteps(3.0))
@@ -37,6 +36,12 @@ def test_large_steps_on_a_mesh_are_a_dense_solve_on_its_places() -> None:
 def test_copies_of_a_vertex_move_alike() -> None:
     moved = LargeSteps(3.0).on_mesh(MeshTopology.of(POINTS, FACES)).apply(np.arange(15, dtype=np.float32))
     np.testing.assert_array_equal(moved.reshape(5, 3)[3], moved.reshape(5, 3)[4])
+
+
+def test_a_constant_passes_unchanged_though_vertices_are_cut() -> None:
+    """The whole mesh moves by the same, without a crease at the seam."""
+    moved = LargeSteps(50.0).on_mesh(MeshTopology.of(POINTS, FACES)).apply(np.ones(15, np.float32))
+    np.testing.assert_allclose(moved, 1.0, rtol=1e-5)
 
 
 def test_one_rate_for_all_elements() -> None:
@@ -55,6 +60,7 @@ def mesh(points: Any, faces: Any, flat: bool = False) -> Any:
         vertex_positions_buffer=lambda: np.ravel(points),
         faces_buffer=lambda: np.ravel(faces),
         has_face_normals=lambda: flat,
+        has_vertex_normals=lambda: not flat,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unrender.core import arrays, trees, vectors
+from unrender.core import arrays, vectors
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -18,6 +18,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
     Variance,
 )
+from unrender.parameterisations.base import Transform
 from unrender.problem.problem import Problem
 
 __all__ = ["by_coordinates"]
@@ -28,7 +29,7 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
 
     With J the diagonal matrix of φ': gradients become S J g, variances J² Var (a variance per element does not pass through S). The second
     derivatives are exact, J H J + diag(g φ''), with the term of φ's own curvature; the loss is a function of u. The σ of smoothed
-    derivatives, which is of x, becomes σ / φ' of each element.
+    derivatives, which is of x, becomes that of each element of u, see `_width`.
     """
     if estimate.preconditioned:
         return estimate
@@ -77,14 +78,20 @@ def _second_order(
 
             return LossFunction(losses)
         case Smoothing(sigma):
-            shapes = trees.shapes(parameters)
+            transforms = problem.coordinates.transforms
             return Smoothing(
                 {
-                    k: value / arrays.numpy(slopes[k]).reshape(shapes[k]) if k in slopes else value
-                    for k, value in sigma.items()
+                    k: _width(transforms[k], arrays.numpy(parameters[k]), s) if k in transforms else s
+                    for k, s in sigma.items()
                 }
             )
     return capability
+
+
+def _width(transform: Transform, x: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
+    """σ of x as one of u: σ / φ', with the greatest φ' within σ, since near a bound φ' vanishes and a width of σ leads beyond it."""
+    around = [np.asarray(transform.slope(at)) for at in (x, x + sigma, x - sigma)]
+    return sigma / np.maximum.reduce(around)
 
 
 def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:

@@ -312,4 +312,6 @@ class MetaEstimator:
         else:
             batch, pixels = self.pixels.redraw(problem, state.pixels, draw_key), state.pixels
         step = gather(problem, parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
-        return step, self.pixels.observe(problem, pixels, step.gradient) if first else pixels
+        if first:
+            pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
+        return step, pixels

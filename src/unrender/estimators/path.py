@@ -143,7 +143,7 @@ class PathGradient:
             tolerance=self.tolerance,
             fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
         )
-        pixels = self.pixels.observe(problem, pixels, step.gradient)
+        pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
         whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):
             image = self.image.prepare(problem, image)

@@ -148,7 +148,8 @@ class Stream:
         gradient = reduce(trees.add, parts)
         arrays.evaluate(gradient)
         if not self._options.all_pixels:
-            pixels = self._options.pixels.observe(self.problem, self.state.pixels, gradient)
+            moved = self.problem.coordinates.by_u(gradient, rendered.parameters)
+            pixels = self._options.pixels.observe(self.problem, self.state.pixels, moved)
             self.state = replace(self.state, pixels=pixels)
         return gradient
 

@@ -108,6 +108,11 @@ class AutoMethod(Options):
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = _logarithms(problem) if self.parameterise else {}
         problem = problem.reparameterised(moved)
+        moved = {
+            k: type(p).__name__.lower()
+            for k, p in problem.parameterisations.items()
+            if k in problem.coordinates.transforms
+        }
         rates = _rates(problem, self.learning_rate)
         optimizer = ScheduleFree(
             {"*": self.learning_rate, **rates},
@@ -210,6 +215,7 @@ def _logarithms(problem: Problem) -> dict[str, str]:
         if (low := problem.bounds[key][0]) is not None
         and problem.bounds[key][1] is None
         and key not in problem.learning_rates
+        and key not in problem.parameterisations
         and (value.ndim == _TEXTURE or (value.ndim <= 1 and value.size <= _MOST_NUMBERS))
         and (value > low + _MOST_MARGINS * MARGIN).all()
     }

@@ -141,7 +141,8 @@ class ScheduleFree:
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
             The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
-        parameterisations: {key: name} for parameters without one of their own, such as "log"; see `unrender.parameterisations`.
+        parameterisations: {key: name}, such as "log", of the parameters that move by another variable, whose size tells nothing of how
+            far they have come; given to those that have none of their own. See `unrender.parameterisations`.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -172,6 +173,9 @@ class ScheduleFree:
         if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
             raise InputError(f"ScheduleFree: preconditioned must be keys of parameters, got {keys!r}")
         object.__setattr__(self, "preconditioned", tuple(keys))
+        named = self.parameterisations
+        if not isinstance(named, Mapping) or not all(isinstance(x, str) for pair in named.items() for x in pair):
+            raise InputError(f"ScheduleFree: parameterisations must be {{key: name}}, got {named!r:.80}")
 
     @property
     def requires(self) -> Capabilities:
@@ -193,6 +197,9 @@ class ScheduleFree:
         ones = dict.fromkeys(parameters, 1.0)
         none = dict.fromkeys(parameters, 0.0)
         smooth = self.preconditioner
+        for key in self.parameterisations:
+            if key not in parameters:
+                raise InputError(f'ScheduleFree: parameterisations: unknown parameter "{key}"')
         near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
         fits = dict.fromkeys(near if isinstance(smooth, Sobolev) else {}, StrengthFit())
         sizes = {

@@ -52,7 +52,7 @@ class PixelSampler(Protocol):
         ...
 
     def observe(self, problem: Problem, state: Any, gradient: Tree) -> Any:
-        """The state after a step with this gradient, before preconditioning."""
+        """The state after a step with this gradient by u (`Problem.coordinates`), before preconditioning."""
         ...
 
 

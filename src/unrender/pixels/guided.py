@@ -62,11 +62,10 @@ class GuidedSamplerState:
     references: np.ndarray
     refreshes: int = 0
     second_moment: Tree = field(default_factory=dict)
-    slopes: Tree = field(default_factory=dict)
 
     def upsampled(self, upsampler: Upsampler) -> GuidedSamplerState:
         """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
-        return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES), slopes={})
+        return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
 class GuidedOptions(Protocol):
@@ -160,7 +159,7 @@ class GuidedSampler:
         if not state.maps or state.age >= self.options.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
         batch = replace(self.redraw(problem, state, key), samples=traced)
-        return batch, replace(state, age=state.age + 1, slopes=problem.coordinates.slopes(parameters))
+        return batch, replace(state, age=state.age + 1)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
         """See `RepeatableSampler.redraw`."""
@@ -175,7 +174,7 @@ class GuidedSampler:
         """
         if state.age % _OBSERVED:
             return state
-        pulled = problem.coordinates.pull_back(gradient, state.slopes)
+        pulled = problem.coordinates.pull_back(gradient, {})
         squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)
         if not state.second_moment or trees.shapes(state.second_moment) != trees.shapes(squares):
             return replace(state, second_moment=squares)

@@ -1,4 +1,4 @@
-"""The solver of (I + λ L) y = x over the vertices of a mesh, L its graph Laplacian.
+"""The solver of (C + λ L) y = x over the places of a mesh, L its graph Laplacian, C how many vertices are there.
 
 (L x)_i is the sum of x_i − x_j over the vertices j that an edge joins with vertex i. Vertices at the same place are one: what is cut along
 seams of texture coordinates or of normals moves together.
@@ -39,7 +39,9 @@ class MeshTopology:
 
 
 class MeshSolver:
-    """P (I + λ L)^-1 Pᵀ by sparse Cholesky factorisation, once; P hands what a place has to its vertices, in equal orthonormal shares.
+    """B (C + λ L)^-1 Bᵀ by sparse Cholesky factorisation, once: B hands what a place has to its vertices, Bᵀ sums them up, C = Bᵀ B.
+
+    So a constant passes unchanged, whatever vertices are cut; where none is, C is I.
 
     Args:
         strength: λ, >= 0.
@@ -48,9 +50,8 @@ class MeshSolver:
 
     def __init__(self, strength: float, topology: MeshTopology):
         self._strength, self._topology = strength, topology
-        counts = np.bincount(topology.places)
-        self._share = (counts[topology.places] ** -0.5).astype(np.float32)[:, None]
-        self._count = len(counts)
+        self._copies = np.bincount(topology.places)
+        self._count = len(self._copies)
 
     @cached_property
     def _factor(self):
@@ -61,7 +62,7 @@ class MeshSolver:
         edges = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (self._count, self._count))
         adjacency = edges + edges.T
         laplacian = scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
-        matrix = (scipy.sparse.identity(self._count) + self._strength * laplacian).tocoo()
+        matrix = (scipy.sparse.diags(self._copies.astype(float)) + self._strength * laplacian).tocoo()
         rows, columns = matrix.row.astype(np.int32), matrix.col.astype(np.int32)
         return CholeskySolverF(self._count, rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
 
@@ -70,9 +71,8 @@ class MeshSolver:
         places = self._topology.places
         if x.shape != (3 * len(places),):
             raise InputError(f"LargeSteps: expected the {3 * len(places)} coordinates of the mesh, got shape {x.shape}")
-        of_vertices = np.asarray(x, np.float32).reshape(-1, 3) * self._share
         right = np.zeros((self._count, 3), np.float32)
-        np.add.at(right, places, of_vertices)
+        np.add.at(right, places, np.asarray(x, np.float32).reshape(-1, 3))
         result = np.empty_like(right)
         self._factor.solve(right, result)
-        return (result[places] * self._share).reshape(-1)
+        return result[places].reshape(-1)

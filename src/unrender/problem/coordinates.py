@@ -41,6 +41,10 @@ class Coordinates:
         """{key: φ''} where there is a φ."""
         return {key: φ.curvature(parameters[key]) for key, φ in self.transforms.items()}
 
+    def by_u(self, gradient: Tree, parameters: Tree) -> Tree:
+        """The gradient by u, of that by x: φ' g."""
+        return _times(gradient, self.slopes(parameters))
+
     def pull_back(self, gradient: Tree, slopes: Tree) -> Tree:
         """The gradient by v, of that by x: S (φ' g)."""
         return self._smoothed(_times(gradient, slopes))

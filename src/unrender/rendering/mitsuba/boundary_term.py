@@ -31,12 +31,13 @@ def moved_shape(scene: LoadedScene, key: str) -> str:
 
 def obstacle(pair: ScenePair, target: str) -> str:
     """Why there is no boundary derivative of a moving shape, "" where there is."""
-    shapes = {shape.id(): shape for shape in pair.current.shapes()}
     if pair.volumetric:
         return "path gradients of moving shapes know no media"
-    if target not in shapes:
+    if any(sensor.id() == target for sensor in pair.current.sensors()):
         return "path gradients do not move sensors"
-    shape = shapes[target]
+    shape = next((shape for shape in pair.current.shapes() if shape.id() == target), None)
+    if shape is None:
+        return "path gradients do not move instances"
     if not shape.is_mesh():
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():

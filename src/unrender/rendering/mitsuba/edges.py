@@ -128,7 +128,7 @@ def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     first = np.flatnonzero(np.r_[True, (names[1:] != names[:-1]).any(axis=1)]) if len(names) else np.zeros(0, np.int64)
     faces_at = np.diff(np.r_[first, len(names)])
     second = first + (faces_at > 1)
-    flat = bool(mesh.has_face_normals())
+    flat = bool(mesh.has_face_normals() or not mesh.has_vertex_normals())
     torn = (ends[first] != ends[second]).any(axis=1)
     thirds = np.stack([thirds[first], thirds[second]], axis=-1)
     return MeshEdges(ends[first], thirds, faces_at != 2, (torn | flat) & (faces_at > 1))

@@ -30,6 +30,11 @@ class Picture:
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
                 sensor.world_transform().inverse().matrix
             )
+        # Of which the projection knows nothing: the film is cut elsewhere out of the plane.
+        offset = mi.traverse(sensor)
+        whole = mi.Vector2f(sensor.film().size())
+        centre = [offset[f"principal_point_offset_{axis}"] for axis in "xy"]
+        self._shift = mi.Vector2f(*(dr.detach(mi.Float(c)) for c in centre)) * whole / self.size
         self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
 
     def _row(self, number: int, v: Any, last: float) -> Any:
@@ -40,12 +45,14 @@ class Picture:
         """Where points are on the film, from 0 to 1, and how far in front."""
         p = dr.detach(point)
         w = self._row(3, p, 1.0)
-        return mi.Point2f(self._row(0, p, 1.0), self._row(1, p, 1.0)) / w, w
+        uv = mi.Vector2f(self._row(0, p, 1.0), self._row(1, p, 1.0)) / w - self._shift
+        return mi.Point2f(uv), w
 
     def project_motion(self, point: Any, uv: Any, motion: Any) -> Any:
         """The motion on the film of points at `uv` that move in space."""
         w = self._row(3, dr.detach(point), 1.0)
         x, y, change = (self._row(number, motion, 0.0) for number in (0, 1, 3))
+        uv = uv + self._shift
         return mi.Vector2f(x - uv.x * change, y - uv.y * change) / w
 
     def weighted(self, value: Any, position: Any, active: Any) -> Any:
