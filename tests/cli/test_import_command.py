@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import zlib
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from tiers import quick
 
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 pytest.importorskip("xatlas", reason="atlases need xatlas: pip install 'unrender[capture]'")
+
+pytest.importorskip("fast_simplification", reason="hulls need fast-simplification: pip install 'unrender[capture]'")
 
 import made_capture as made
 from unrender.capture.cameras import Lens
@@ -104,6 +107,25 @@ def test_an_earlier_import_is_replaced_only_when_asked(unrender: Unrender, captu
     _photograph(capture).unlink()
     assert unrender(*given, "--hold-out", 0, "--overwrite").status == 0
     assert not Path("asset/held-out.toml").exists()
+
+
+def test_nothing_but_an_earlier_import_is_removed(unrender: Unrender, capture: Path, mesh: Path) -> None:
+    given = ("import", capture, "--mesh", mesh, "--resolution", 20, "--texture", 4, "--overwrite", "--out")
+    assert unrender(*given, "asset").status == 0
+    answer = unrender(*given, "asset", "--check")
+    assert (answer.status, "holds no earlier results (check)" in answer.error) == (2, True)
+    Path("asset/run").mkdir()
+    answer = unrender(*given, "asset")
+    assert (answer.status, "asset: holds other things, such as run" in answer.error) == (2, True)
+    Path("asset/run").rmdir()
+    capture.rename("asset/masks/head")
+    answer = unrender("import", "asset/masks/head", *given[2:], "asset")
+    assert (answer.status, "lies in it and would be removed" in answer.error) == (2, True)
+    Path("empty").mkdir()
+    os.chdir("empty")
+    answer = unrender("import", "../asset/masks/head", *given[2:], ".")
+    assert (answer.status, "the current directory" in answer.error, answer.error.count("\n")) == (2, True, 1)
+    assert Path("../asset/problem.toml").is_file()
 
 
 def test_check_draws_every_photograph(unrender: Unrender, capture: Path) -> None:
@@ -232,6 +254,11 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no JSON": (lambda c: (c / "transforms.json").write_text("{"), "transforms.json"),
     "no frames": (_top("frames", []), "transforms.json: frames: expected a list of at least one frame"),
     "no name": (_frame("file_path", 7), "transforms.json: frames[2]: expected a table with file_path"),
+    "a focal length of 400 digits": (_top("fl_x", 10**400), "fl_x: expected a number, got"),
+    "a matrix of 400 digits": (
+        _frame("transform_matrix", [[10**400] * 4] * 3),
+        "frames[2]: transform_matrix: expected",
+    ),
     "no matrix": (_frame("transform_matrix", None), "frames[2]: transform_matrix: expected a matrix"),
     "NaN": (_frame("transform_matrix", [[float("nan")] * 4] * 4), "frames[2]: transform_matrix: expected a matrix"),
     "a shear": (_frame("transform_matrix", [[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "columns are no rotation"),

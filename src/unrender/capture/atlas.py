@@ -6,6 +6,7 @@ As a program, `python -m unrender.capture.atlas IN.npz OUT.npz`, it is that proc
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 import tempfile
@@ -16,13 +17,19 @@ import numpy as np
 from unrender.capture.mesh import Mesh, normals
 from unrender.core.errors import InputError
 
-__all__ = ["SECONDS", "unwrap"]
+__all__ = ["SECONDS", "check_installed", "unwrap"]
 
 SECONDS = 120.0
 """Time limit; 10 000 faces take 2 seconds, 20 000 15."""
 _PADDING = 3
 """Texels between charts, of an atlas that is then scaled down a little."""
 _COMMAND = (sys.executable, "-m", "unrender.capture.atlas")
+
+
+def check_installed() -> None:
+    """Raise `InputError` where xatlas is missing."""
+    if importlib.util.find_spec("xatlas") is None:
+        raise InputError("a mesh without texture coordinates needs xatlas: pip install 'unrender[capture]'")
 
 
 def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
@@ -39,8 +46,7 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
     Raises:
         InputError: xatlas is not installed, fails, or does not end in time.
     """
-    if importlib.util.find_spec("xatlas") is None:
-        raise InputError("a mesh without texture coordinates needs xatlas: pip install 'unrender[capture]'")
+    check_installed()
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     with tempfile.TemporaryDirectory(prefix="unrender-atlas-") as folder:
@@ -48,7 +54,15 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
         local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
         np.savez(given, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
         try:
-            done = subprocess.run([*command, str(given), str(made)], timeout=seconds, capture_output=True, check=False)
+            # Python begins its search for modules in the current directory, which may have come from anywhere.
+            done = subprocess.run(
+                [*command, str(given), str(made)],
+                timeout=seconds,
+                capture_output=True,
+                check=False,
+                cwd=folder,
+                env=_environment(),
+            )
         except subprocess.TimeoutExpired as error:
             many = f"{len(mesh.faces)} faces"
             raise InputError(f"the atlas of {many} was not ready within {seconds:g} s: try fewer (--faces)") from error
@@ -59,6 +73,14 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
             of, faces, uv = found["of"], found["faces"].astype(np.int64), found["uv"].astype(float)
     own = normals(mesh) if mesh.normals is None else mesh.normals
     return Mesh(mesh.vertices[of], faces, uv, own[of])
+
+
+def _environment() -> dict[str, str]:
+    """This process's, for one in another directory that does not look for modules there."""
+    found = {**os.environ, "PYTHONSAFEPATH": "1"}
+    if path := found.get("PYTHONPATH"):
+        found["PYTHONPATH"] = os.pathsep.join(os.path.abspath(place) for place in path.split(os.pathsep))
+    return found
 
 
 def _main(given: str, made: str) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from unrender.backend import variant
 from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder
@@ -24,10 +25,14 @@ from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.io import files
 
-__all__ = ["CHECK", "PROBLEM", "SHEET", "Imported", "Options", "check", "import_capture"]
+__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "Imported", "Options", "check", "import_capture"]
 
 CHECK, SHEET = "check", "check.png"
 PROBLEM = problem_folder.PROBLEM
+MOST_VOXELS = 256
+"""Along the longest side of the hull: memory grows with the cube."""
+_OF_CHECK = {CHECK, SHEET}
+_OF_IMPORT = {*problem_folder.OWN, SHEET}
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Options:
         resolution: pixels along the longer side of a view, at most.
         scale: in place of `resolution`, a factor of the photograph's own; None for `resolution`.
         hold_out: every so many photographs one is held out; 0 for none; None for the capture's own split, or 8.
-        voxels: along the longest side of the hull.
+        voxels: along the longest side of the hull, at most `MOST_VOXELS`.
         faces: of the hull, about.
         texture: texels along the sides of the base colour.
     """
@@ -59,6 +64,10 @@ class Options:
     voxels: int = 96
     faces: int = 10_000
     texture: int = 512
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.voxels <= MOST_VOXELS:
+            raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
 
 
 @dataclass(frozen=True)
@@ -100,12 +109,13 @@ class _Read:
 def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     """Write the problem of a folder of posed photographs: scene.xml, problem.toml, held-out.toml, references, masks, mesh, and check.png.
 
-    What stands at `out` is replaced in one instant, and only when all is written.
+    What stands at `out` is replaced in one instant, and only when all is written. It may be an earlier import or check, nothing else.
 
     Raises:
         InputError: which file, and what was expected; nothing is written then.
     """
-    found = _read(folder, options)
+    _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
+    found = _read(folder, options, unwrapped=True)
     if found.refusal:
         raise InputError(f"{folder}: {found.refusal}")
     mesh = found.mesh
@@ -116,7 +126,11 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     def fill(place: Path) -> None:
         with phases.phase("problem"):
             problem_folder.write(place, folder.resolve().name, found.views, mesh, options.texture)
-            (place / SHEET).write_bytes(_sheet(found, list(_overlays(found))))
+            (place / SHEET).write_bytes(
+                _sheet(
+                    found, [overlays.thumbnail(_overlay(found, index)) for index in overlays.chosen(len(found.views))]
+                )
+            )
 
     _write_folder(out, fill)
     return _imported(found, out, mesh)
@@ -130,28 +144,52 @@ def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
     Raises:
         InputError: which file, and what was expected; nothing is written then.
     """
-    found = _read(folder, options)
+    _check_place(out, folder, options, _OF_CHECK)
+    found = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:
         with phases.phase("pictures"):
-            pictures = list(_overlays(found))
             (place / CHECK).mkdir()
-            for index, (view, picture) in enumerate(zip(found.views, pictures, strict=True)):
+            shown, thumbnails = set(overlays.chosen(len(found.views))), []
+            for index, view in enumerate(found.views):
+                picture = _overlay(found, index)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
                 (place / CHECK / name).write_bytes(overlays.png(picture))
-            (place / SHEET).write_bytes(_sheet(found, pictures))
+                thumbnails += [overlays.thumbnail(picture)] if index in shown else []
+            (place / SHEET).write_bytes(_sheet(found, thumbnails))
 
     _write_folder(out, fill)
     return _imported(found, out, found.mesh), found.refusal
 
 
-def _read(folder: Path, options: Options) -> _Read:
+def _check_place(out: Path, folder: Path, options: Options, own: set[str]) -> None:
+    """Raise `InputError` where replacing `out` would remove more than an earlier import's or check's files, `own`."""
+    place = out.resolve()
+    if out.name in ("", "..") or Path.cwd().is_relative_to(place):
+        raise InputError(f"--out {out}: the current directory or one above it; expected a folder to be made")
+    for what, needed in (("FOLDER", folder), ("--masks", options.masks)):
+        if needed is not None and needed.resolve().is_relative_to(place):
+            raise InputError(f"--out {out}: {what} {needed} lies in it and would be removed; give a new one")
+    try:
+        others = sorted({path.name for path in out.iterdir()} - own) if out.is_dir() else []
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror or error}") from error
+    if others:
+        raise InputError(f"--out {out}: holds other things, such as {printable(others[0])}; give a new one")
+
+
+def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
+    """What the folder holds, its shape and how they fit; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
     capture = formats.read(folder, options.kind, options.masks)
     if options.axes is not None or options.world_to_camera is not None:
         inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
         capture = reinterpreted(capture, options.axes or capture.axes, inverse)
     given = None if options.mesh is None else meshes.read(options.mesh)
+    if given is None:
+        meshes.check_installed()
+    if unwrapped and (given is None or given.uv is None):
+        atlas.check_installed()
     if given is None and not _has_masks(capture):
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
     with phases.phase("photographs") as advance:
@@ -183,15 +221,15 @@ def _has_masks(capture: Capture) -> bool:
     )
 
 
-def _overlays(found: _Read) -> Sequence[np.ndarray]:
-    return [overlays.overlay(view, found.silhouettes) for view in found.views]
+def _overlay(found: _Read, index: int) -> np.ndarray:
+    return overlays.overlay(found.views[index], found.silhouettes)
 
 
-def _sheet(found: _Read, pictures: Sequence[np.ndarray]) -> bytes:
+def _sheet(found: _Read, thumbnails: list[Image.Image]) -> bytes:
+    """Of those of `overlays.chosen`."""
     overlaps = [f"IoU {value:.3f}  " for value in found.overlaps] or [""] * len(found.views)
-    return overlays.contact_sheet(
-        pictures, [f"{value}{printable(view.name)}" for value, view in zip(overlaps, found.views, strict=True)]
-    )
+    labels = [f"{overlaps[index]}{printable(found.views[index].name)}" for index in overlays.chosen(len(found.views))]
+    return overlays.contact_sheet(thumbnails, labels)
 
 
 def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, mesh_files
 
-__all__ = ["Mesh", "decimate", "normals", "ply", "read", "smooth", "without_crumbs"]
+__all__ = ["Mesh", "check_installed", "decimate", "normals", "ply", "read", "smooth", "without_crumbs"]
 
 _SHRINK, _GROW = 0.5, -0.53
 _KINDS = (".ply", ".obj")
@@ -78,6 +79,12 @@ def without_crumbs(mesh: Mesh, share: float) -> Mesh:
     kept = mesh.faces[sizes[parts[mesh.faces[:, 0]]] >= share * sizes.max()]
     used, faces = np.unique(kept, return_inverse=True)
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
+
+
+def check_installed() -> None:
+    """Raise `InputError` where the package that `decimate` needs is missing."""
+    if importlib.util.find_spec("fast_simplification") is None:
+        raise InputError("a first shape needs fast-simplification: pip install 'unrender[capture]'")
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:

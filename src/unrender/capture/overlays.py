@@ -14,7 +14,7 @@ from unrender.capture.views import CapturedView
 from unrender.core.text import printable
 from unrender.evaluation.metrics import srgb
 
-__all__ = ["LEGEND", "contact_sheet", "overlay", "png"]
+__all__ = ["LEGEND", "chosen", "contact_sheet", "overlay", "png", "thumbnail"]
 
 LEGEND = "orange: the mesh and its edges; blue: the outline of the mask; dimmed: outside the mesh"
 _MESH, _MASK = np.array([1.0, 0.55, 0.05]), np.array([0.1, 0.55, 1.0])
@@ -44,20 +44,29 @@ def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
     return np.clip(picture, 0, 1)
 
 
-def contact_sheet(pictures: Sequence[np.ndarray], labels: Sequence[str]) -> bytes:
-    """PNG of at most 48 of the pictures, evenly chosen, with their labels."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _LARGEST_SHEET)).round().astype(int))
-    columns = min(8, math.ceil(math.sqrt(len(chosen))))
-    rows = math.ceil(len(chosen) / columns)
+def chosen(count: int) -> list[int]:
+    """Which of so many pictures a sheet shows: at most 48, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, _LARGEST_SHEET)).round().astype(int)).tolist()
+
+
+def thumbnail(picture: np.ndarray) -> Image.Image:
+    """A picture with values in [0, 1] as it is on a sheet, 8 bits."""
+    small = Image.fromarray(_bytes(picture))
+    small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
+    return small
+
+
+def contact_sheet(thumbnails: Sequence[Image.Image], labels: Sequence[str]) -> bytes:
+    """PNG of the pictures with their labels."""
+    columns = min(8, math.ceil(math.sqrt(len(thumbnails))))
+    rows = math.ceil(len(thumbnails) / columns)
     sheet = Image.new("RGB", (columns * _CELL, rows * (_CELL + _LABEL) + _LABEL), (20, 20, 20))
     draw = ImageDraw.Draw(sheet)
     draw.text((3, 1), LEGEND, fill=(220, 220, 220))
-    for place, index in enumerate(chosen):
-        small = Image.fromarray(_bytes(pictures[index]))
-        small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
+    for place, (small, label) in enumerate(zip(thumbnails, labels, strict=True)):
         left, top = place % columns * _CELL, place // columns * (_CELL + _LABEL) + _LABEL
         sheet.paste(small, (left + 2, top + _LABEL))
-        draw.text((left + 3, top + 1), _latin(labels[int(index)]), fill=(220, 220, 220))
+        draw.text((left + 3, top + 1), _latin(label), fill=(220, 220, 220))
     return _encoded(sheet)
 
 

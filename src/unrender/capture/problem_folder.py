@@ -20,10 +20,13 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 
-__all__ = ["HELD_OUT", "PROBLEM", "to_world", "write"]
+__all__ = ["HELD_OUT", "OWN", "PROBLEM", "to_world", "write"]
 
 PROBLEM, HELD_OUT, SCENE, MESH = "problem.toml", "held-out.toml", "scene.xml", "asset.ply"
 TEXTURE, LIGHT = "textures/base-colour.exr", "textures/light.exr"
+_FOLDERS = ("references", "masks", "textures")
+OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, *_FOLDERS})
+"""What `write` puts into a folder."""
 BASE_COLOUR_KEY, LIGHT_KEY = "asset.bsdf.base_color.data", "light.data"
 _LIGHT_SIZE = 16, 32
 _BASE_COLOUR, _ROUGHNESS = 0.4, 0.6
@@ -49,7 +52,7 @@ def write(folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, te
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
     (folder / SCENE).write_bytes(_scene(views, stems, mesh))
-    for part in ("references", "masks", "textures"):
+    for part in _FOLDERS:
         (folder / part).mkdir()
     silhouettes = Silhouettes(mesh)
     level = []

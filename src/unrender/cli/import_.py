@@ -43,7 +43,7 @@ _Direction = Annotated[
     bool | None,
     typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
 ]
-_Voxels = Annotated[int, typer.Option(min=16, max=512, help="Of the carved shape, along its longest side.")]
+_Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape, along its longest side.")]
 _Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
 _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the base colour.")]
 
@@ -78,8 +78,8 @@ def import_(
     options = importing.Options(
         mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture
     )
-    mark = importing.SHEET
-    place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, mark)
+    marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
+    place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
     refusal = ""
     try:
         with Progress(console):
@@ -91,12 +91,12 @@ def import_(
     finally:
         arguments.remove_if_empty(place)
     _tell(console, found)
-    written = place / (mark if check else importing.PROBLEM)
+    written = place / (importing.SHEET if check else importing.PROBLEM)
     console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
     if refusal:
         raise InputError(f"{folder}: {refusal}")
     if not check:
-        console.print(f"to look at: {place / mark}", soft_wrap=True, markup=False)
+        console.print(f"to look at: {place / importing.SHEET}", soft_wrap=True, markup=False)
         console.print(f"next: unrender run {shlex.quote(str(written))} --seconds 60", soft_wrap=True, markup=False)
 
 
