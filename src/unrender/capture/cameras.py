@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.text import printable
 
 __all__ = ["FISHEYE", "MODELS", "RADIAL_TANGENTIAL", "Lens", "opencv", "project", "rigid"]
 
@@ -21,6 +22,8 @@ RADIAL_TANGENTIAL, FISHEYE = "radial-tangential", "fisheye"
 MODELS = (RADIAL_TANGENTIAL, FISHEYE)
 _MOST_COEFFICIENTS = {RADIAL_TANGENTIAL: 8, FISHEYE: 4}
 _NARROWEST, _WIDEST = 1e-3, 1e6
+_LONGEST_SIDE = 1 << 31
+_LAST_ROW = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,9 @@ class Lens:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(number) for number in numbers):
             raise InputError("camera: expected finite numbers")
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: expected a width and height of at least 1, got {self.width} x {self.height}")
+        if not all(1 <= side <= _LONGEST_SIDE for side in (self.width, self.height)):
+            got = f"{str(self.width)[:20]} x {str(self.height)[:20]}"
+            raise InputError(f"camera: expected a width and height of 1 to {_LONGEST_SIDE} pixels, got {got}")
         for name, value, side in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
             if not _NARROWEST < value / side < _WIDEST:
                 raise InputError(f"camera: {name}: expected a focal length in pixels, got {value:g} for {side} pixels")
@@ -71,8 +75,9 @@ class Lens:
     @classmethod
     def of_field_of_view(cls, radians: float, width: int, height: int) -> Lens:
         """Square pixels, principal point in the middle, `radians` from the left edge to the right."""
-        if not 0 < radians < math.pi:
-            raise InputError(f"camera: expected a horizontal angle of view of 0 to π radians, got {radians:g}")
+        if not 1 / _WIDEST < radians < math.pi:
+            limits = f"more than {1 / _WIDEST:g} and less than π radians"
+            raise InputError(f"camera: expected a horizontal angle of view of {limits}, got {radians:g}")
         focal = width / (2 * math.tan(radians / 2))
         return cls(width, height, focal, focal, width / 2, height / 2)
 
@@ -104,21 +109,28 @@ def _coefficients(lens: Lens) -> np.ndarray:
     return np.array([*lens.distortion, *[0.0] * 8][:8], float)
 
 
-def rigid(matrix: Any, where: str) -> np.ndarray:
-    """A 3 x 4 or 4 x 4 matrix as a rotation and a position, (4, 4).
-
-    A uniform scale of the axes is taken out: it changes no picture.
+def rigid(matrix: Any, where: str) -> tuple[np.ndarray, float]:
+    """A 3 x 4 or 4 x 4 matrix [sR | t] as [R | t], (4, 4), and s. A last row of 0 0 0 w divides all others by w.
 
     Raises:
-        InputError: not finite, or its axes are not orthogonal and equally long to 2 %, or mirrored.
+        InputError: not finite, its axes are not orthogonal and equally long to 2 %, or mirrored, or its last row is another.
     """
     try:
         given = np.asarray(matrix, float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: expected a matrix of numbers") from error
     if given.shape not in ((3, 4), (4, 4)) or not np.isfinite(given).all():
         raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 finite numbers, got shape {given.shape}")
-    axes = given[:3, :3]
+    if len(given) == 4:
+        *rest, last = given[3]
+        if not np.abs(rest).max() <= _LAST_ROW * abs(last) or not last:
+            raise InputError(f"{where}: its last row is {printable(given[3].tolist())}, expected 0 0 0 1")
+        with np.errstate(over="ignore"):
+            given = given / last
+    largest = float(np.abs(given[:3, :3]).max())
+    if not 0 < largest < math.inf or not np.isfinite(given).all():
+        raise InputError(f"{where}: its first three columns are no rotation")
+    axes = given[:3, :3] / largest  # so that no product overflows
     determinant = float(np.linalg.det(axes))
     length = abs(determinant) ** (1 / 3)
     if length == 0 or np.abs(axes.T @ axes / length**2 - np.eye(3)).max() > 0.02:
@@ -128,7 +140,7 @@ def rigid(matrix: Any, where: str) -> np.ndarray:
     u, _, v = np.linalg.svd(axes)
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = u @ v, given[:3, 3]
-    return found
+    return found, length * largest
 
 
 def opencv() -> Any:

@@ -24,6 +24,7 @@ class Photograph:
         mask: a file, None for none.
         held_out: whether it is for judging alone; None where the capture does not say.
         field_of_view: horizontal, in radians, where there is no lens.
+        scale: of the axes of the matrix in the file, which `camera_to_world` is without.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Photograph:
     mask: Path | None = None
     held_out: bool | None = None
     field_of_view: float = 0.0
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -27,13 +27,20 @@ AXES = {
 """Of each convention, its x, y and z axis as columns in the axes right, up, backwards."""
 
 
-def pose(matrix: object, axes: str, world_to_camera: bool, where: str) -> np.ndarray:
-    """The matrix of a file as camera-to-world, (4, 4), with the axes right, up, backwards. Raises `InputError`."""
-    found = rigid(matrix, where)
+def pose(matrix: object, axes: str, world_to_camera: bool, where: str) -> tuple[np.ndarray, float]:
+    """The matrix of a file as camera-to-world, (4, 4), with the axes right, up, backwards; and the scale of its axes, which is taken out.
+
+    Of [sR | t], world to camera, the camera is at -Rᵀ t / s. Raises `InputError`.
+    """
+    found, scale = rigid(matrix, where)
     if world_to_camera:
+        with np.errstate(over="ignore"):
+            found[:3, 3] /= scale
+        if not np.isfinite(found).all():
+            raise InputError(f"{where}: its axes are too short for its position")
         found = _inverse(found)
     found[:3, :3] = found[:3, :3] @ AXES[axes].T
-    return found
+    return found, scale
 
 
 def reinterpreted(capture: Capture, axes: str, world_to_camera: bool) -> Capture:
@@ -46,7 +53,9 @@ def reinterpreted(capture: Capture, axes: str, world_to_camera: bool) -> Capture
         stored[:3, :3] = stored[:3, :3] @ AXES[capture.axes]
         if capture.world_to_camera:
             stored = _inverse(stored)
-        moved = pose(stored, axes, world_to_camera, photograph.name)
+            stored[:3, 3] *= photograph.scale
+        stored[:3, :3] *= photograph.scale
+        moved, _ = pose(stored, axes, world_to_camera, photograph.name)
         photographs.append(replace(photograph, camera_to_world=moved))
     return replace(capture, photographs=tuple(photographs), axes=axes, world_to_camera=world_to_camera)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from unrender.capture.capture import Capture
 from unrender.capture.formats import colmap, llff, transforms
 from unrender.core.errors import InputError
+from unrender.core.text import printable
 from unrender.io import bounded_files
 
 __all__ = ["FORMATS", "read"]
@@ -51,9 +52,23 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             capture = each.read(folder, masks)
             if not capture.photographs:
                 raise InputError(f"{folder}: none of its photographs is there")
+            _check_masks(capture)
             return capture
     if kind is not None:
         raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
     if (folder / "lights.txt").is_file():
         raise InputError(f"{folder}: one camera under several lights (lights.txt) is not supported yet")
     raise InputError(f"{folder}: no camera poses: expected {'; '.join(each.files for each in FORMATS.values())}")
+
+
+def _check_masks(capture: Capture) -> None:
+    """Raise `InputError` where two photographs have one mask."""
+    owners: dict[Path, Path] = {}
+    for photograph in capture.photographs:
+        if photograph.mask is not None:
+            other = owners.setdefault(photograph.mask.resolve(), photograph.file)
+            if other != photograph.file:
+                two = f"{printable(str(other))} and {printable(str(photograph.file))}"
+                raise InputError(
+                    f"{photograph.mask}: the mask of two photographs, {two}; put masks into folders as the photographs are"
+                )

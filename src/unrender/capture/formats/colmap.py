@@ -93,7 +93,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
             continue
         if image.camera not in lenses:
             raise InputError(f"{images_file}: {printable(image.name)}: no camera {image.camera} in {cameras_file.name}")
-        matrix = pose(_matrix(image, images_file), AXES, True, f"{images_file}: {printable(image.name)}")
+        matrix, _ = pose(_matrix(image, images_file), AXES, True, f"{images_file}: {printable(image.name)}")
         mask = files.find_mask(folder, file, masks)
         photographs.append(Photograph(image.name, file, lenses[image.camera], matrix, mask))
     notices = files.left_out(missing, len(images))

@@ -38,10 +38,13 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
 
     Looked for in this order: in the folder `given`, and nowhere else where there is one; the file that the format names; beside the
     photograph as NAME_mask.png; in a folder that is called after the photograph's, as train_mask is after train; in masks or mask, in
-    `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own.
+    `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own; the path
+    from `folder` or a folder in it to the photograph, the longest first, goes before the name alone.
     """
+    relative = _relative(folder, photograph)
     if given is not None:
-        return _of_name(given, photograph)
+        found = _of_name(given, relative)
+        return None if found == photograph else found
     if named is not None:
         path = folder / named
         if not path.is_file():
@@ -53,16 +56,24 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
             return beside
     own = photograph.parent.with_name(f"{photograph.parent.name}_mask") if photograph.parent.name else folder / "mask"
     places = [own, *(place / name for place in (folder, photograph.parent.parent) for name in _MASK_FOLDERS)]
-    return next((found for place in places if (found := _of_name(place, photograph)) is not None), None)
+    return next((found for place in places if (found := _of_name(place, relative)) is not None), None)
 
 
-def _of_name(folder: Path, photograph: Path) -> Path | None:
-    names = (
-        photograph.name,
-        *(f"{photograph.stem}{e}" for e in PICTURES),
-        *(f"{photograph.name}{e}" for e in PICTURES),
-    )
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+def _relative(folder: Path, photograph: Path) -> list[Path]:
+    """images/left/1.png, left/1.png and 1.png of a photograph images/left/1.png of `folder`."""
+    parts = photograph.relative_to(folder).parts if photograph.is_relative_to(folder) else (photograph.name,)
+    ends = [parts[index:] for index in range(len(parts))]
+    return [Path(*end) for end in ends if ".." not in end]
+
+
+def _of_name(folder: Path, relative: Iterable[Path]) -> Path | None:
+    for path in relative:
+        place = folder / path.parent
+        if place.is_dir():
+            names = (path.name, *(f"{path.stem}{e}" for e in PICTURES), *(f"{path.name}{e}" for e in PICTURES))
+            if (found := next((place / name for name in names if (place / name).is_file()), None)) is not None:
+                return found
+    return None
 
 
 def left_out(missing: list[str], count: int) -> tuple[str, ...]:

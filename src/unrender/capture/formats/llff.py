@@ -39,6 +39,8 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         raise InputError(f"{path}: expected rows of 17 finite numbers, got shape {rows.shape}")
     place = next((folder / name for name in _FOLDERS if files.pictures(folder / name)), folder)
     pictures = files.pictures(place)
+    masks_beside = {f"{path.stem.removesuffix('_rgb').removesuffix('_rgba')}_mask" for path in pictures}
+    pictures = [path for path in pictures if path.stem not in masks_beside]
     if len(pictures) != len(rows):
         many = f"{len(rows)} poses, and {place} has {len(pictures)} pictures"
         raise InputError(f"{path}: {many}: they belong together in the order of names, so none may be missing")
@@ -52,5 +54,6 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         mask = files.find_mask(folder, file, masks)
-        photographs.append(Photograph(file.name, file, lens, pose(matrix[:, :4], AXES, False, where), mask))
+        found, scale = pose(matrix[:, :4], AXES, False, where)
+        photographs.append(Photograph(file.name, file, lens, found, mask, scale=scale))
     return Capture(folder, "llff", tuple(photographs), AXES, False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +80,9 @@ def _photograph(
         raise InputError(f"{where}: mask_path: expected a path, got {printable(repr(named)[:60])}")
     numbers = {**document, **frame}
     lens, angle = _lens(numbers, where)
-    matrix = pose(frame.get("transform_matrix"), AXES, False, f"{where}: transform_matrix")
+    matrix, scale = pose(frame.get("transform_matrix"), AXES, False, f"{where}: transform_matrix")
     mask = files.find_mask(folder, file, masks, named)
-    return Photograph(frame["file_path"], file, lens, matrix, mask, held_out, angle)
+    return Photograph(frame["file_path"], file, lens, matrix, mask, held_out, angle, scale)
 
 
 def _lens(numbers: Mapping[str, Any], where: str) -> tuple[Lens | None, float]:
@@ -101,9 +102,15 @@ def _lens(numbers: Mapping[str, Any], where: str) -> tuple[Lens | None, float]:
         angle = _number(numbers, "camera_angle_x", where)
         if not 0 < angle < math.pi:
             raise InputError(f"{where}: camera_angle_x: expected radians from 0 to π, got {angle:g}")
-        if "w" not in numbers or "h" not in numbers or "cx" in numbers:
+        if not {"w", "h"} <= set(numbers) and not {"cx", "cy"} & set(numbers):
             return None, angle
-        return Lens.of_field_of_view(angle, *(round(_number(numbers, name, where)) for name in ("w", "h"))), angle
+        width, height = (round(_number(numbers, name, where)) for name in ("w", "h"))
+        try:
+            lens = Lens.of_field_of_view(angle, width, height)
+            cx, cy = (_number(numbers, name, where, side / 2) for name, side in (("cx", width), ("cy", height)))
+            return replace(lens, cx=cx, cy=cy), angle
+        except InputError as error:
+            raise InputError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
     fx = _number(numbers, "fl_x", where)
     fy = _number(numbers, "fl_y", where, fx)
     width, height = (round(_number(numbers, name, where)) for name in ("w", "h"))
@@ -118,6 +125,9 @@ def _number(numbers: Mapping[str, Any], name: str, where: str, default: float | 
     value = numbers.get(name, default)
     if value is None:
         raise InputError(f"{where}: {name}: missing, expected a number")
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{where}: {name}: expected a number, got {printable(repr(value)[:60])}")
-    return float(value)
+    try:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        pass
+    raise InputError(f"{where}: {name}: expected a number, got {printable(repr(value)[:60])}")
