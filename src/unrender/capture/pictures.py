@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +28,9 @@ _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 _MIRRORED = (2, 4, 5, 7)
 _LONGEST_SIDE = 1 << 15
 """In pixels, exclusive: OpenCV's `remap` takes no more."""
+_GUARDED = ("JPEG", "MPO", "PNG", "BMP")
+"""Pillow's names of kinds that a few bytes can make much of."""
+_BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
 
@@ -49,17 +53,33 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
     Raises `InputError` where the file is no picture, or too large a one.
     """
     if path.suffix.lower() in _RAW:
-        raise InputError(f"{path}: camera raw files are not read; develop them to .tif, .png or .exr, linear or sRGB")
+        raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
     if (found := bounded_files.kind(path)) != "file":
         raise InputError(f"{path}: {'not a file' if found else 'no such file'}")
     try:
         with _opened(path) as picture:
-            return picture.width, picture.height, int(picture.getexif().get(_ORIENTATION, 1))
-    except UnidentifiedImageError:
+            if picture.format == "PNG":
+                picture.load()  # EXIF may follow the pixels
+            return picture.width, picture.height, _orientation(picture)
+    except InputError:
+        raise
+    except UnidentifiedImageError as error:
+        if path.suffix.lower() in _BY_OPENCV:
+            raise InputError(
+                f"{path}: cannot be read as a picture; save floating-point values as .exr, not as .tif"
+            ) from error
         height, width = _by_mitsuba(path).values.shape[:2]  # OpenEXR, which Pillow does not know
         return width, height, 1
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except _BROKEN as error:
         raise InputError(f"{path}: cannot be read as a picture: {_one_line(error)}") from error
+
+
+def _orientation(picture: Image.Image) -> int:
+    """EXIF's, 1 where there is none or it cannot be read."""
+    try:
+        return int(picture.getexif().get(_ORIENTATION, 1))
+    except Exception:  # what cameras and editors write there is often broken, and Pillow throws whatever it meets
+        return 1
 
 
 def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]:
@@ -152,9 +172,14 @@ def _decode(path: Path) -> np.ndarray | None:
 def _opened(path: Path) -> Iterator[Image.Image]:
     """The file as Pillow sees it, whose header says no more than is read here."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is as large
+        warnings.simplefilter("ignore")  # of sizes, where our own limit is as large, and of broken EXIF
         with Image.open(path) as picture:
             _check_size(path, picture.width, picture.height)
+            if picture.format in _GUARDED:
+                try:
+                    image_size.check(path)
+                except InputError as error:
+                    raise InputError(f"{path}: {error}") from error
             yield picture
 
 
@@ -171,7 +196,9 @@ def _decode_pillow(path: Path) -> np.ndarray:
         with _opened(path) as picture:
             transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
             return np.array(picture.convert("RGBA" if transparent else "RGB"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except InputError:
+        raise
+    except _BROKEN as error:
         raise InputError(f"{path}: cannot be read as a picture: {_one_line(error)}") from error
 
 
@@ -195,6 +222,7 @@ def _decode_opencv(path: Path) -> np.ndarray:
 
 def _by_mitsuba(path: Path) -> Pixels:
     values = images.read(path).values
+    _check_size(path, values.shape[1], values.shape[0])
     return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, None)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.capture.cameras import FISHEYE, Lens, opencv
+from unrender.core.errors import InputError
 
 __all__ = ["Resampling", "pinhole"]
 
@@ -27,8 +28,15 @@ def pinhole(lens: Lens, scale: float) -> Lens:
     """The camera of the result: no distortion, square pixels, `scale` (at most 1) times as many along each side.
 
     The scale is the same along both sides, exactly: what is left of a last pixel is cropped. The principal point goes with it.
+
+    Raises:
+        InputError: no whole pixel is left along a side.
     """
-    width, height = (max(1, math.floor(scale * side + 1e-9)) for side in (lens.width, lens.height))
+    width, height = (math.floor(scale * side + 1e-9) for side in (lens.width, lens.height))
+    if min(width, height) < 1:
+        raise InputError(
+            f"{lens.width} x {lens.height} pixels at a scale of {scale:.3g} leave less than one along a side"
+        )
     focal = scale * math.sqrt(lens.fx * lens.fy)
     return Lens(width, height, focal, focal, scale * lens.cx, scale * lens.cy)
 

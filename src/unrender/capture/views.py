@@ -100,10 +100,12 @@ def _split(photographs: Sequence[Photograph], every: int | None) -> list[bool]:
 
 def _view(photograph: Photograph, resolution: int, scale: float | None, held_out: bool) -> tuple[CapturedView, bool]:
     width, height, orientation = pictures.upright(photograph.file, photograph.lens)
-    lens = photograph.lens or Lens.of_field_of_view(photograph.field_of_view, width, height)
-    lens = lens.scaled(width, height)
-    longest = max(lens.width, lens.height)
-    target = pinhole(lens, min(1.0, resolution / longest) if scale is None else scale)
+    try:
+        lens = photograph.lens or Lens.of_field_of_view(photograph.field_of_view, width, height)
+        lens = lens.scaled(width, height)
+        target = pinhole(lens, min(1.0, resolution / max(width, height)) if scale is None else scale)
+    except InputError as error:
+        raise InputError(f"{photograph.file}: {error}") from error
     read = pictures.read(photograph.file, orientation)
     if read.values.shape[:2] != (height, width):
         have = f"{read.values.shape[1]} x {read.values.shape[0]}"
