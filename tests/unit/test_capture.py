@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
-from unrender.capture import atlas, hull
+import unrender
+from unrender.capture import atlas, formats, hull, importing, pictures
 from unrender.capture.cameras import Lens, project, rigid
+from unrender.capture.capture import Capture, Photograph
+from unrender.capture.conventions import AXES, pose, reinterpreted
 from unrender.capture.formats import colmap
 from unrender.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
 from unrender.capture.undistortion import Resampling, pinhole
@@ -164,8 +171,17 @@ def test_a_folded_polynomial_shows_nothing_twice() -> None:
 
 def test_matrices_that_are_no_poses_are_refused() -> None:
     good = np.eye(4)
-    np.testing.assert_allclose(rigid(5 * good[:3], "here"), good)
-    for bad in (np.zeros((4, 4)), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan), [[1, 2], [3, 4]], "text", None):
+    for given, scale in ((5 * good[:3], 5), (np.diag([6.0, 6, 6, 3]), 2), (np.diag([1e200, 1e200, 1e200, 1]), 1e200)):
+        found, length = rigid(given, "here")
+        np.testing.assert_allclose(found, good)
+        assert length == pytest.approx(scale)
+    tilted = np.eye(4)
+    tilted[3, 0] = 0.1
+    mirrored = np.diag([1.0, 1, -1, 1])
+    huge = [[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    beyond = np.diag([1e300, 1e300, 1e300, 1e-300])
+    none = (np.zeros((4, 4)), np.full((4, 4), np.nan), [[1, 2], [3, 4]], "text", None)
+    for bad in (mirrored, tilted, np.diag([1.0, 1, 1, 0]), huge, beyond, *none):
         with pytest.raises(InputError, match=r"^here: "):
             rigid(bad, "here")
 
@@ -176,3 +192,128 @@ def test_a_cut_model_is_one_line(cut: int, tmp_path: Path) -> None:
     (tmp_path / "images.bin").write_bytes((b"\5" + 200 * b"\0")[:cut])
     with pytest.raises(InputError, match=r"(cameras|images)\.bin: "):
         colmap.read(tmp_path)
+
+
+def _rotation() -> np.ndarray:
+    return _camera(np.array([0.4, 0.5, -0.7]), 2.0)[:3, :3]
+
+
+@pytest.mark.parametrize("world_to_camera", [False, True])
+@pytest.mark.parametrize("axes", AXES)
+def test_a_scale_of_a_matrix_leaves_the_camera_where_it_is(axes: str, world_to_camera: bool) -> None:
+    """x' = s R x + t: what is at 0 is the camera, at -R^T t / s; of camera to world, it is t."""
+    scale, t, turn = 2.5, np.array([1.0, -2.0, 3.0]), _rotation()
+    stored = np.column_stack([scale * turn, t])
+    expected = np.linalg.solve(stored[:, :3], -t) if world_to_camera else t
+    found, length = pose(stored, axes, world_to_camera, "here")
+    np.testing.assert_allclose(found[:3, 3], expected)
+    photograph = Photograph("a", Path("a.png"), LENS, found, scale=length)
+    capture = Capture(Path(), "transforms", (photograph,), axes, world_to_camera)
+    for other in (False, True):
+        (moved,) = reinterpreted(capture, "opencv", other).photographs
+        np.testing.assert_allclose(moved.camera_to_world, pose(stored, "opencv", other, "here")[0], atol=1e-12)
+
+
+def test_lenses_that_leave_no_pixel_or_have_no_width_are_refused() -> None:
+    with pytest.raises(InputError, match=r"40 x 40 pixels at a scale of 0\.01"):
+        pinhole(Lens(40, 40, 48.0, 48.0, 20.0, 20.0), 0.01)
+    with pytest.raises(InputError, match="angle of view"):
+        Lens.of_field_of_view(5e-324, 40, 40)
+    with pytest.raises(InputError, match="width and height"):
+        Lens(10**400, 40, 48.0, 48.0, 20.0, 20.0)
+    with pytest.raises(InputError, match="--voxels 512"):
+        importing.Options(voxels=512)
+
+
+def test_the_atlas_program_imports_nothing_from_the_current_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("xatlas", reason="atlases need xatlas: pip install 'unrender[capture]'")
+    (tmp_path / "numpy.py").write_text("open('was-run', 'w')\n")
+    assert unrender.__file__ is not None
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.path.relpath(Path(unrender.__file__).parents[1]))
+    assert atlas.unwrap(Mesh(np.eye(3), np.array([[0, 1, 2]])), 16).uv is not None
+    assert not (tmp_path / "was-run").exists()
+
+
+# ---------------------------------------------------------------------- files
+
+
+def _picture(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return path
+
+
+def _transforms(folder: Path, names: list[str], **more: object) -> None:
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
+    document = {"camera_angle_x": 0.8, "frames": frames, **more}
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+NAMES = ["images/left/1.jpg", "images/right/1.jpg"]
+
+
+@pytest.mark.parametrize("place", ["masks/images/{}/1.png", "masks/{}/1.png", "masks/{}/1.jpg.png"])
+def test_masks_of_photographs_in_folders_are_told_apart(place: str, tmp_path: Path) -> None:
+    for name in NAMES:
+        _picture(tmp_path / name)
+    masks = [_picture(tmp_path / place.format(side)) for side in ("left", "right")]
+    _transforms(tmp_path, NAMES)
+    assert [photograph.mask for photograph in formats.read(tmp_path).photographs] == masks
+    given = formats.read(tmp_path, masks=tmp_path / "masks")
+    assert [photograph.mask for photograph in given.photographs] == masks
+
+
+def test_a_mask_of_two_photographs_is_refused(tmp_path: Path) -> None:
+    for name in (*NAMES, "masks/1.png"):
+        _picture(tmp_path / name)
+    _transforms(tmp_path, NAMES)
+    with pytest.raises(InputError, match=r"masks/1\.png: the mask of two photographs"):
+        formats.read(tmp_path)
+
+
+def test_a_principal_point_beside_an_angle_of_view_is_kept(tmp_path: Path) -> None:
+    _picture(tmp_path / "a.png")
+    _transforms(tmp_path, ["a.png"], w=60, h=40, cx=25.0, cy=22.0)
+    lens = formats.read(tmp_path).photographs[0].lens
+    assert lens is not None
+    assert (lens.cx, lens.cy) == (25, 22)
+    assert lens.fx == lens.fy == pytest.approx(30 / np.tan(0.4))
+    for more in ({"cx": 25.0}, {"w": 10**400, "h": 40}, {"w": 60, "h": 40, "camera_angle_x": 5e-324}):
+        _transforms(tmp_path, ["a.png"], **more)
+        with pytest.raises(InputError, match=r"transforms\.json: frames\[0\]: "):
+            formats.read(tmp_path)
+
+
+def test_masks_beside_llffs_photographs_are_not_counted(tmp_path: Path) -> None:
+    masks = [_picture(tmp_path / "images" / f"{name}_mask.png") for name in "ab"]
+    files = [_picture(tmp_path / "images" / f"{name}.jpg") for name in "ab"]
+    row = np.r_[np.column_stack([np.eye(3), np.zeros(3), [40, 60, 50]]).ravel(), 1, 9]
+    np.save(tmp_path / "poses_bounds.npy", np.array([row, row]))
+    found = formats.read(tmp_path).photographs
+    assert [(photograph.file, photograph.mask) for photograph in found] == list(zip(files, masks, strict=True))
+
+
+def test_broken_exif_is_passed_over(tmp_path: Path) -> None:
+    text = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x02\0\x04\0\0\0ab\0\0\0\0\0\0"  # an orientation in letters
+    for exif in (text, b"Exif\0\0II*\0\xff\xff\xff\xff"):
+        Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", exif=exif)
+        assert pictures.upright(tmp_path / "a.jpg", None) == (8, 6, 1)
+
+
+def test_a_photograph_of_a_thousand_scans_is_refused(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    Image.new("RGB", (8, 6)).save(buffer, "JPEG", progressive=True)
+    (tmp_path / "a.jpg").write_bytes(buffer.getvalue() + 1000 * b"\xff\xda")
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be read as a picture: more than 100 scans"):
+        pictures.upright(tmp_path / "a.jpg", None)
+
+
+def test_a_tiff_of_another_kind_names_exr(tmp_path: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "a.tif"), np.ones((6, 8, 3), np.float32))
+    with pytest.raises(InputError, match=r"a\.tif: cannot be read as a picture; save floating-point values as \.exr"):
+        pictures.upright(tmp_path / "a.tif", None)
