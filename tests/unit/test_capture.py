@@ -317,3 +317,21 @@ def test_a_tiff_of_another_kind_names_exr(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.tif"), np.ones((6, 8, 3), np.float32))
     with pytest.raises(InputError, match=r"a\.tif: cannot be read as a picture; save floating-point values as \.exr"):
         pictures.upright(tmp_path / "a.tif", None)
+
+
+def test_a_side_that_opencv_does_not_take_is_refused_of_mitsubas_kinds_too(tmp_path: Path) -> None:
+    (tmp_path / "a.pfm").write_bytes(b"PF\n32768 1\n-1.0\n" + bytes(12 * 32768))
+    with pytest.raises(InputError, match=r"a\.pfm: 32768 x 1 pixels, expected at most"):
+        pictures.upright(tmp_path / "a.pfm", None)
+
+
+@pytest.mark.parametrize("name", ["xatlas", "fast_simplification"])
+def test_a_missing_package_is_told_before_photographs_are_read(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file in ("a.png", "a_mask.png"):  # empty: to read them is an error
+        _picture(tmp_path / file)
+    _transforms(tmp_path, ["a.png"])
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=r"pip install 'unrender\[capture\]'"):
+        importing.import_capture(tmp_path, tmp_path / "out", importing.Options())
