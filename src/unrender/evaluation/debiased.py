@@ -44,6 +44,7 @@ def rmse(
     count = float(weight.sum()) * a.shape[2]
     if count == 0:
         return 0.0, 0.0
+    a, b, r = (np.where(weight[..., None] > 0, x, 0.0) for x in (a, b, r))
     with np.errstate(over="ignore", invalid="ignore"):
         products = np.sum((a - r) * (b - r), axis=2)
         square = float(np.sum(weight * products)) / count

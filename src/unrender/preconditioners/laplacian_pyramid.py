@@ -25,6 +25,9 @@ from unrender.preconditioners import grid
 
 __all__ = ["LaplacianPyramid"]
 
+_LEAST_FALLOFF = 0.001
+"""Below it, nothing but the coarsest level moves."""
+
 
 @register
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class LaplacianPyramid:
     Args:
         levels: of the pyramid, the texture itself among them, >= 1; 1 does nothing. None for all, down to a single texel. More than these
             are as all.
-        falloff: r, a level's share over that of the next coarser one, in (0, 1].
+        falloff: r, a level's share over that of the next coarser one, in [0.001, 1].
         wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per
             axis: an environment map (H, W, C) wraps as (False, True).
     """
@@ -62,8 +65,8 @@ class LaplacianPyramid:
     def __post_init__(self):
         if self.levels is not None:
             checks.integer("LaplacianPyramid", "levels", self.levels, at_least=1)
-        if checks.number("LaplacianPyramid", "falloff", self.falloff, above=0.0) > 1:
-            raise InputError(f"LaplacianPyramid: falloff must be at most 1, got {self.falloff!r}")
+        if not _LEAST_FALLOFF <= checks.number("LaplacianPyramid", "falloff", self.falloff, above=0.0) <= 1:
+            raise InputError(f"LaplacianPyramid: falloff must be from {_LEAST_FALLOFF} to 1, got {self.falloff!r}")
         object.__setattr__(self, "wrap", grid.wraps("LaplacianPyramid", self.wrap))
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
