@@ -112,7 +112,16 @@ def test_a_table_makes_one_and_says_what_is_wrong() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"levels": 0}, {"levels": 2.5}, {"falloff": 0.0}, {"falloff": 1.5}, {"falloff": 1e-200}, {"falloff": "x"}, {"wrap": 1}]
+    "options",
+    [
+        {"levels": 0},
+        {"levels": 2.5},
+        {"falloff": 0.0},
+        {"falloff": 1.5},
+        {"falloff": 1e-200},
+        {"falloff": "x"},
+        {"wrap": 1},
+    ],
 )
 def test_refuses_options(options: dict) -> None:
     with pytest.raises(InputError, match=r"LaplacianPyramid: (levels|falloff|wrap) must"):

@@ -129,6 +129,7 @@ class Problem:
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
+        self._as_given: Problem | None = None
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
@@ -136,6 +137,11 @@ class Problem:
         from unrender.problem.toml_file import read
 
         return read(path)
+
+    @property
+    def as_given(self) -> Problem:
+        """The problem before an optimizer's parameterisations were added (`reparameterised`)."""
+        return self._as_given or self
 
     def reparameterised(self, given: Mapping[str, Any]) -> Problem:
         """The same problem with these parameterisations, {key: one, or its name}, for the parameters that have none of their own.
@@ -146,6 +152,7 @@ class Problem:
         if not missing:
             return self
         found = copy.copy(self)
+        found._as_given = self.as_given
         made = {k: check_parameterisation(g, self.bounds[k], self._initial[k]) for k, g in missing.items()}
         found.parameters = tuple(
             replace(p, parameterisation=made[p.key][0]) if p.key in made else p for p in self.parameters

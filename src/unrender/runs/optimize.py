@@ -147,7 +147,9 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
     """The writer of a run's folder, to be used as a context manager. What goes wrong with the folder goes to the run's warnings."""
     table = method_file.serialize(run, method, checkpoint_every, final_spp)
     # By a closure: resuming replaces the list of warnings.
-    return RunWriter(folder, run.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line))
+    return RunWriter(
+        folder, run.problem.as_given, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line)
+    )
 
 
 @exclusive("estimate")
