@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,7 +123,8 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
 
     def fill(place: Path) -> None:
         with phases.phase("problem"):
-            problem_folder.write(place, folder.resolve().name, found.views, mesh, options.texture)
+            name = folder.resolve().name
+            problem_folder.write(place, name, found.views, mesh, found.silhouettes, options.texture)
             (place / SHEET).write_bytes(
                 _sheet(
                     found, [overlays.thumbnail(_overlay(found, index)) for index in overlays.chosen(len(found.views))]
@@ -241,13 +240,7 @@ def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:
 
 def _write_folder(out: Path, fill: Callable[[Path], None]) -> None:
     files.remove_leftovers(out.parent, (out.name,))
-    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
-        try:
-            files.make_folder(partial)
-            fill(partial)
-            files.replace_folder(partial, out)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        files.write_folder(out, fill)
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error

@@ -36,7 +36,9 @@ _FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 """A camera's axes left, up, forwards, which are Mitsuba's, in those of `cameras`: right, up, backwards."""
 
 
-def write(folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, texture: int) -> None:
+def write(
+    folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, silhouettes: Silhouettes, texture: int
+) -> None:
     """Write the problem to an empty folder.
 
     Args:
@@ -44,6 +46,7 @@ def write(folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, te
         name: of the problem.
         views: of photographs.
         mesh: with texture coordinates.
+        silhouettes: of it.
         texture: texels along the sides of the base colour.
 
     Raises:
@@ -54,7 +57,6 @@ def write(folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, te
     (folder / SCENE).write_bytes(_scene(views, stems, mesh))
     for part in _FOLDERS:
         (folder / part).mkdir()
-    silhouettes = Silhouettes(mesh)
     level = []
     for view, stem in zip(views, stems, strict=True):
         mask = _loss_mask(view, silhouettes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -101,21 +100,16 @@ def export(
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
-    partial = out.with_name(f".{out.name}.{os.getpid()}.part")
+    renderer, plain = problem.renderer, not problem.renderer.pair.emissive
+
+    def fill(folder: Path) -> list[str]:
+        notices = maps.write(values, folder)
+        if plain:
+            return _fill(folder, renderer, values, problem.max_depth, spp) + notices
+        return [*notices, f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"]
+
     try:
-        try:
-            files.make_folder(partial)
-            notices = maps.write(values, partial)
-            plain = not problem.renderer.pair.emissive
-            if plain:
-                notices = _fill(partial, problem.renderer, values, problem.max_depth, spp) + notices
-            else:
-                notices.append(
-                    f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
-                )
-            files.replace_folder(partial, out)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        notices = files.write_folder(out, fill)
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
     return Exported(out, out / SCENE if plain else None, tuple(notices))

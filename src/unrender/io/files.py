@@ -16,8 +16,9 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -35,7 +36,10 @@ __all__ = [
     "temporary",
     "write",
     "write_arrays",
+    "write_folder",
 ]
+
+_T = TypeVar("_T")
 
 PARTIAL, RETIRED = "part", "old"
 """Ends of the names of what is being written, and of what is being removed."""
@@ -196,6 +200,25 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 # ---------------------------------------------------------------------- what processes left that died
+
+
+def write_folder(place: Path, fill: Callable[[Path], _T]) -> _T:
+    """Put a folder at `place`, in place of one that is there now, as `replace_folder` does; nothing is left of one that was not filled.
+
+    Args:
+        place: where it comes to stand; what is above it is made.
+        fill: given an empty folder, writes what belongs there.
+
+    Returns what `fill` does. Raises `OSError`, and what `fill` raises.
+    """
+    partial = place.with_name(f".{place.name}.{os.getpid()}.{PARTIAL}")
+    try:
+        make_folder(partial)
+        found = fill(partial)
+        replace_folder(partial, place)
+        return found
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None:
