@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.renderer import SampleRequest
 
-__all__ = ["BoundaryTerm", "moved_shape", "obstacle"]
+__all__ = ["BoundaryTerm", "moved_shape", "obstacles"]
 
 _STREAM = 3
 """Of the key of a request: numbers that its paths do not have."""
@@ -29,13 +30,17 @@ def moved_shape(scene: LoadedScene, key: str) -> str:
     return owner if name == "vertex_positions" else ""
 
 
-def obstacle(pair: ScenePair, target: str) -> str:
-    """Why there is no boundary derivative of a moving shape, "" where there is."""
+def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
+    """{target: why there is no boundary derivative of a moving shape, "" where there is}."""
+    shapes = {shape.id(): shape for shape in pair.current.shapes()}
+    return {target: _obstacle(pair, target, shapes.get(target)) for target in targets}
+
+
+def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes know no media"
     if any(sensor.id() == target for sensor in pair.current.sensors()):
         return "path gradients do not move sensors"
-    shape = next((shape for shape in pair.current.shapes() if shape.id() == target), None)
     if shape is None:
         return "path gradients do not move instances"
     if not shape.is_mesh():

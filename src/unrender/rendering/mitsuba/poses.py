@@ -17,6 +17,7 @@ Since each ray may have its own transform, one launch renders any number of pose
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -63,14 +64,15 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     shapes = [shape.id() for shape in scene.shapes() if not (shape.is_emitter() or shape.is_sensor())]
     sensors = [sensor.id() for sensor in scene.sensors() if sensor.get_shape() is None]
     found: dict[str, PoseKey] = {}
-    for target in shapes + sensors:
-        if _NAMELESS.fullmatch(target) or (shapes + sensors).count(target) > 1:
+    counts, moved = Counter(shapes + sensors), frozenset(shapes)
+    for target, count in counts.items():
+        if _NAMELESS.fullmatch(target) or count > 1:
             continue
         for part in ("translation", "rotation"):
             for axis in (None, 0, 1, 2):
                 key = f"{target}.{part}" + ("" if axis is None else f".{_AXES[axis]}")
                 found[key] = PoseKey(target, part, axis)
-        if target in shapes:
+        if target in moved:
             found[f"{target}.scale"] = PoseKey(target, "scale", None)
     return found
 

@@ -11,7 +11,7 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import ignored, poses
-from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacle
+from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -47,9 +47,8 @@ class MitsubaRenderer:
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = dict(self.pair.info())
-        obstacles = {pose.target: "" for pose in self._poses.values()}
-        obstacles = {target: obstacle(self.pair, target) for target in obstacles}
-        self._info |= {key: poses.info(pose, obstacles[pose.target]) for key, pose in self._poses.items()}
+        found = obstacles(self.pair, {pose.target for pose in self._poses.values()})
+        self._info |= {key: poses.info(pose, found[pose.target]) for key, pose in self._poses.items()}
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], bool], MitsubaSession] = {}
         self._stock: StockSession | None = None
@@ -110,7 +109,7 @@ class MitsubaRenderer:
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         shape = moved_shape(self.pair.loaded(), key)
-        if derivatives and shape and key not in self._poses and (why := obstacle(self.pair, shape)):
+        if derivatives and shape and key not in self._poses and (why := obstacles(self.pair, [shape])[shape]):
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
         if not info.perturbable:
             raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")
