@@ -105,7 +105,7 @@ def limit(count: int, level: float = 1e-4) -> float:
 
 def test_the_first_problem_is_the_one_to_begin_with():
     assert NAMES[0] == "indirect-room"
-    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, "sphere-to-mesh"} == set(NAMES)
+    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, "sphere-to-mesh", "camera"} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -152,7 +152,7 @@ def test_an_unknown_name_is_told_the_nearest(ask):
         ({"views": 99}, "views must be at most 16, got 99"),
         (
             {"loss": "l1"},
-            'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual", got "l1"; did you mean L1?',
+            'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual" or "Censored", got "l1"; did you mean L1?',
         ),
         ({"loss": ur.losses.L1}, "loss must be one of unrender.losses or its name"),
         ({"loss": 1}, "loss must be one of unrender.losses or its name, got 1"),

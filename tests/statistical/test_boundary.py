@@ -73,7 +73,7 @@ def smooth() -> dict[str, Any]:
 
 def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool = True) -> np.ndarray:
     """(RUNS, n)."""
-    renderer = MitsubaRenderer(description, depth)
+    renderer = MitsubaRenderer(description, depth, [key])
     session = renderer.prepare([key], None)
     if not boundary:
         session._boundary = None
@@ -85,18 +85,18 @@ def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool =
     return np.stack(found).astype(float)
 
 
-def differences(description: Any, key: str, depth: int, spp: int) -> np.ndarray:
+def differences(description: Any, key: str, depth: int, spp: int, step: float = STEP) -> np.ndarray:
     """(RUNS, n), central, with the same random numbers on both sides."""
     renderer = MitsubaRenderer(description, depth)
     session = renderer.prepare([key], None, derivatives=False)
     loaded = np.array(renderer.values([key])[key])
-    steps = np.eye(max(loaded.size, 1)) * STEP
+    steps = np.eye(max(loaded.size, 1)) * step
     states = np.concatenate([loaded + steps.reshape(-1, *loaded.shape), loaded - steps.reshape(-1, *loaded.shape)])
     found = []
     for run in range(RUNS):
         images = np.array(session.image_batch({key: states}, SampleRequest(0, spp, 500 + run))).astype(float)
         sums = (images * weights()).sum(axis=(1, 2, 3))
-        found.append((sums[: len(steps)] - sums[len(steps) :]) / (2 * STEP))
+        found.append((sums[: len(steps)] - sums[len(steps) :]) / (2 * step))
     return np.stack(found)
 
 

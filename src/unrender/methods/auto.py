@@ -19,6 +19,7 @@ from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Choice, Options, method, parameterised
+from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
@@ -26,6 +27,7 @@ from unrender.preconditioners import Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
+from unrender.schedules import Exponential
 
 __all__ = ["AutoMethod"]
 
@@ -45,6 +47,8 @@ _MOST_NUMBERS, _MOST_MARGINS = 4, 10
 """Elements of a number or colour that moves as its logarithm; and the distance from its bound that it has at least, in margins."""
 _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
+_CAMERA_SHARE = 0.1
+"""First steps of sensors' poses, in units of the world and radians, over `learning_rate`."""
 _FRESH_FROM = 16
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _MOST_PIXELS = 1 << 19
@@ -67,7 +71,8 @@ class AutoMethod(Options):
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
     memory, each step has its own rendering. Textures and grids move along Sobolev gradients, parameters by steps in proportion to their
-    range. Where path gradients do not reach a parameter, as of a pose, it is `smoothed`. Every choice can be set.
+    range. Where path gradients do not reach a parameter, as of a pose, it is `smoothed`; cameras move along path gradients. Every choice
+    can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -100,6 +105,8 @@ class AutoMethod(Options):
 
     def choose(self, problem: Problem) -> Choice:
         """See `Options.choose`."""
+        if _is_of_cameras(problem):
+            return self._of_cameras(problem)
         if unreachable := _unreachable(problem):
             reason = f"derivatives of a smoothed loss (method smoothed): {unreachable}"
             return Choice(*method("smoothed").start(), (reason,))
@@ -136,6 +143,17 @@ class AutoMethod(Options):
         fresh_from = _FRESH_FROM if smoothed and remembers else 0
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
+
+    def _of_cameras(self, problem: Problem) -> Choice:
+        """Where sensors alone are unknown."""
+        sampler, drawn = self._sampler(problem)
+        spp, rate = self._samples(problem, sampler), _CAMERA_SHARE * self.learning_rate
+        image = RecursiveControlVariate("primary") if self.image == "rcv" else Plain()
+        reason = (
+            f"path gradients of cameras, {spp} samples per pixel, Adam, first rate {rate:.3g}, halved every 30 steps"
+        )
+        descent = Adam(rate, beta_2=0.99, schedule=Exponential(30, 0.01))
+        return Choice(PathGradient(image, sampler, spp), descent, tuple(filter(None, (reason, drawn))))
 
     def _image(self, problem: Problem, whole: bool) -> _Image:
         if self.image == "plain":
@@ -177,6 +195,12 @@ class AutoMethod(Options):
         )
 
 
+def _is_of_cameras(problem: Problem) -> bool:
+    """Whether all parameters are poses of sensors that path gradients reach. Lenses are in other units."""
+    known = problem.renderer.parameters()
+    return all(known[key].viewpoint and known[key].rigid and known[key].differentiable for key in problem.shapes())
+
+
 def _unreachable(problem: Problem) -> str:
     """Why path gradients of the parameters do not serve; "" where they do."""
     known = problem.renderer.parameters()
@@ -199,7 +223,9 @@ def _firefly_share(problem: Problem) -> float:
     session = problem.renderer.prepare(list(parameters), None, derivatives=False)
     noise = []
     for view in range(min(len(problem.views), _PILOT_VIEWS)):
-        groups = arrays.numpy(session.image(parameters, SampleRequest(view, _PILOT_SPP, 0, 2)).images)
+        groups = arrays.numpy(
+            session.image(parameters, SampleRequest(problem.views[view].sensor, _PILOT_SPP, 0, 2)).images
+        )
         noise.append(np.square(groups[0] - groups[1], dtype=np.float64).sum(axis=-1).ravel())
     found = np.sort(np.concatenate(noise))[::-1]
     whole = found.sum()

@@ -48,6 +48,7 @@ class ParameterInfo:
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
+        viewpoint: whether it is a sensor's pose or lens.
         mesh: of vertex positions (3 V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
     """
@@ -62,6 +63,7 @@ class ParameterInfo:
     compiled: bool = False
     resizable: bool = False
     rigid: bool = False
+    viewpoint: bool = False
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
 
 
@@ -76,6 +78,8 @@ class SampleRequest:
         groups: how many independent images the samples are split into.
         pixels: flat pixel indices (row-major), or None for the whole film.
         sensors: of each chosen pixel, in place of `sensor`; None where all are of that one.
+        positions: of each chosen pixel among those that the seed is for, by which its random numbers are drawn: a part of a mini-batch
+            is rendered as the whole would be. None where these are all.
     """
 
     sensor: int
@@ -84,6 +88,7 @@ class SampleRequest:
     groups: int = 1
     pixels: Array | None = None
     sensors: Array | None = None
+    positions: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
+from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import SampleRequest
 
 __all__ = ["BoundaryTerm", "moved_shape", "obstacles"]
@@ -39,18 +41,17 @@ def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
 def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes know no media"
-    if any(sensor.id() == target for sensor in pair.current.sensors()):
-        return "path gradients do not move sensors"
     if shape is None:
         return "path gradients do not move instances"
     if not shape.is_mesh():
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():
         return "path gradients do not move emitters"
-    for sensor in pair.current.sensors():
-        kind = sensor.class_name()
-        if kind != "PerspectiveCamera":
-            return f"boundary derivatives are limited to perspective sensors, and {sensor.id()} is another ({kind})"
+    kinds = [sensor.class_name() for sensor in pair.current.sensors()]
+    if "PerspectiveCamera" not in kinds:
+        return (
+            f"boundary derivatives are limited to perspective sensors, of which the scene has none ({', '.join(kinds)})"
+        )
     return ""
 
 
@@ -75,7 +76,7 @@ class BoundaryTerm:
 
     def accumulate(self, scene: LoadedScene, request: SampleRequest, weights: mi.TensorXf) -> None:
         """Add to the gradients of the scene's leaves those of the mean over groups g of sum(weights[g] * image), by as many samples as
-        the request has, of numbers of its own.
+        the request has, rounded up to a power of two for pixels of its own choice, of numbers of their own.
 
         Args:
             scene: its parameters are set and attached.
@@ -83,36 +84,16 @@ class BoundaryTerm:
             weights: of `RenderSession.adjoint`.
         """
         key = Key(request.seed, 0, _STREAM)
-        for sensor, image in self._images(request, weights):
-            height, width = self._resolutions[sensor]
-            pixels = height * width if request.pixels is None else dr.width(request.pixels)
-            found = self._integrator.weighted_image(
-                scene.scene, scene.scene.sensors()[sensor], image, key.fold(sensor).uint32(), pixels * request.spp
-            )
+        for view in views_of(request, weights, self._resolutions):
+            sensor = scene.scene.sensors()[view.sensor]
+            if sensor.class_name() != "PerspectiveCamera":
+                raise InputError(
+                    f"sensor {sensor.id()}: moving shapes have path gradients in perspective views only, and it is another "
+                    f"({sensor.class_name()}): --method smoothed"
+                )
+            seed = key.fold(view.sensor).uint32()
+            # A mini-batch has another number of each view's pixels at each step; kernels are recorded anew for each.
+            samples = view.samples if request.pixels is None else 1 << (view.samples - 1).bit_length()
+            found = self._integrator.weighted_image(scene.scene, sensor, view.image, seed, samples)
             if dr.grad_enabled(found):
                 dr.backward(found, dr.ADFlag.ClearInterior)
-
-    def _images(self, request: SampleRequest, weights: mi.TensorXf) -> list[tuple[int, mi.TensorXf]]:
-        """(sensor, mean weights (H, W, 3)) of all that have pixels."""
-        groups = weights.shape[0]
-        size = dr.width(weights.array) // groups
-        lane = dr.arange(mi.UInt32, size)
-        mean = mi.Float(0)
-        for group in range(groups):
-            mean += dr.gather(mi.Float, weights.array, lane + group * size)
-        mean /= groups
-        dr.eval(mean)
-        if request.pixels is None:
-            return [(request.sensor, mi.TensorXf(mean, (*self._resolutions[request.sensor], 3)))]
-        which = np.full(size // 3, request.sensor) if request.sensors is None else np.array(request.sensors)
-        found = []
-        for sensor in np.unique(which).tolist():
-            height, width = self._resolutions[sensor]
-            image = dr.zeros(mi.Float, height * width * 3)
-            pixel = dr.gather(mi.UInt32, request.pixels, lane // 3)
-            own = mi.Bool(True)
-            if request.sensors is not None:
-                own = dr.gather(mi.UInt32, mi.UInt32(request.sensors), lane // 3) == sensor
-            dr.scatter_add(image, mean, pixel * 3 + lane % 3, own)
-            found.append((int(sensor), mi.TensorXf(image, (height, width, 3))))
-        return found

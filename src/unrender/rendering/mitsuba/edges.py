@@ -73,7 +73,9 @@ class EdgeTable:
         meshes = [shape for shape in scene.shapes() if shape.is_mesh()]
         self._order = [mesh.id() for mesh in sorted(meshes, key=lambda mesh: mesh.id() not in moving)]
         by_id = {mesh.id(): mesh for mesh in meshes}
-        parts, first = [], 0
+        none = np.zeros((0, 2), np.uint32)
+        parts: list[tuple[MeshEdges, int]] = [(MeshEdges(none, none, np.zeros(0, bool), np.zeros(0, bool)), 0)]
+        first = 0
         self.moving = 0
         for name in self._order:
             mesh = by_id[name]

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "per_sample", "rays", "rays_of_many"]
+__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "per_sample", "rays", "rays_of_many", "sampler_at"]
 
 
 @dataclass
@@ -24,16 +24,22 @@ class RepeatingSampler:
     Attributes:
         period: lanes of one image.
         rng: `mitsuba.PCG32`, once seeded.
+        lanes: `mi.UInt32`, the lane whose numbers each one is to have, in place of its own; None for its own.
     """
 
     period: int
     rng: Any = None
+    lanes: Any = None
 
     def seed(self, seed: Any, lanes: int) -> None:
         """Start anew with `lanes` lanes."""
-        lane = dr.arange(mi.UInt32, lanes) % self.period
+        lane = dr.arange(mi.UInt32, lanes) % self.period if self.lanes is None else self.lanes
         state, sequence = mi.sample_tea_32(seed, lane)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
+
+    def clone(self) -> RepeatingSampler:
+        """Another with the same numbers to come."""
+        return RepeatingSampler(self.period, mi.PCG32(self.rng), self.lanes)  # pyright: ignore[reportCallIssue]
 
     def next_1d(self, active: Any = True) -> Any:
         """A uniform number per lane, in lanes that are not active, too."""
@@ -118,6 +124,17 @@ def rays_of_many(
     )
     ray.scale_differential(spp**-0.5)
     return ray, weight
+
+
+def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:
+    """The sampler of a part of an image: each pixel has the numbers that it has as part of the whole.
+
+    Args:
+        positions: `mi.UInt32`, of each pixel in the whole.
+        spp, count: of the part.
+    """
+    sample = dr.arange(mi.UInt32, count * spp) % spp
+    return RepeatingSampler(count * spp, lanes=per_sample(positions, spp, count) * spp + sample)
 
 
 def per_sample(of_pixel: Any, spp: int, count: int) -> Any:

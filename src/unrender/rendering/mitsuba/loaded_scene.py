@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import itertools
 import weakref
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
+from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
 __all__ = ["LoadedScene", "loaded_scenes"]
@@ -85,17 +87,22 @@ class LoadedScene:
 
     Args:
         description: what to load.
+        moving: ids of shapes that move; the spheres among them become meshes.
 
     Attributes:
         scene: as Mitsuba has it.
         source: what was loaded: the file's path, or the dictionary.
+        meshed: ids of spheres that have become meshes.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
 
-    def __init__(self, description: SceneDescription):
+    def __init__(self, description: SceneDescription, moving: AbstractSet[str] = frozenset()):
         self.scene, self.source = load_resolved(description)
         self._shared = is_loaded(description)
+        self.meshed: list[str] = []
+        if moving and not self._shared:
+            self.scene, self.meshed = meshed(self.scene, moving)
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
@@ -166,8 +173,10 @@ class LoadedScene:
             self._held.pop(key, None)
             self.leaves.pop(key, None)
             self._posed.pop(key, None)
-            for name in self.poses.written(key):
-                self.parameters[name] = _reference(self._own[name])
+            if key in self.poses:
+                self.poses.restore(self.parameters, key)
+            else:
+                self.parameters[key] = _reference(self._own[key])
         self.parameters.update()
         # A mesh whose vertices were set computes its normals anew, also where it was loaded with others.
         written = [name for key in keys for name in self.poses.written(key)]

@@ -78,13 +78,15 @@ class Pass(ABC):
         return {"delta": delta}
 
     def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
-        """What is recorded: of the scene, all loaded scenes, tables, the seed, pixels or None, the films and each pixel's sensor or
-        None, and the pass's own arrays."""
+        """What is recorded: of the scene, all loaded scenes, tables, the seed with each pixel's position or None, pixels or None, the
+        films and each pixel's sensor or None, and the pass's own arrays."""
 
-        def launch(scene, loaded, tables, seed, pixels, sensors, *own):
+        def launch(scene, loaded, tables, seeds, pixels, sensors, *own):
             del loaded  # read through pointers, if at all
             # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
-            numbers = sampler.clone()
+            seed, positions = seeds
+            whole = positions is None
+            numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
             with dr.suspend_grad():
                 ray, ray_weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
                 if sensors is not None and "camera" in tables:
@@ -245,8 +247,9 @@ class PosesPass(Pass):
     def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
         """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled."""
 
-        def launch(scenes, loaded, tables, seed, pixels, sensors, numbers):
+        def launch(scenes, loaded, tables, seeds, pixels, sensors, numbers):
             del loaded, tables, sensors
+            seed, _ = seeds
             lanes = size.pixels * size.spp
             batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes
             assembly = self.posed.at(scenes, numbers, batch)
@@ -268,7 +271,7 @@ class PosesPass(Pass):
 
 def _camera_rays(
     scene: mi.Scene,
-    sampler: mi.Sampler,
+    sampler: Any,
     size: LaunchSize,
     seed: mi.UInt32,
     pixels: mi.UInt32 | None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import mitsuba as mi
 import numpy as np
@@ -12,9 +12,11 @@ from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import ignored, poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
+from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
+from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import ParameterInfo, Space
@@ -29,10 +31,12 @@ class MitsubaRenderer:
         description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, of which there is one state
             only: no pairs.
         max_depth: longest path in segments, >= 1.
+        keys: parameters that will be asked for, if known. Spheres that these move become meshes, so that path gradients reach them.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
     vertex positions (3 V,). Geometry moves through Mitsuba's `prb` kernel, whose gradient leaves out visibility; where meshes move, by
-    their vertices or as a whole (`poses.py`), `boundary_term.py` adds it. Poses of sensors and other shapes have no path gradient.
+    their vertices or as a whole (`poses.py`), `boundary_term.py` adds it. Of sensors, `camera_term.py` has the whole derivative. Poses of
+    shapes that are no meshes have no path gradient.
 
     Attributes:
         notices: one line for each setting of the scene that is not used.
@@ -40,15 +44,21 @@ class MitsubaRenderer:
     Raises `InputError` where Mitsuba refuses the description.
     """
 
-    def __init__(self, description: SceneDescription, max_depth: int = 6):
+    def __init__(self, description: SceneDescription, max_depth: int = 6, keys: Iterable[str] = ()):
         self.max_depth = max_depth
-        self.pair = ScenePair(description)
-        self.notices = ignored.notices(self.pair.current, self.pair.loaded().source, max_depth)
+        self.pair = ScenePair(description, moving_targets(keys))
+        self.notices = (
+            *ignored.notices(self.pair.current, self.pair.loaded().source, max_depth),
+            *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
+        )
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
-        self._info: dict[str, ParameterInfo] = dict(self.pair.info())
-        found = obstacles(self.pair, {pose.target for pose in self._poses.values()})
-        self._info |= {key: poses.info(pose, found[pose.target]) for key, pose in self._poses.items()}
+        self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
+        sensors = {sensor.id() for sensor in self.pair.current.sensors()}
+        found = self._obstacles({pose.target for pose in self._poses.values()})
+        self._info |= {
+            key: poses.info(pose, found[pose.target], pose.target in sensors) for key, pose in self._poses.items()
+        }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], bool], MitsubaSession] = {}
         self._stock: StockSession | None = None
@@ -95,8 +105,15 @@ class MitsubaRenderer:
     def stock(self) -> StockSession:
         """See `StockRenderer.stock`."""
         if self._stock is None:
-            self._stock = StockSession(self.pair.description, self.pair.volumetric, self.max_depth)
+            self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.max_depth)
         return self._stock
+
+    def _obstacles(self, targets: set[str]) -> dict[str, str]:
+        """{shape or sensor that moves: why it has no path gradient, "" where it has}."""
+        sensors = {sensor.id() for sensor in self.pair.current.sensors() if sensor.get_shape() is None}
+        return obstacles(self.pair, targets - sensors) | {
+            target: sensor_obstacle(self.pair, target) for target in targets & sensors
+        }
 
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
         if key not in self._info:
@@ -108,8 +125,8 @@ class MitsubaRenderer:
             )
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
-        shape = moved_shape(self.pair.loaded(), key)
-        if derivatives and shape and key not in self._poses and (why := obstacles(self.pair, [shape])[shape]):
+        target = moved_sensor(self.pair.loaded(), key) or moved_shape(self.pair.loaded(), key)
+        if derivatives and target and key not in self._poses and (why := self._obstacles({target})[target]):
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
         if not info.perturbable:
             raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")

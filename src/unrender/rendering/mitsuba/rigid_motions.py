@@ -1,4 +1,4 @@
-"""Rigid poses of meshes, written into the scene: what path gradients of the keys of `poses.py` are taken through."""
+"""Rigid poses of meshes and sensors, written into the scene: what path gradients of the keys of `poses.py` are taken through."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["RigidMotions"]
 
 
 class RigidMotions:
-    """The pose parameters of a loaded scene's meshes.
+    """The pose parameters of a loaded scene's meshes and sensors.
 
     Args:
         scene: as loaded.
@@ -23,13 +23,15 @@ class RigidMotions:
     """
 
     def __init__(self, scene: Any, own: Mapping[str, Any]):
-        meshes = {shape.id() for shape in scene.shapes() if shape.is_mesh()}
+        movable = [shape for shape in scene.shapes() if shape.is_mesh()]
+        movable += [sensor for sensor in scene.sensors() if sensor.get_shape() is None]
+        names = {item.id() for item in movable}
         self._own = own
-        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in meshes}
+        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in names}
         self._worlds = {
-            shape.id(): parameters["to_world"]
-            for shape in scene.shapes()
-            if shape.id() in meshes and "to_world" in (parameters := mi.traverse(shape))
+            item.id(): _copy(parameters["to_world"])
+            for item in movable
+            if "to_world" in (parameters := mi.traverse(item))
         }
         self._centres = poses.centres(scene, {pose.target for pose in self._keys.values()})
 
@@ -49,8 +51,17 @@ class RigidMotions:
         if key not in self._keys:
             return [key]
         target = self._keys[key].target
-        names = (f"{target}.vertex_positions", f"{target}.to_world")
-        return [name for name in names if name in self._own]
+        positions = f"{target}.vertex_positions"
+        return [positions if positions in self._own else f"{target}.to_world"]
+
+    def restore(self, parameters: mi.SceneParameters, key: str) -> None:
+        """Put what a pose has moved back to where it was loaded, without derivatives; the caller updates the scene."""
+        target = self._keys[key].target
+        (name,) = self.written(key)
+        if name in self._own:
+            parameters[name] = type(self._own[name])(self._own[name])
+        else:
+            self._set_world(parameters, name, _copy(self._worlds[target]))
 
     def write(self, parameters: mi.SceneParameters, values: Mapping[str, Any]) -> None:
         """Move the meshes, as derivatives of the poses or not, and update the scene.
@@ -63,9 +74,7 @@ class RigidMotions:
         for target, pose in self._poses(values).items():
             positions = f"{target}.vertex_positions"
             if positions not in self._own:
-                # Mitsuba would keep an equal matrix, and its derivatives with it: another one first.
-                parameters[f"{target}.to_world"] = mi.Transform4f().scale(-1)
-                parameters[f"{target}.to_world"] = pose.transform() @ self._worlds[target]
+                self._set_world(parameters, f"{target}.to_world", pose.transform() @ self._worlds[target])
                 continue
             points = dr.unravel(mi.Point3f, self._own[positions])
             parameters[positions] = dr.ravel(pose.point(points))
@@ -78,6 +87,11 @@ class RigidMotions:
             parameters[name] = value
         if turned:
             parameters.update()
+
+    def _set_world(self, parameters: mi.SceneParameters, name: str, transform: Any) -> None:
+        # Mitsuba would keep an equal matrix, and its derivatives with it: another one first.
+        parameters[name] = mi.Transform4f().scale(-1)
+        parameters[name] = transform
 
     def _poses(self, values: Mapping[str, Any]) -> dict[str, Pose]:
         """{target: its pose}."""
@@ -92,3 +106,8 @@ class RigidMotions:
                         numbers[first + k] = dr.gather(mi.Float, values[key], k)
             found[target] = Pose(self._centres[target], numbers[0:3], numbers[3:6], numbers[6])
         return found
+
+
+def _copy(transform: Any) -> Any:
+    """Of its own: a sensor gives away the matrix that it goes on using."""
+    return type(transform)(transform)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -42,6 +43,7 @@ class ScenePair:
 
     Args:
         description: what to load.
+        moving: ids of shapes that move; the spheres among them become meshes.
 
     Attributes:
         single: whether there is one state only, since the scene was loaded by the user.
@@ -49,10 +51,10 @@ class ScenePair:
         resolutions: (height, width) of each sensor's film, after cropping.
     """
 
-    def __init__(self, description: SceneDescription):
-        self.description = description
+    def __init__(self, description: SceneDescription, moving: AbstractSet[str] = frozenset()):
+        self.description, self.moving = description, moving
         self.single = is_loaded(description)
-        self._current = LoadedScene(description)
+        self._current = LoadedScene(description, moving)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
         known = self.volumetric and not self.single
@@ -73,8 +75,12 @@ class ScenePair:
         if self.single:
             raise InputError(SINGLE)
         if self._previous is None:
-            self._previous = LoadedScene(self.description)
+            self._previous = LoadedScene(self.description, self.moving)
         return self._previous
+
+    def as_described(self) -> LoadedScene:
+        """The first load or, where spheres of it have become meshes, one in which they are spheres."""
+        return LoadedScene(self.description) if self._current.meshed else self._current
 
     @property
     def current(self) -> mi.Scene:

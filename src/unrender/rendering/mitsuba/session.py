@@ -15,6 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
+from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -90,21 +91,26 @@ class MitsubaSession:
         sampler: mi.Sampler,
     ):
         traits = {key: pair.parameter_traits(key) for key in keys}
-        moving = next((key for key in keys if traits[key].geometric), None)
+        cameras = [key for key in (*keys, *poses) if moved_sensor(pair.loaded(), key)]
+        moving = next((key for key in keys if traits[key].geometric and key not in cameras), None)
         if poses and moving is not None:
             raise InputError(
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
-        shapes = {moved_shape(pair.loaded(), key) for key in (*keys, *poses)} - {""} if derivatives else set()
-        self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
-        if derivatives and poses:
-            # Path gradients move the shapes of the scene itself.
+        self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
+        if derivatives:
+            # Path gradients move the shapes and sensors of the scene itself.
             slots(poses)
-            keys, poses, moving = [*keys, *poses], {}, next(iter(poses))
+            everything = [*keys, *poses]
+            shapes = {moved_shape(pair.loaded(), key) for key in everything if key not in cameras} - {""}
+            self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
+            self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
+            self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
+            self._replays = len(cameras) < len(everything)
+            keys, poses = everything, {}
         self._pair, self._keys, self._poses, self._attached = pair, keys, poses, derivatives
         self._posed = PosedScene(pair.current, poses) if poses else None
         self._max_depth, self._sampler = max_depth, sampler
-        self._geometric = derivatives and moving is not None
         self._traits = list(traits.values()) if derivatives else []
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
@@ -186,7 +192,10 @@ class MitsubaSession:
             nothing = tensor(np.zeros(weights.shape))
             return self.adjoint_pair(parameters, paths.previous, paths, weights, nothing)[0]
         self._set_parameters(parameters)
-        self._run(AdjointPass(), paths.request, paths.radiance, weights)
+        if self._replays:
+            self._run(AdjointPass(), paths.request, paths.radiance, weights)
+        else:
+            self._pair.clear_gradients()
         return self._gradients(paths.request, weights)
 
     def adjoint_pair(
@@ -198,9 +207,11 @@ class MitsubaSession:
         self._set_parameters(previous, previous=True)
         request = paths.request
         if paths.space == "primary":
-            self._run(AdjointPass(), request, paths.radiance, weights)
-            gradient = self._gradients(request, weights)
-            self._run(AdjointPass(previous=True), request, paths.radiance_previous, weights_previous)
+            gradient = self.adjoint(current, Paths(request, paths.radiance), weights)
+            if self._replays:
+                self._run(AdjointPass(previous=True), request, paths.radiance_previous, weights_previous)
+            else:
+                self._pair.clear_gradients()
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self._run(AdjointPairPass(), request, *states)
@@ -217,10 +228,11 @@ class MitsubaSession:
         return self._develop(squares, paths.request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
-        """Of the last adjoint pass, and of the borders of what is visible where shapes move."""
+        """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
         scene = self._pair.loaded(previous)
-        if self._boundary is not None:
-            self._boundary.accumulate(scene, request, weights)
+        for term in (self._boundary, self._camera):
+            if term is not None:
+                term.accumulate(scene, request, weights)
         found = scene.gradients()
         dr.eval(found)
         return found
@@ -253,16 +265,16 @@ class MitsubaSession:
         several = request.sensors is not None
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
-        key = (task, size, request.groups, request.pixels is None, several, shapes)
+        key = (task, size, request.groups, request.pixels is None, several, request.positions is None, shapes)
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size)
             self._functions[key] = FrozenFunction(traced, self._recordable)
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
-        seed = mi.UInt32(request.seed)
+        seeds = mi.UInt32(request.seed), request.positions
         before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
-        return self._functions[key](before, task.scene(pair), scenes, tables, seed, request.pixels, sensors, *own)
+        return self._functions[key](before, task.scene(pair), scenes, tables, seeds, request.pixels, sensors, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

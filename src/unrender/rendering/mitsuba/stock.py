@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set as AbstractSet
 from typing import Any
 
 import drjit as dr
@@ -20,12 +21,13 @@ class StockSession:
 
     Args:
         description: what to load.
+        moving: ids of shapes that move; the spheres among them become meshes.
         volumetric: whether there is a participating medium, which takes `prbvolpath` in place of `prb`.
         max_depth: longest path in segments, >= 1.
     """
 
-    def __init__(self, description: SceneDescription, volumetric: bool, max_depth: int):
-        self._loaded = LoadedScene(description)
+    def __init__(self, description: SceneDescription, moving: AbstractSet[str], volumetric: bool, max_depth: int):
+        self._loaded = LoadedScene(description, moving)
         kind = "prbvolpath" if volumetric else "prb"
         self._integrator: Any = mi.load_dict({"type": kind, "max_depth": max_depth})
 

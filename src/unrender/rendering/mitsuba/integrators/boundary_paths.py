@@ -24,7 +24,8 @@ class Picture:
         self.scene, self.sensor, self.samples = scene, sensor, samples
         self.width, self.height = int(size[0]), int(size[1])
         self.size = mi.Vector2f(self.width, self.height)
-        self.scale = self.width * self.height / samples
+        # Opaque: of a mini-batch's views the number differs from step to step, and kernels with it.
+        self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
         self._weights = weights.array
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(

@@ -1,0 +1,250 @@
+"""How a picture changes as the sensor moves.
+
+A point that the sensor sees is at P(x; θ) on the film, where θ are the sensor's pose and field of view. Where the picture f is followed
+along the flow v = ∂P/∂θ of what it shows, it changes only with the direction from which that is seen. So (Reynolds' transport theorem)
+
+    d/dθ ∫_pixel f du = −∮ f v·n ds + ∫ f div v du + ∫ Df du + Σ over silhouettes ∫ [f (v − s)·n] ds
+
+with the border of the pixel, the divergence of the flow, the change Df of f at fixed points, and curves at which the flow jumps, which
+move by s and have f, v on either side. Shadows, textures and all else that light does on surfaces are part of f, and need no edges of
+their own. Where a sensor turns or zooms, the flow depends on u alone: Df and the silhouettes vanish, whatever the scene holds.
+
+The radiance at opposite borders of a pixel, and within, is estimated with the same random numbers, so that noise cancels between them.
+In flat mirrors the flow is that of the mirrored point's virtual image.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.integrators.boundary_paths import OFFSET, Picture
+from unrender.rendering.mitsuba.integrators.boundary_sampling import WeightedChoice, lane_sampler
+from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, MirroredView
+from unrender.rendering.mitsuba.integrators.glossy_directions import glossy_radiance, is_glossy
+from unrender.rendering.mitsuba.integrators.silhouette_curves import SilhouetteCurves
+from unrender.rendering.mitsuba.view_weights import ViewWeights
+
+__all__ = ["CameraMotion"]
+
+_POINTS = 5
+"""Of a sample: two pairs on opposite borders of its pixel, and one within."""
+
+
+class _Seen:
+    """What a lane sees: its radiance, and the point, for each lane as homogeneous coordinates, with its derivatives by the film's two
+    coordinates along the surface. Detached."""
+
+    def __init__(self, L: Any, point: Any, across: tuple[Any, Any]):
+        self.L, self.point, self.across = L, point, across
+
+
+class _FilmMap:
+    """Where points are on the film; attached to the sensor's parameters. Coordinates from 0 to 1."""
+
+    def __init__(self, sensor: Any):
+        with dr.resume_grad():
+            matrix = sensor.projection_transform().matrix @ sensor.world_transform().inverse().matrix
+            offset, film = mi.traverse(sensor), sensor.film()
+            centre = [mi.Float(offset[f"principal_point_offset_{axis}"]) for axis in "xy"]
+            whole, size = film.size(), film.crop_size()
+            self._shift = [centre[k] * dr.opaque(mi.Float, float(whole[k]) / float(size[k])) for k in range(2)]
+            self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
+        with dr.suspend_grad():
+            self.origin = dr.detach(sensor.world_transform()) @ mi.Point3f(0)
+            inverse = dr.rcp(dr.detach(matrix))
+            self._columns = [mi.Vector4f(*(inverse[row, column] for row in range(4))) for column in range(4)]
+
+    def direction(self, uv: Any) -> tuple[Any, Any, Any]:
+        """Of the ray through `uv`, not of unit length, and its derivatives. Detached."""
+        x, y, _, one = self._columns
+        near = (uv.x + dr.detach(self._shift[0])) * x + (uv.y + dr.detach(self._shift[1])) * y + one
+        found = [mi.Vector3f(v.x, v.y, v.z) / near.w for v in (near, x, y)]
+        return found[0] - mi.Vector3f(self.origin), found[1], found[2]
+
+    def place(self, point: Any) -> Any:
+        """Of homogeneous points."""
+        w = dr.dot(self._rows[3], point)
+        return mi.Vector2f(
+            dr.dot(self._rows[0], point) / w - self._shift[0], dr.dot(self._rows[1], point) / w - self._shift[1]
+        )
+
+    def stretch(self, seen: _Seen) -> Any:
+        """The determinant of the map from the film as it is now to the film as the sensor moves, along what is seen: 1, with derivative
+        div v."""
+        w, (x, y) = dr.dot(self._rows[3], seen.point), (dr.dot(row, seen.point) for row in self._rows[:2])
+        columns = []
+        for across in seen.across:
+            change = dr.dot(self._rows[3], across)
+            columns.append(tuple((dr.dot(self._rows[k], across) - v * change / w) / w for k, v in ((0, x), (1, y))))
+        (a, b), (c, d) = columns
+        return a * d - b * c
+
+
+class CameraMotion:
+    """Derivatives of what a perspective sensor sees by its own pose and field of view.
+
+    Args:
+        table: the scene's edges; None where the sensor stays in its place.
+        max_depth: longest path in segments, >= 1.
+        still: whether no shape moves, so that curves and mirrors need to be found once only.
+    """
+
+    # No dataclass: Dr.Jit would take it for state of its loops.
+    def __init__(self, table: EdgeTable | None, max_depth: int, still: bool):
+        self._table, self._max_depth, self._still = table, max_depth, still
+        self._mirrors: Any = None
+        self._curves: Any = None
+        self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
+
+    def weighted_image(self, scene: Any, sensor: Any, view: ViewWeights, seed: int) -> Any:
+        """Σ weights · image, of which only the derivative is of use: attached to the sensor's parameters. Unbiased, but for what curved
+        mirrors and glass show while the sensor's place changes.
+
+        Args:
+            scene, sensor: of Mitsuba; the sensor is perspective.
+            view: weights of the sensor's pixels.
+            seed: in [0, 2**32).
+        """
+        if self._mirrors is None or not self._still:
+            self._mirrors = FlatMirrors(scene)
+            self._curves = SilhouetteCurves(scene, self._table) if self._table is not None else None
+        film = _FilmMap(sensor)
+        picture = Picture(scene, sensor, view.image, view.samples)
+        found = self._pixels(picture, film, view, seed)
+        if self._curves is not None:
+            if self._curves.count:
+                found += self._silhouettes(self._curves, picture, film, seed ^ 0x5BD1E995)
+            if self._max_depth >= 2 and is_glossy(scene):
+                found += self._directions(picture, view, seed ^ 0x1B873593)
+        return found
+
+    # ------------------------------------------------------------------ pixels and their borders
+
+    def _pixels(self, picture: Picture, film: _FilmMap, view: ViewWeights, seed: int) -> Any:
+        count = picture.samples
+        with dr.suspend_grad():
+            number = dr.arange(mi.UInt32, _POINTS * count)
+            kind, lane = number // count, number % count
+            index = lane // view.spp
+            pixel = dr.gather(mi.UInt32, view.pixels, index)
+            row = pixel // picture.width
+            corner = mi.Vector2f(pixel - row * picture.width, row)
+            inside = lane_sampler(seed, count, _POINTS * count).next_2d()
+            # x = 0, x = 1, y = 0, y = 1, within.
+            at = mi.Vector2f(
+                dr.select(kind == 0, 0, dr.select(kind == 1, 1, inside.x)),
+                dr.select(kind == 2, 0, dr.select(kind == 3, 1, inside.y)),
+            )
+            uv = (corner + at) / picture.size
+            seen = self._look(picture, film, uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
+            weighted = mi.Float(0)
+            for c in range(3):
+                weighted += seen.L[c] * dr.gather(mi.Float, view.values, index * 3 + c)
+            dr.eval(weighted)
+            outward: Any = mi.Vector2f(
+                dr.select(kind == 0, -1, dr.select(kind == 1, 1, 0)),
+                dr.select(kind == 2, -1, dr.select(kind == 3, 1, 0)),
+            )
+            border: Any = mi.Vector2f(*(-weighted * outward[axis] * picture.size[axis] for axis in range(2)))
+            within = dr.select(kind == _POINTS - 1, weighted, 0)
+        with dr.resume_grad():
+            total = dr.sum(dr.dot(border, film.place(seen.point)) + within * film.stretch(seen))
+            return total * dr.opaque(mi.Float, 1 / view.spp)
+
+    def _look(self, picture: Picture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
+        """What is seen at `uv`; lanes a period apart share random numbers."""
+        sensor, scene = picture.sensor, picture.scene
+        ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
+        si = scene.ray_intersect(ray, active)
+        view = MirroredView(si, mi.Ray3f(ray), dr.norm(si.p - film.origin), self._max_depth)
+        if self._mirrors:
+            view.follow(scene, active)
+        L = self._trace(scene, view.ray, view.si, view.depth, active, seed, period) * weight * view.β
+        towards, across, down = film.direction(uv)
+        valid = view.si.is_valid()
+        inverse = dr.select(valid, dr.norm(towards) / view.distance, 0)
+        n = mi.Vector3f(view.linear.T @ mi.Vector3f(view.si.n))
+        height = dr.dot(n, towards)
+        tilted = valid & (dr.abs(height) > 1e-6 * dr.norm(towards))
+        slopes = [dr.select(tilted, inverse * dr.dot(n, v) / height, 0) for v in (across, down)]
+        origin = mi.Vector3f(film.origin)
+        tangents = [_homogeneous(origin * slope + v, slope) for v, slope in zip((across, down), slopes, strict=True)]
+        return _Seen(
+            dr.select(active, L, 0), _homogeneous(origin * inverse + towards, inverse), (tangents[0], tangents[1])
+        )
+
+    def _trace(self, scene: Any, ray: Any, si: Any, depth: Any, active: Any, seed: int, period: int) -> Any:
+        sampler = lane_sampler(seed, period, dr.width(ray.d))
+        return self._radiance.sample(dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si)[0]
+
+    def _directions(self, picture: Picture, view: ViewWeights, seed: int) -> Any:
+        """∫ Df du: what is seen at fixed points changes with the direction towards the sensor."""
+        sensor, scene, count = picture.sensor, picture.scene, picture.samples
+        with dr.suspend_grad():
+            sampler = lane_sampler(seed, count, count)
+            index = dr.arange(mi.UInt32, count) // view.spp
+            pixel = dr.gather(mi.UInt32, view.pixels, index)
+            row = pixel // picture.width
+            uv = (mi.Vector2f(pixel - row * picture.width, row) + sampler.next_2d()) / picture.size  # pyright: ignore[reportOperatorIssue]
+            ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(uv), mi.Point2f(0.5), True)
+            si = scene.ray_intersect(ray)
+            weight *= mi.Spectrum(*(dr.gather(mi.Float, view.values, index * 3 + c) for c in range(3)))
+            active = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Glossy)
+        with dr.resume_grad():
+            viewpoint = sensor.world_transform() @ mi.Point3f(0)
+            towards = si.to_local(dr.normalize(viewpoint - si.p))
+        lit = glossy_radiance(scene, si, towards, sampler, self._trace_on, active)
+        with dr.resume_grad():
+            return dr.sum(dr.dot(weight, lit)) * dr.opaque(mi.Float, 1 / view.spp)
+
+    def _trace_on(self, scene: Any, ray: Any, si: Any, sampler: Any, active: Any) -> Any:
+        """The radiance along a path's second segment."""
+        return self._radiance.sample(
+            dr.ADMode.Primal, scene, sampler, ray, mi.UInt32(1), None, None, active, False, si
+        )[0]
+
+    # ------------------------------------------------------------------ silhouettes
+
+    def _silhouettes(self, curves: SilhouetteCurves, picture: Picture, film: _FilmMap, seed: int) -> Any:
+        scene, count = picture.scene, picture.samples
+        with dr.suspend_grad():
+            mirrors = self._mirrors
+            number = dr.arange(mi.UInt32, curves.count * mirrors.count)
+            viewpoint = mirrors.reflect(film.origin, number // curves.count)
+            middle, along, jumps = curves.at(number % curves.count, 0.5, viewpoint)
+            chosen = WeightedChoice(dr.select(jumps, dr.norm(along) / dr.norm(middle - viewpoint), 0))
+            sampler = lane_sampler(seed, count, count)
+            number, pmf = chosen.draw(sampler.next_1d())
+            mirror = number // curves.count
+            viewpoint = mirrors.reflect(film.origin, mirror)
+            real, along, jumps = curves.at(number % curves.count, sampler.next_1d(), viewpoint)
+            point, along = mirrors.reflect(real, mirror), mirrors.reflect(along, mirror, direction=True)
+            uv, depth = picture.project(point)
+            along = picture.project_motion(point, uv, along)
+            length = dr.norm(along)
+            normal = mi.Vector2f(-along.y, along.x) / dr.maximum(length, 1e-20)
+            active = (pmf > 0) & jumps & (length > 1e-12) & (depth > 0) & dr.all((uv >= 0) & (uv < 1))
+            active &= self._mirrors.sees(scene, film.origin, real, point, mirror, active)
+            factor = dr.select(active, length / pmf * picture.scale, 0)
+            # The two sides.
+            number = dr.arange(mi.UInt32, 2 * count)
+            lane = number % count
+            sign = dr.select(number < count, -1.0, 1.0)
+            active, normal, point = (dr.gather(type(v), v, lane) for v in (active, normal, mi.Point3f(point)))
+            uv = dr.gather(mi.Vector2f, mi.Vector2f(uv), lane)
+            shifted = uv + mi.Vector2f(normal) * (OFFSET * sign)
+            seen = self._look(picture, film, shifted, active, seed ^ 0x9E3779B9, count)
+            weighted = picture.weighted(seen.L, uv * picture.size, active)
+            scale = dr.gather(mi.Float, factor, lane) * weighted * sign
+            dr.eval(scale, normal, point)
+        with dr.resume_grad():
+            relative = film.place(seen.point) - film.place(_homogeneous(point, 1.0))
+            return dr.sum(scale * dr.dot(normal, relative))
+
+
+def _homogeneous(v: Any, w: Any) -> Any:
+    return mi.Vector4f(v.x, v.y, v.z, w)

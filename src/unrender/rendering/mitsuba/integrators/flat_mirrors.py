@@ -1,0 +1,142 @@
+"""Perfect mirrors with flat faces, behind which the virtual images of what they show stand still as the viewer moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["FlatMirrors", "MirroredView"]
+
+_NEAR = 1e-3
+"""Share of a distance within which nothing occludes."""
+_BOUNCES = 2
+"""Between flat mirrors, that are followed."""
+_PLANES = 12
+"""Of mirrors in whose image edges are looked for, at most."""
+
+
+class FlatMirrors:
+    """The flat mirrors of a scene. False where there are none.
+
+    Args:
+        scene: of Mitsuba.
+
+    Attributes:
+        count: of views: without a mirror, number 0, and in each plane of a mirror.
+    """
+
+    # No dataclass: Dr.Jit would take it for state of its loops.
+    def __init__(self, scene: Any):
+        planes: list[np.ndarray] = []
+        for shape in scene.shapes():
+            if shape.is_mesh() and _reflects(shape.bsdf().flags()):
+                for plane in _planes(shape):
+                    if not any(np.allclose(plane, known, atol=1e-5) for known in planes):
+                        planes.append(plane)
+        self._any = bool(planes)
+        rows = np.concatenate([np.zeros((1, 4)), np.reshape(planes[:_PLANES], (-1, 4))])
+        self.count = len(rows)
+        self._rows = mi.Float(rows.astype(np.float32).reshape(-1))
+
+    def __bool__(self) -> bool:
+        return self._any
+
+    def _plane(self, number: Any) -> tuple[Any, Any]:
+        v = [dr.gather(mi.Float, self._rows, number * 4 + k) for k in range(4)]
+        return mi.Vector3f(v[0:3]), v[3]
+
+    def reflect(self, point: Any, number: Any, direction: bool = False) -> Any:
+        """Points, or directions, in the mirror of this number."""
+        n, height = self._plane(number)
+        v = mi.Vector3f(point)
+        v -= 2 * (dr.dot(n, v) - (0 if direction else height)) * n
+        return v if direction else mi.Point3f(v)
+
+    def sees(self, scene: Any, origin: Any, real: Any, virtual: Any, number: Any, active: Any) -> Any:
+        """Whether the origin sees a point: by way of the mirror where there is one."""
+        n, height = self._plane(number)
+        towards = mi.Vector3f(virtual - origin)
+        ray = mi.Ray3f(origin, dr.normalize(towards))
+        ray.maxt = dr.norm(towards) * (1 - _NEAR)
+        plain = number == 0
+        if not self._any:
+            return active & ~scene.ray_test(ray, active)
+        si = scene.ray_intersect(ray, active)
+        free = active & plain & ~si.is_valid()
+        meets = active & ~plain & si.is_valid() & _is_flat_mirror(si)
+        meets &= dr.abs(dr.dot(n, si.p) - height) < 1e-4 * (1 + dr.abs(height))
+        beyond = si.spawn_ray_to(real)
+        beyond.maxt = beyond.maxt * (1 - _NEAR)
+        return free | (meets & ~scene.ray_test(beyond, meets))
+
+
+class MirroredView:
+    """What a ray meets, by way of flat mirrors: the surface, the ray and its length from the viewer, and the orientation of what is seen.
+
+    Attributes:
+        si: `mi.SurfaceInteraction3f`.
+        ray: its last segment.
+        distance: of all segments.
+        depth: segments before the last.
+        β: throughput.
+        linear: `mi.Matrix3f`, from directions of the virtual image to those of the world.
+    """
+
+    # No dataclass: Dr.Jit would take it for state of its loops.
+    def __init__(self, si: Any, ray: Any, distance: Any, max_depth: int):
+        self.si, self.ray, self.distance = si, ray, distance
+        self.depth, self.β, self.linear = mi.UInt32(0), mi.Spectrum(1), mi.Matrix3f(dr.identity(mi.Matrix3f))
+        self._max_depth = max_depth
+
+    def follow(self, scene: Any, active: Any) -> None:
+        """To the first surface that is no flat mirror, as far as that is within two bounces."""
+        for _ in range(_BOUNCES):
+            si = self.si
+            turns = active & si.is_valid() & _is_flat_mirror(si) & (self.depth + 1 < self._max_depth)
+            bs, weight = si.bsdf().sample(mi.BSDFContext(), si, 0.5, mi.Point2f(0.5), turns)
+            turns &= dr.any(weight != 0)
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            n = mi.Vector3f(si.n)
+            columns = [mi.Vector3f(*(self.linear[row, column] for row in range(3))) for column in range(3)]
+            turned = [v - 2 * dr.dot(n, v) * n for v in columns]
+            matrix = mi.Matrix3f(*(turned[column][row] for row in range(3) for column in range(3)))
+            following = scene.ray_intersect(ray, turns)
+            self.distance = dr.select(turns, self.distance + following.t, self.distance)
+            self.linear = dr.select(turns, matrix, self.linear)
+            self.β = dr.select(turns, self.β * weight, self.β)
+            self.depth = dr.select(turns, self.depth + 1, self.depth)
+            self.ray = dr.select(turns, ray, self.ray)
+            self.si = dr.select(turns, following, si)
+
+
+def _reflects(flags: Any) -> Any:
+    """Whether a BSDF is a perfect mirror, and nothing besides."""
+    reflects = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
+    others = [mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null]
+    for flag in others:
+        reflects = reflects & (mi.has_flag(flags, flag) == False)  # noqa: E712 (per lane)
+    return reflects
+
+
+def _is_flat_mirror(si: Any) -> Any:
+    flat = si.shape.is_mesh() & (dr.squared_norm(mi.Vector3f(si.sh_frame.n) - mi.Vector3f(si.n)) < 1e-8)
+    return flat & _reflects(si.bsdf().flags())
+
+
+def _planes(mesh: Any) -> list[np.ndarray]:
+    """Normal and height (4,) of the planes of a mesh's faces; none of one that is not made of a few flat sides."""
+    points = np.array(mesh.vertex_positions_buffer(), float).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3).astype(np.int64)
+    if len(faces) > 2 * _PLANES:
+        return []
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = (normals / np.maximum(size, 1e-20))[size[:, 0] > 0]
+    planes = np.c_[normals, (normals * a[size[:, 0] > 0]).sum(axis=1)]
+    # The two sides of a plane are one mirror: the largest component of its normal is positive.
+    largest = np.take_along_axis(normals, np.abs(normals).argmax(axis=1)[:, None], axis=1)
+    return list(planes * np.where(largest < 0, -1.0, 1.0))

@@ -1,0 +1,94 @@
+"""Spheres that move, as meshes: boundary derivatives are sampled on edges, which a sphere does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from collections.abc import Set as AbstractSet
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["meshed", "moving_targets"]
+
+_ROWS, _COLUMNS = 64, 128
+"""Of the mesh: its silhouette is within a 1700th of the radius of the sphere's."""
+_PARTS = ("translation", "rotation", "scale", "vertex_positions")
+
+
+def moving_targets(keys: Iterable[str]) -> frozenset[str]:
+    """The ids of the shapes or sensors that parameters of these names would move as a whole or vertex by vertex."""
+    found = set()
+    for key in keys:
+        owner, _, name = key.rpartition(".")
+        if name in ("x", "y", "z"):
+            owner, _, name = owner.rpartition(".")
+        if name in _PARTS:
+            found.add(owner)
+    return frozenset(found)
+
+
+def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
+    """The scene with these of its spheres replaced by meshes, and their ids. Not those that are emitters or carry sensors or media, nor
+    mirrors and glass, whose facets would show, nor any of a scene in which a shape carries a sensor.
+
+    The mesh has the sphere's texture coordinates, normals at its vertices, and their interpolations between.
+
+    Args:
+        scene: `mi.Scene`.
+        ids: of shapes, some of which may be spheres.
+    """
+    spheres = [shape for shape in scene.shapes() if shape.class_name() == "Sphere" and shape.id() in ids]
+    spheres = [
+        shape
+        for shape in spheres
+        if not (shape.is_emitter() or shape.is_sensor() or shape.is_medium_transition() or _is_specular(shape.bsdf()))
+    ]
+    if not spheres or any(sensor.get_shape() is not None for sensor in scene.sensors()):
+        return scene, []
+    replaced = [shape.id() for shape in spheres]
+    objects = [_mesh(shape) if shape.id() in replaced else shape for shape in scene.shapes()]
+    objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    described: dict[str, Any] = {"type": "scene"}
+    own = [] if scene.integrator() is None else [scene.integrator()]
+    for index, item in enumerate([*objects, *scene.sensors(), *own]):
+        name = item.id()
+        described[name if name and name not in described else f"object_{index}"] = item
+    return mi.load_dict(described, parallel=False, optimize=False), replaced
+
+
+def _is_specular(bsdf: Any) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+
+
+def _mesh(sphere: Any) -> Any:
+    """By rows of latitude, the seam's vertices twice."""
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, _COLUMNS + 1), np.linspace(0, 1, _ROWS + 1)))
+    turn, tilt = 2 * np.pi * (u % 1), np.pi * v
+    normals = np.stack([np.cos(turn) * np.sin(tilt), np.sin(turn) * np.sin(tilt), np.cos(tilt)], -1)
+    normals[v == 0], normals[v == 1] = (0, 0, 1), (0, 0, -1)
+    corner = (np.arange(_ROWS)[:, None] * (_COLUMNS + 1) + np.arange(_COLUMNS)).ravel()
+    down, right = corner + _COLUMNS + 1, corner + 1
+    faces = np.concatenate([np.stack([corner, down, right], -1), np.stack([right, down, down + 1], -1)])
+    matrix = np.array(mi.traverse(sphere)["to_world"].matrix, float).reshape(4, 4)  # pyright: ignore[reportAttributeAccessIssue]
+    points = normals @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = normals @ matrix[:3, :3].T
+    sample = sphere.sample_position(0.0, mi.Point2f(0.3, 0.4))
+    outwards = np.array(sample.p).reshape(-1) - matrix[:3, 3]
+    if outwards @ np.array(sample.n).reshape(-1) < 0:  # `flip_normals`
+        normals, faces = -normals, faces[:, ::-1]
+    properties = mi.Properties()
+    properties["bsdf"] = sphere.bsdf()
+    mesh = mi.Mesh(sphere.id(), len(points), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=True)
+    mesh.set_id(sphere.id())
+    parameters = mi.traverse(mesh)
+    for name, values in (("vertex_positions", points), ("vertex_texcoords", np.stack([u, v], -1))):
+        parameters[name] = mi.Float(values.ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    parameters.update()
+    # In a second update: Mitsuba computes normals anew whenever positions change.
+    parameters["vertex_normals"] = mi.Float(
+        (normals / np.linalg.norm(normals, axis=1, keepdims=True)).ravel().astype(np.float32)
+    )
+    parameters.update()
+    return mesh
