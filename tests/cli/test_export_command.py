@@ -18,10 +18,8 @@ QUICK = ["--final-spp", "4"]
 
 
 @pytest.fixture
-def run(unrender, problem: Path, mitsuba_variant: str) -> Path:
-    answer = unrender("run", "problem.toml", "--steps", 3, "--out", "result", "--variant", mitsuba_variant, *QUICK)
-    assert answer.status == 0, answer.error
-    return problem.parent / "result"
+def run(run_once, mitsuba_variant: str) -> Path:
+    return run_once("--steps", 3, "--variant", mitsuba_variant, *QUICK)
 
 
 def test_a_toml_problems_result_goes_home(unrender, run: Path, mitsuba_variant: str) -> None:

@@ -23,8 +23,10 @@ pytest.importorskip("xatlas", reason="atlases need xatlas: pip install 'unrender
 pytest.importorskip("fast_simplification", reason="hulls need fast-simplification: pip install 'unrender[capture]'")
 
 import made_capture as made
+import unrender as ur
 from unrender.capture.cameras import Lens
 from unrender.io import images
+from unrender.stages import stages_file
 
 LENS = Lens(40, 40, 48.0, 48.0, 20.0, 20.0)
 SMALL = ("--voxels", 24, "--faces", 400, "--texture", 16)
@@ -77,10 +79,54 @@ def test_masks_alone_become_a_problem_that_runs(unrender: Unrender, capture: Pat
     assert covered > 0.93
     folder = Path("asset")
     assert {path.name for path in folder.iterdir()} == {
-        *("scene.xml", "problem.toml", "held-out.toml", "asset.ply", "check.png"),
+        *("scene.xml", "problem.toml", "held-out.toml", "stages.toml", "asset.ply", "check.png"),
         *("references", "masks", "textures"),
     }
     assert [path.name for path in Path().iterdir() if "part" in path.name] == []
+
+
+@pytest.mark.slow
+def test_unknowns_by_choice_are_parameters_of_the_scene(unrender: Unrender, capture: Path, mesh: Path) -> None:
+    given = ("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4, "--band", 2)
+    answer = unrender(*given, "--unknowns", "exposure, shape,light,normal,metallic,roughness,colour")
+    assert answer.status == 0, answer.error
+    problem = ur.Problem.from_file("asset/problem.toml")
+    material = "asset.bsdf.nested_bsdf"
+    assert {key: value.shape for key, value in problem.initial_values().items() if key != "asset.vertex_positions"} == {
+        f"{material}.base_color.data": (4, 4, 3),
+        f"{material}.roughness.data": (4, 4, 1),
+        f"{material}.metallic.data": (4, 4, 1),
+        "asset.bsdf.normalmap.data": (4, 4, 3),
+        "light.data": (16, 34, 3),
+        "exposure": (7, 3),
+    }
+    assert problem.preconditioners["asset.vertex_positions"].strength == 20  # pyright: ignore[reportAttributeAccessIssue]
+    held_out = ur.Problem.from_file("asset/held-out.toml")
+    assert [*held_out.initial_values(), "exposure"] == list(problem.initial_values())
+    # The band counts a tenth, in training views alone.
+    weights = {float(weight) for view in problem.views for weight in np.unique(np.asarray(view.mask))}
+    assert np.allclose(sorted(weights), [0, 26 / 255, 1], atol=2e-3)
+    assert {float(weight) for view in held_out.views for weight in np.unique(np.asarray(view.mask))} == {0.0, 1.0}
+    stages = stages_file.read("asset/stages.toml")
+    assert [stage.name for stage in stages.stages] == ["light-and-colour", "roughness", "shape", "all"]
+    assert {key for stage in stages.stages for key in stage.unknowns} == set(problem.initial_values())
+    assert all("exposure" in stage.unknowns for stage in stages.stages)
+    for wrong in ("", "color", "colour,lihgt"):
+        answer = unrender(*given, "--overwrite", "--unknowns", wrong)
+        assert answer.status == 2
+        assert answer.error.startswith("unrender: --unknowns: ")
+
+
+@pytest.mark.slow
+def test_saturated_photographs_are_censored(unrender: Unrender, capture: Path, mesh: Path) -> None:
+    given = ("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4, "--overwrite")
+    assert unrender(*given).status == 0
+    assert ur.Problem.from_file("asset/problem.toml").loss == ur.losses.L1()
+    for path in (capture / "images").iterdir():
+        picture = np.array(Image.open(path)).astype(int)
+        Image.fromarray((picture * 3).clip(0, 255).astype(np.uint8)).save(path)
+    assert unrender(*given).status == 0
+    assert ur.Problem.from_file("asset/problem.toml").loss == ur.losses.Censored(ur.losses.L1(), 0.95)
 
 
 @pytest.mark.slow

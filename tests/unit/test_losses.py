@@ -22,6 +22,8 @@ REFERENCE = np.array([0.0, 0.2, 1.0, 3.0])
         (losses.L1(), [0.5, 0.2, 0.0, 2.0], [1, -1, 0, 1]),
         (losses.L2(), [0.25, 0.04, 0.0, 4.0], [1.0, -0.4, 0.0, 4.0]),
         (losses.RelativeL2(0.01), [25.0, 0.8, 0.0, 4 / 9.01], [100.0, -8.0, 0.0, 4 / 9.01]),
+        (losses.Censored(losses.L1(), 1.0), [0.5, 0.2, 0.0, 0.0], [1, -1, 0, 0]),
+        (losses.Censored(losses.L2(), 3.0), [0.25, 0.04, 0.0, 0.0], [1.0, -0.4, 0.0, 0.0]),
         (losses.Huber(1.0), [0.125, 0.02, 0.0, 1.5], [0.5, -0.2, 0.0, 1.0]),
     ],
 )
@@ -69,3 +71,13 @@ def test_device_agrees_with_numpy(loss):
 def test_bad_constants_are_named(loss, name, bad):
     with pytest.raises(InputError, match=f"{loss.__name__}: {name} must be a finite number > 0, got "):
         loss(bad)
+
+
+def test_a_saturated_pixel_is_pulled_up_and_never_down():
+    loss = losses.Censored(losses.L2(), 0.9)
+    image, reference = np.array([0.5, 1.5, 0.5, 1.5]), np.array([1.0, 1.0, 0.8, 0.8])
+    np.testing.assert_allclose(loss.derivative(image, reference), [-1.0, 0.0, -0.6, 1.4])
+    with pytest.raises(InputError, match="Censored: loss must be one per pixel"):
+        losses.Censored(losses.L1)  # pyright: ignore[reportArgumentType]  # the class
+    with pytest.raises(InputError, match="white"):
+        losses.Censored(white=0)

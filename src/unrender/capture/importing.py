@@ -16,17 +16,19 @@ from unrender.capture.capture import Capture
 from unrender.capture.conventions import reinterpreted
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
+from unrender.capture.unknowns import DEFAULT
 from unrender.capture.views import CapturedView, prepare
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.io import files
+from unrender.stages import stages_file
 
-__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "Imported", "Options", "check", "import_capture"]
+__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "Imported", "Options", "check", "import_capture"]
 
 CHECK, SHEET = "check", "check.png"
-PROBLEM = problem_folder.PROBLEM
+PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
 """Along the longest side of the hull: memory grows with the cube."""
 _OF_CHECK = {CHECK, SHEET}
@@ -48,7 +50,9 @@ class Options:
         hold_out: every so many photographs one is held out; 0 for none; None for the capture's own split, or 8.
         voxels: along the longest side of the hull, at most `MOST_VOXELS`.
         faces: of the hull, about.
-        texture: texels along the sides of the base colour.
+        texture: texels along the sides of the textures.
+        unknowns: of the asset, of `unknowns.NAMES`.
+        band: pixels along the border of masks that count little.
     """
 
     mesh: Path | None = None
@@ -62,6 +66,8 @@ class Options:
     voxels: int = 96
     faces: int = 10_000
     texture: int = 512
+    unknowns: tuple[str, ...] = DEFAULT
+    band: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.voxels <= MOST_VOXELS:
@@ -124,7 +130,9 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     def fill(place: Path) -> None:
         with phases.phase("problem"):
             name = folder.resolve().name
-            problem_folder.write(place, name, found.views, mesh, found.silhouettes, options.texture)
+            problem_folder.write(
+                place, name, found.views, mesh, found.silhouettes, options.texture, options.unknowns, options.band
+            )
             (place / SHEET).write_bytes(
                 _sheet(
                     found, [overlays.thumbnail(_overlay(found, index)) for index in overlays.chosen(len(found.views))]

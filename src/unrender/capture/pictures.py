@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from unrender.capture.cameras import Lens, opencv
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size, images
 
 __all__ = ["Pixels", "read", "read_mask", "upright"]
@@ -71,7 +71,7 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
         height, width = _by_mitsuba(path).values.shape[:2]  # OpenEXR, which Pillow does not know
         return width, height, 1
     except _BROKEN as error:
-        raise InputError(f"{path}: cannot be read as a picture: {_one_line(error)}") from error
+        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
 
 
 def _orientation(picture: Image.Image) -> int:
@@ -199,7 +199,7 @@ def _decode_pillow(path: Path) -> np.ndarray:
     except InputError:
         raise
     except _BROKEN as error:
-        raise InputError(f"{path}: cannot be read as a picture: {_one_line(error)}") from error
+        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
 
 
 def _decode_opencv(path: Path) -> np.ndarray:
@@ -210,7 +210,7 @@ def _decode_opencv(path: Path) -> np.ndarray:
     try:
         array = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
-        raise InputError(f"{path}: cannot be read as a picture: {_one_line(error)}") from error
+        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
     if array is None:
         raise InputError(f"{path}: cannot be read as a picture")
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
@@ -231,7 +231,3 @@ def _check_size(path: Path, width: int, height: int) -> None:
         most = image_size.MOST_VALUES // 3_000_000
         limits = f"at most {most} megapixels and less than {_LONGEST_SIDE} pixels a side"
         raise InputError(f"{path}: {width} x {height} pixels, expected {limits}")
-
-
-def _one_line(error: Any) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

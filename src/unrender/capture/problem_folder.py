@@ -12,6 +12,7 @@ import numpy as np
 import tomli_w
 
 from unrender.backend import variant
+from unrender.capture import unknowns
 from unrender.capture.mesh import Mesh, ply
 from unrender.capture.overlays import png
 from unrender.capture.silhouettes import Silhouettes
@@ -19,27 +20,39 @@ from unrender.capture.views import CapturedView
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
+from unrender.io import toml_lines
+from unrender.judging.held_out import HELD_OUT
+from unrender.rendering.exposure import EXPOSURE
+from unrender.stages import stages_file
 
-__all__ = ["HELD_OUT", "OWN", "PROBLEM", "to_world", "write"]
+__all__ = ["OWN", "PROBLEM", "to_world", "write"]
 
-PROBLEM, HELD_OUT, SCENE, MESH = "problem.toml", "held-out.toml", "scene.xml", "asset.ply"
-TEXTURE, LIGHT = "textures/base-colour.exr", "textures/light.exr"
+PROBLEM, SCENE, MESH = "problem.toml", "scene.xml", "asset.ply"
+LIGHT = "textures/light.exr"
 _FOLDERS = ("references", "masks", "textures")
-OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, *_FOLDERS})
+OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
 """What `write` puts into a folder."""
-BASE_COLOUR_KEY, LIGHT_KEY = "asset.bsdf.base_color.data", "light.data"
 _LIGHT_SIZE = 16, 32
-_BASE_COLOUR, _ROUGHNESS = 0.4, 0.6
 _MAX_DEPTH = 3
 _WHOLE = 0.999
+_BAND_WEIGHT = 0.1
+_WHITE = 0.95
+"""Of a saturated pixel, linear: resizing mixes it with its neighbours."""
 _FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 """A camera's axes left, up, forwards, which are Mitsuba's, in those of `cameras`: right, up, backwards."""
 
 
 def write(
-    folder: Path, name: str, views: Sequence[CapturedView], mesh: Mesh, silhouettes: Silhouettes, texture: int
+    folder: Path,
+    name: str,
+    views: Sequence[CapturedView],
+    mesh: Mesh,
+    silhouettes: Silhouettes,
+    texture: int,
+    chosen: Sequence[str] = unknowns.DEFAULT,
+    band: int = 0,
 ) -> None:
-    """Write the problem to an empty folder.
+    """Write the problem and its stages to an empty folder.
 
     Args:
         folder: exists.
@@ -47,30 +60,44 @@ def write(
         views: of photographs.
         mesh: with texture coordinates.
         silhouettes: of it.
-        texture: texels along the sides of the base colour.
+        texture: texels along the sides of the textures.
+        chosen: the unknowns, of `unknowns.NAMES`.
+        band: pixels along the border of the masks that count little, of training views.
 
     Raises:
         InputError: a mask leaves no whole pixel.
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
-    (folder / SCENE).write_bytes(_scene(views, stems, mesh))
+    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen))
     for part in _FOLDERS:
         (folder / part).mkdir()
-    level = []
+    level, clipped = [], False
     for view, stem in zip(views, stems, strict=True):
         mask = _loss_mask(view, silhouettes)
         level.append(float(view.values[mask].mean()))
+        clipped |= bool((view.values[mask] >= _WHITE).any())
         _write_exr(view.values, folder / "references" / f"{stem}.exr", half=True)
-        (folder / "masks" / f"{stem}.png").write_bytes(png(np.repeat(mask[..., None], 3, 2)))
-    _write_exr(np.full((texture, texture, 3), _BASE_COLOUR, np.float32), folder / TEXTURE)
+        weights = _banded(mask, 0 if view.held_out else band)
+        (folder / "masks" / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
+    for file, values in unknowns.textures(chosen, texture).values():
+        _write_exr(values, folder / "textures" / file)
     # Under an even light, a surface shows its base colour times the light's radiance.
-    radiance = max(float(np.median(level)) / _BASE_COLOUR, 1e-4)
+    radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
     _write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
+    # Numbers above 1 are no photograph's of 8 or 16 bits, which end at white.
+    white = clipped and all(float(view.values.max()) <= 1.001 for view in views)
+    loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
+    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))))
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
-        chosen = [index for index, view in enumerate(views) if view.held_out == held_out]
-        if chosen:
-            (folder / file).write_text(_toml(name, [stems[i] for i in chosen], chosen, held_out), encoding="utf-8")
+        sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
+        moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
+        if sensors and moved:
+            text = _toml(name, [stems[i] for i in sensors], sensors, held_out, moved, loss)
+            (folder / file).write_text(text, encoding="utf-8")
+    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
+    text = stages_file.text(unknowns.stages(chosen, Path(PROBLEM)), f"{note}. Written by `unrender import`.")
+    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
@@ -92,28 +119,40 @@ def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
     return found
 
 
-def _toml(name: str, stems: Sequence[str], sensors: Sequence[int], held_out: bool) -> str:
+def _banded(mask: np.ndarray, band: int) -> np.ndarray:
+    """Weights of pixels: 1 inside, little within `band` pixels of the border."""
+    from scipy import ndimage
+
+    if not band:
+        return mask.astype(np.float32)
+    # What lies outside of the picture is no border of the object.
+    distance = ndimage.distance_transform_edt(np.pad(mask, band + 1, mode="edge"))
+    assert isinstance(distance, np.ndarray)
+    inner = distance[band + 1 : -band - 1, band + 1 : -band - 1] > band
+    return np.where(mask, np.where(inner, 1.0, _BAND_WEIGHT), 0.0).astype(np.float32)
+
+
+def _toml(
+    name: str, stems: Sequence[str], sensors: Sequence[int], held_out: bool, parameters: Sequence[dict], loss: Any
+) -> str:
     head = {
         "scene": SCENE,
         "name": f"{name} (held out)"[:200] if held_out else name[:200],
         "max_depth": _MAX_DEPTH,
-        "loss": "L1",
+        "loss": loss,
     }
-    tables: list[tuple[str, dict[str, Any]]] = [
-        ("parameters", {"key": BASE_COLOUR_KEY, "bounds": [0.0, 1.0]}),
-        ("parameters", {"key": LIGHT_KEY, "bounds": [0.0, math.inf]}),
-    ]
+    tables: list[tuple[str, dict[str, Any]]] = [("parameters", table) for table in parameters]
     for stem, sensor in zip(stems, sensors, strict=True):
         view = {"reference": f"references/{stem}.exr", "sensor": sensor, "mask": f"masks/{stem}.png"}
         tables.append(("views", view))
     what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
     # A table under a heading of its own for each, as people write them; tomli_w would put them into one line each.
     parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
-    parts += [f"[[{heading}]]\n{tomli_w.dumps(table)}" for heading, table in tables]
+    parts += [toml_lines.array_table(heading, table) for heading, table in tables]
     return "\n".join(parts)
 
 
-def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh) -> bytes:
+def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh, chosen: Sequence[str]) -> bytes:
     root = Xml.Element("scene", version="3.0.0")
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
@@ -122,15 +161,32 @@ def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh) -> b
         root.append(_sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius)))
     shape = Xml.SubElement(root, "shape", type="ply", id="asset")
     _value(shape, "string", "filename", MESH)
-    bsdf = Xml.SubElement(shape, "bsdf", type="principled")
-    texture = Xml.SubElement(bsdf, "texture", type="bitmap", name="base_color")
-    for key, value in (("filename", TEXTURE), ("format", "variant"), ("wrap_mode", "clamp")):
-        _value(texture, "string", key, value)
-    _value(bsdf, "float", "roughness", _ROUGHNESS)
+    _material(shape, chosen)
     light = Xml.SubElement(root, "emitter", type="envmap", id="light")
     _value(light, "string", "filename", LIGHT)
     Xml.indent(root)
     return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
+    """A principled BSDF whose textures lie over the atlas, within a normal map where that is unknown."""
+    textures = unknowns.textures(chosen, 1)
+    if "normalmap" in textures:
+        shape = Xml.SubElement(shape, "bsdf", type="normalmap")
+        _texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
+    bsdf = Xml.SubElement(shape, "bsdf", type="principled")
+    for name, (file, values) in textures.items():
+        _texture(bsdf, name, file, raw=values.shape[2] == 1)
+    if "roughness" not in textures:
+        _value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
+
+
+def _texture(parent: Xml.Element, name: str, file: str, raw: bool) -> None:
+    texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
+    for key, value in (("filename", f"textures/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):
+        _value(texture, "string", key, value)
+    if raw:
+        _value(texture, "boolean", "raw", "true")
 
 
 def _sensor(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:

@@ -45,7 +45,13 @@ _Direction = Annotated[
 ]
 _Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape, along its longest side.")]
 _Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
-_Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the base colour.")]
+_Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
+_Unknowns = Annotated[
+    str, typer.Option(metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure.")
+]
+_Band = Annotated[
+    int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
+]
 
 
 def import_(
@@ -63,6 +69,8 @@ def import_(
     voxels: _Voxels = 96,
     faces: _Faces = 10_000,
     texture: _Texture = 512,
+    unknowns: _Unknowns = "colour,light",
+    band: _Band = 0,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
@@ -74,9 +82,11 @@ def import_(
     if not folder.is_dir():
         raise InputError(f"{folder}: {'not a folder' if folder.exists() else 'no such folder'}")
     from unrender.capture import importing
+    from unrender.capture.unknowns import parse
 
+    names = parse(unknowns)
     options = importing.Options(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band
     )
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
     place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
@@ -98,6 +108,8 @@ def import_(
     if not check:
         console.print(f"to look at: {place / importing.SHEET}", soft_wrap=True, markup=False)
         console.print(f"next: unrender run {shlex.quote(str(written))} --seconds 60", soft_wrap=True, markup=False)
+        staged = place / importing.STAGES
+        console.print(f"in stages: unrender run {shlex.quote(str(staged))} --seconds 300", soft_wrap=True, markup=False)
 
 
 def _tell(console: Console, found: Imported) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,16 @@ from unrender.backend import variant
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.exporting import maps, ready_made
+from unrender.exporting import asset, maps, ready_made
+from unrender.exporting.formats import MITSUBA, OWN
+from unrender.exporting.formats import check as check_formats
+from unrender.exporting.formats import write as write_formats
 from unrender.exporting.graph import SceneGraph
 from unrender.exporting.setters import store
 from unrender.io import files
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
+from unrender.rendering.exposure import EXPOSURE, without_exposure
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -37,7 +41,8 @@ _FOLDERS = {
     mi.ObjectType.Texture: ready_made.BITMAPS,
     mi.ObjectType.Emitter: ready_made.BITMAPS,
 }
-_OWN = {SCENE, maps.RECORD, maps.TABLE, maps.FOLDER, *_FOLDERS.values(), "files"}
+_OF_SCENE = {SCENE, *_FOLDERS.values(), "files"}
+_OWN = {maps.RECORD, maps.TABLE, maps.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
 _ROUNDING = 1e-4
 
@@ -48,13 +53,15 @@ class Exported:
 
     Attributes:
         folder: where.
-        scene: the XML file; None where there is none, as plain Mitsuba has no emissive media.
+        scene: the XML file; None where it was not asked for, or there is none, as plain Mitsuba has no emissive media.
         notices: one line for each thing that its user should know of.
+        renamed: {key: its name in the scene that was written}, of all parameters of the scene that have another one there.
     """
 
     folder: Path
     scene: Path | None
     notices: tuple[str, ...]
+    renamed: Mapping[str, str] = field(default_factory=dict)
 
 
 @exclusive("export")
@@ -63,11 +70,13 @@ def export(
     out: str | Path,
     overwrite: bool = False,
     spp: int = _SPP,
+    formats: Sequence[str] = (MITSUBA,),
 ) -> Exported:
-    """Write a scene with its recovered parameters as a folder that plain Mitsuba loads.
+    """Write a scene with its recovered parameters as a folder that plain Mitsuba loads, or for other programs.
 
         ur.export("out/indirect-room-auto", "out/room")
         ur.export((problem, result.parameters), "out/room-2")
+        ur.export("out/indirect-room-auto", "out/room-3", formats=["obj", "ply"])
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
@@ -75,44 +84,79 @@ def export(
     come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not have, only the
     recovered values are written.
 
+    The other formats take meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
+    the cameras; what they cannot take is a notice.
+
     Args:
-        what: a run folder, or a problem and {key: array} of all its parameters.
+        what: a run folder; a problem file, for its initial values; or a problem and {key: array} of all its parameters.
         out: the new folder.
         overwrite: whether an earlier export may be replaced.
         spp: samples per pixel that scene.xml asks for.
+        formats: "mitsuba", "glb", "obj", "ply", "environment", "blender", "usd".
 
     Raises:
-        InputError: the run folder or the problem cannot be read, `out` cannot be written, or a parameter has no place in a description.
-            Nothing is left behind then.
+        InputError: the run folder or the problem cannot be read, `out` cannot be written, a parameter has no place in a description, the
+            scene has no mesh, a mesh with maps no texture coordinates, or a map is too large. Nothing is left behind then.
 
     What is written is on the disk when this returns. An earlier export stands at its place until the new one does, which then takes its
     place in one instant (where the system cannot exchange two names: in two, between which the next export sets right what was left).
     """
     variant.ensure()
-    out = Path(out)
+    out, asked = Path(out), check_formats(formats)
     files.remove_leftovers(out.parent, (out.name,))
     _check_place(out, overwrite)
-    if isinstance(what, (str, Path)):
-        problem, parameters = reopen.problem_of(what), folders.read(what).parameters
-    else:
-        problem, parameters = what
-    if not isinstance(problem.renderer, MitsubaRenderer):
+    problem, parameters = _opened(what)
+    renderer = without_exposure(problem.renderer)
+    if not isinstance(renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
-    renderer, plain = problem.renderer, not problem.renderer.pair.emissive
-
-    def fill(folder: Path) -> list[str]:
-        notices = maps.write(values, folder)
-        if plain:
-            return _fill(folder, renderer, values, problem.max_depth, spp) + notices
-        return [*notices, f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"]
-
     try:
-        notices = files.write_folder(out, fill)
+        notices, renamed = files.write_folder(out, lambda folder: _write(folder, problem, renderer, values, asked, spp))
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
-    return Exported(out, out / SCENE if plain else None, tuple(notices))
+    has_scene = MITSUBA in asked and not renderer.pair.emissive
+    return Exported(out, out / SCENE if has_scene else None, tuple(notices), renamed)
+
+
+def _opened(
+    what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
+) -> tuple[Problem, Mapping[str, np.ndarray]]:
+    if not isinstance(what, (str, Path)):
+        return what
+    if Path(what).suffix.lower() == ".toml":
+        problem = Problem.from_file(what)
+        return problem, problem.initial_values()
+    return reopen.problem_of(what), folders.read(what).parameters
+
+
+def _write(
+    folder: Path,
+    problem: Problem,
+    renderer: MitsubaRenderer,
+    values: dict[str, np.ndarray],
+    asked: Sequence[str],
+    spp: int,
+) -> tuple[list[str], dict[str, str]]:
+    """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
+    notices = maps.write(values, folder)
+    others = [name for name in asked if name != MITSUBA]
+    if renderer.pair.emissive:
+        if others:
+            raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
+        why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
+        return [*notices, why], {}
+    of_scene = {key: value for key, value in values.items() if key != EXPOSURE}
+    renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
+    if MITSUBA in asked:
+        told = [f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene]
+        notices = told + notices
+    if others:
+        notices += write_formats(asset.read(folder / SCENE), folder, others)
+    if MITSUBA not in asked:
+        for name in _OF_SCENE:
+            files.remove(folder / name)
+    return notices, renamed
 
 
 def _check_place(out: Path, overwrite: bool) -> None:
@@ -132,13 +176,16 @@ def _check_place(out: Path, overwrite: bool) -> None:
 
 def _fill(
     folder: Path, renderer: MitsubaRenderer, values: dict[str, np.ndarray], max_depth: int, spp: int
-) -> list[str]:
-    """Write scene.xml and the files that it names."""
+) -> dict[str, str]:
+    """Write scene.xml and the files that it names. Returns `Exported.renamed`."""
     graph = SceneGraph(_description(renderer.pair.description, folder))
-    scene = renderer.pair.current
+    described = renderer.pair.as_described()
+    scene = described.scene
     moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
     own = {key: value for key, value in values.items() if key not in moved}
-    places = graph.places(renderer.pair.current_parameters)
+    places = graph.places(described.parameters)
+    if deformed := next((key for key in own if key not in places), None):
+        raise InputError(f"parameter {deformed} cannot be exported: the scene has a sphere there, without vertices")
     for key, value in own.items():
         live = graph.live[places[key].key]
         graph.live[places[key].key] = from_tensor(renderer.array(value), live)
@@ -153,7 +200,8 @@ def _fill(
     _gather_files(graph, folder)
     path = folder / SCENE
     path.write_bytes(graph.xml())
-    return _verify(graph, path, {key: places[key].key for key in own}, posed)
+    names = _verify(graph, path, {key: places[key].key for key in own}, posed)
+    return {key: names[place.key] for key, place in places.items() if names[place.key] != key}
 
 
 def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
@@ -220,7 +268,7 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
             path.unlink()
 
 
-def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> list[str]:
+def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> dict[str, str]:
     """Load the exported scene and hold it to the values that it should have.
 
     Args:
@@ -230,7 +278,7 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         posed: nodes that were moved, which the live scene's are not.
 
     Returns:
-        a line for each parameter that has another name now.
+        the name of each parameter of the live scene in the one that was written.
     """
     try:
         found = mi.traverse(load(path))
@@ -243,7 +291,6 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         raise InputError("export: the scene that was written has other parameters than the one it was made of")
     names = dict(zip(graph.live.properties, found.properties, strict=True))
     given = {own: key for key, own in recovered.items()}
-    notices = []
     moved = tuple(f"n{index}." for index in posed)
     for own, name in names.items():
         if own.startswith(moved):
@@ -256,6 +303,4 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         scale = max(1.0, float(np.max(np.abs(before), initial=0)))
         if before.shape != after.shape or not np.allclose(before, after, rtol=0, atol=_ROUNDING * scale):
             raise InputError(f"parameter {key} cannot be exported: the scene that was written has another value")
-        if own in given and name != key:
-            notices.append(f"{key} is called {name} in the exported scene")
-    return notices
+    return names

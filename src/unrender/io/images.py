@@ -10,6 +10,7 @@ import numpy as np
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size
 
 __all__ = ["READABLE", "Picture", "luminance", "read", "resize", "srgb_to_linear"]
@@ -104,7 +105,7 @@ def _read(path: Path, linearise: bool) -> Picture:
     except InputError:
         raise
     except Exception as error:  # Mitsuba throws what its image libraries throw
-        raise InputError(f"cannot be read as a picture: {_one_line(error)}") from error
+        raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
     return Picture(values, f"{bits}-bit sRGB, linearised" if encoded and linearise else "")
 
@@ -142,7 +143,3 @@ def _check_finite(values: np.ndarray) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise InputError(f"{int(bad.sum())} pixels are NaN or infinite, the first in row {row}, column {column}")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from unrender.core.errors import InputError
 
-__all__ = ["LARGEST", "Place", "check", "find", "parse"]
+__all__ = ["LARGEST", "Place", "array_table", "check", "find", "parse"]
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -49,6 +50,19 @@ def parse(text: str, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: not valid TOML: nested too deeply") from error
     except ValueError as error:  # tomllib's own among them, and those of numbers without end
         raise InputError(f"{where}: not valid TOML: {str(error)[:200]}") from error
+
+
+def array_table(heading: str, fields: Mapping[str, Any]) -> str:
+    """One [[heading]] as people write it: tables among its fields stand in one line each."""
+    import tomli_w
+
+    def inline(table: Mapping[str, Any]) -> str:
+        return "{ " + ", ".join(tomli_w.dumps({key: value}).strip() for key, value in table.items()) + " }"
+
+    plain = {key: value for key, value in fields.items() if not isinstance(value, Mapping)}
+    tables = {key: value for key, value in fields.items() if isinstance(value, Mapping)}
+    rows = [f"{key} = {inline(value)}\n" for key, value in tables.items()]
+    return f"[[{heading}]]\n{tomli_w.dumps(plain)}{''.join(rows)}"
 
 
 def find(text: str, place: Place) -> int:

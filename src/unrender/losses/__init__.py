@@ -9,8 +9,9 @@ of whole images (`FunctionLoss`).
 """
 
 from unrender.losses.base import Loss
+from unrender.losses.censored import Censored
 from unrender.losses.function import FunctionLoss
 from unrender.losses.perceptual import Perceptual
 from unrender.losses.pixelwise import L1, L2, Huber, RelativeL2
 
-__all__ = ["L1", "L2", "FunctionLoss", "Huber", "Loss", "Perceptual", "RelativeL2"]
+__all__ = ["L1", "L2", "Censored", "FunctionLoss", "Huber", "Loss", "Perceptual", "RelativeL2"]

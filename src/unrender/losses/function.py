@@ -15,6 +15,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 
 __all__ = ["FunctionLoss"]
 
@@ -98,9 +99,7 @@ class FunctionLoss:
             try:
                 value, _ = _CALLS[way](self, image, reference, True)
             except Exception as error:  # whatever a user's function raises for arrays of another framework
-                said.append(
-                    f"with {_NAMES[way]}'s tensors: {' '.join(str(error).split())[:160] or type(error).__name__}"
-                )
+                said.append(f"with {_NAMES[way]}'s tensors: {reason_of(error, 160)}")
                 continue
             if not np.isfinite(value):
                 raise InputError(f"{self!r}: its value at an image that is nearly the reference is {value}")

@@ -20,6 +20,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
+from unrender.core.text import reason_of
 from unrender.io import bounded_files
 
 __all__ = ["LAYERS", "Perceptual"]
@@ -207,7 +208,7 @@ def _read(path: Path) -> Mapping[str, Any]:
             return load_file(path)
         found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # PyTorch throws whatever its unpickler and its zip reader throw
-        raise InputError(f"cannot be read: {' '.join(str(error).split())[:200] or type(error).__name__}") from error
+        raise InputError(f"cannot be read: {reason_of(error, 200)}") from error
     if not isinstance(found, Mapping):
         raise InputError(f"expected named tensors, found a {type(found).__name__}")
     return found

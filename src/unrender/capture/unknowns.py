@@ -1,0 +1,101 @@
+"""The unknowns of an asset by name: their keys, textures, bounds and first values, and the stages that recover them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.rendering.exposure import EXPOSURE
+from unrender.stages.stages_file import Stage, Stages
+
+__all__ = ["DEFAULT", "NAMES", "keys", "parameters", "parse", "stages", "textures"]
+
+NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure")
+DEFAULT = ("colour", "light")
+COLOUR, ROUGHNESS = 0.4, 0.6
+_METALLIC = 0.1
+"""Above 0, which is a bound."""
+_FLAT = (0.5, 0.5, 1.0)
+"""The normal map of a surface as it is."""
+_STRENGTH, _VERTEX_RATE = 20.0, 1e-3
+"""Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
+_COARSER = 4
+
+
+def parse(text: str) -> tuple[str, ...]:
+    """ "colour,light" as names in the order of `NAMES`. Raises `InputError`."""
+    given = [name.strip() for name in text.split(",") if name.strip()]
+    if not given:
+        raise InputError(f"--unknowns: expected some of {', '.join(NAMES)}, such as {','.join(DEFAULT)}")
+    for name in given:
+        if name not in NAMES:
+            expected = did_you_mean(name, NAMES) or f"; expected some of {', '.join(NAMES)}"
+            raise InputError(f"--unknowns: no {name}{expected}")
+    return tuple(name for name in NAMES if name in given)
+
+
+def keys(unknowns: Sequence[str]) -> dict[str, str]:
+    """{name: the parameter's key} of all names; under a normal map, the material is nested."""
+    material = "asset.bsdf.nested_bsdf" if "normal" in unknowns else "asset.bsdf"
+    return {
+        "colour": f"{material}.base_color.data",
+        "roughness": f"{material}.roughness.data",
+        "metallic": f"{material}.metallic.data",
+        "normal": "asset.bsdf.normalmap.data",
+        "shape": "asset.vertex_positions",
+        "light": "light.data",
+        "exposure": EXPOSURE,
+    }
+
+
+def parameters(unknowns: Sequence[str], diagonal: float) -> list[dict[str, Any]]:
+    """The [[parameters]] of a problem file. `diagonal`: of the mesh's bounding box, > 0."""
+    of = keys(unknowns)
+    unit = {"bounds": [0.0, 1.0]}
+    more: dict[str, dict[str, Any]] = {
+        "colour": unit,
+        "roughness": {"bounds": [0.02, 1.0]},
+        "metallic": unit,
+        "normal": unit,
+        "light": {"bounds": [0.0, math.inf]},
+        "shape": {
+            "learning_rate": _VERTEX_RATE * diagonal,
+            "preconditioner": {"type": "LargeSteps", "strength": _STRENGTH},
+        },
+        "exposure": {},
+    }
+    return [{"key": of[name], **more[name]} for name in NAMES if name in unknowns]
+
+
+def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndarray]]:
+    """{attribute of the material: (file below textures, first values (size, size, C))}; of `normalmap` that of the map around it."""
+    found = {"base_color": ("base-colour.exr", np.full((size, size, 3), COLOUR, np.float32))}
+    if "roughness" in unknowns:
+        found["roughness"] = ("roughness.exr", np.full((size, size, 1), ROUGHNESS, np.float32))
+    if "metallic" in unknowns:
+        found["metallic"] = ("metallic.exr", np.full((size, size, 1), _METALLIC, np.float32))
+    if "normal" in unknowns:
+        found["normalmap"] = ("normal.exr", np.broadcast_to(np.array(_FLAT, np.float32), (size, size, 3)))
+    return found
+
+
+def stages(unknowns: Sequence[str], problem: Path) -> Stages:
+    """Light and colour at low resolution, then what shines, then the shape, then all."""
+    of, found = keys(unknowns), []
+
+    def add(name: str, wanted: Sequence[str], share: float, coarser: int = 1) -> None:
+        moved = [one for one in NAMES if one in unknowns and one in (*wanted, "exposure")]
+        if any(one in wanted for one in moved):
+            found.append(Stage(name, tuple(of[one] for one in moved), share, coarser))
+
+    add("light-and-colour", ("colour", "light"), 1.0, _COARSER)
+    add("roughness", ("roughness", "metallic"), 1.0)
+    add("shape", ("shape", "normal"), 1.0)
+    add("all", NAMES, 2.0)
+    return Stages(problem, tuple(found))

@@ -1,0 +1,1 @@
+"""A descent in stages: which parameters move in each, and what it begins with."""

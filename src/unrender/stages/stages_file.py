@@ -1,0 +1,275 @@
+"""Stages as TOML files.
+
+    problem = "problem.toml"                   # all unknowns, views and the loss
+    method = "auto"                            # of the stages that name none
+    settings = { pixels = 16384 }              # of the method, likewise
+    steps = 600                                # of all stages together; or seconds
+    seed = 0
+
+    [[stages]]
+    name = "light-and-colour"
+    unknowns = ["asset.bsdf.base_color.data", "light.data"]
+    share = 2.0                                # of the steps or seconds, against the other stages'
+    coarser = 4                                # textures have so many times fewer texels a side
+
+    [[stages]]
+    name = "all"
+    unknowns = ["asset.bsdf.base_color.data", "asset.bsdf.roughness.data", "light.data"]
+
+Paths are relative to the file. Only `problem`, `name` and `unknowns` are required. In a run's folder, the file has a table [run], too:
+how it was begun, so that it goes on likewise.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
+
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.io import bounded_files, files, toml_lines
+from unrender.problem.errors import Place, dotted
+
+__all__ = [
+    "FILE",
+    "RunOptions",
+    "Stage",
+    "Stages",
+    "folder_of",
+    "is_of_run",
+    "is_stages",
+    "read",
+    "split",
+    "text",
+    "write",
+]
+
+FILE = "stages.toml"
+"""In an import's folder, and in that of a run in stages."""
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
+_MOST = 99
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One run of several.
+
+    Attributes:
+        name: of its folder.
+        unknowns: keys of the problem's parameters that move; the others stay as earlier stages left them.
+        share: of the budget, in proportion to the other stages', > 0.
+        coarser: how many times fewer texels its textures and grids have along each side, >= 1. They are interpolated at its end.
+        method: as on the command line; None for that of all stages.
+        settings: of the method, beside those of all stages.
+    """
+
+    name: str
+    unknowns: tuple[str, ...]
+    share: float = 1.0
+    coarser: int = 1
+    method: str | None = None
+    settings: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a run in stages, which are no part of what is run.
+
+    Attributes:
+        variant: of Mitsuba.
+        threads: of the processor; None for one per core.
+        checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
+    """
+
+    variant: str = "auto"
+    threads: int | None = None
+    checkpoint_every: int | None = None
+    final_spp: int | None = None
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Runs of one problem, each from where the one before it ended.
+
+    Attributes:
+        problem: a problem file.
+        stages: at least one.
+        method, settings: of the stages that name none.
+        steps, seconds: of all stages together; None where there is no such budget.
+        seed: of the first stage; the next have the next numbers.
+        run: how it was begun; None outside of a run's folder.
+    """
+
+    problem: Path
+    stages: tuple[Stage, ...]
+    method: str = "auto"
+    settings: dict[str, Any] | None = None
+    steps: int | None = None
+    seconds: float | None = None
+    seed: int = 0
+    run: RunOptions | None = None
+
+    def settings_of(self, stage: Stage) -> dict[str, str]:
+        """The method's settings in a stage, as on the command line."""
+        both = {**(self.settings or {}), **(stage.settings or {})}
+        return {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in both.items()}
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+_Positive = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
+_Setting = StrictStr | StrictInt | StrictFloat | bool
+
+
+class _Stage(_Model):
+    name: StrictStr = Field(description="lower-case letters, digits and dashes, at most 40")
+    unknowns: list[StrictStr] = Field(
+        description="a list of at least one key of the problem's parameters", min_length=1
+    )
+    share: _Positive = Field(1.0, description="a number above 0")
+    coarser: Annotated[StrictInt, Field(ge=1, le=64)] = Field(1, description="a whole number from 1 to 64")
+    method: StrictStr | None = Field(None, description="the name of a method, see `unrender methods`")
+    settings: dict[StrictStr, _Setting] = Field({}, description="a table of the method's options, such as { spp = 4 }")
+
+
+_Count = Annotated[StrictInt, Field(ge=1)]
+
+
+class _Run(_Model):
+    variant: StrictStr = Field("auto", description="a variant of Mitsuba")
+    threads: _Count | None = Field(None, description="a whole number of at least 1")
+    checkpoint_every: _Count | None = Field(None, description="a whole number of at least 1")
+    final_spp: _Count | None = Field(None, description="a whole number of at least 1")
+
+
+class _Stages(_Model):
+    problem: StrictStr = Field(description="the path of a problem file")
+    stages: list[_Stage] = Field(description="at least one [[stages]] table", min_length=1, max_length=_MOST)
+    method: StrictStr = Field("auto", description="the name of a method, see `unrender methods`")
+    settings: dict[StrictStr, _Setting] = Field({}, description="a table of the method's options, such as { spp = 4 }")
+    steps: _Count | None = Field(None, description="a whole number of at least 1")
+    seconds: _Positive | None = Field(None, description="a number above 0")
+    seed: Annotated[StrictInt, Field(ge=0)] = Field(0, description="a whole number of at least 0")
+    run: _Run | None = Field(None, description="a table of a run's options")
+
+
+def is_stages(path: Path) -> bool:
+    """Whether a TOML file describes stages and no problem. False for what cannot be read: whoever reads it will say why."""
+    found = _parsed(path)
+    return "stages" in found and "scene" not in found
+
+
+def is_of_run(path: Path) -> bool:
+    """Whether a file of stages is that of a run, which `write` wrote, and none that a user or an import did. False as above."""
+    problem = _parsed(path).get("problem")
+    return is_stages(path) and isinstance(problem, str) and Path(problem).is_absolute()
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        return toml_lines.parse(bounded_files.read_text(path, toml_lines.LARGEST), str(path))
+    except (InputError, OSError):
+        return {}
+
+
+def read(path: str | Path) -> Stages:
+    """The stages that a TOML file describes.
+
+    Raises:
+        InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, what was expected.
+    """
+    file = Path(path)
+    content = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
+    try:
+        model = _Stages.model_validate(toml_lines.parse(content, str(file)))
+    except pydantic.ValidationError as error:
+        details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+        place, what = _explain(details[0])
+        raise InputError(f"{file}:{toml_lines.find(content, place)}: {dotted(place)}: {what}") from error
+    known: set[str] = set()
+    for index, stage in enumerate(model.stages):
+        place, what = ("stages", index, "name"), ""
+        if not _NAME.fullmatch(stage.name):
+            what = f"expected {_Stage.model_fields['name'].description}, got {stage.name!r:.60}"
+        elif stage.name in known:
+            what = f"{stage.name} is given twice"
+        elif len(set(stage.unknowns)) < len(stage.unknowns):
+            place, what = ("stages", index, "unknowns"), "a key is given twice"
+        if what:
+            raise InputError(f"{file}:{toml_lines.find(content, place)}: {dotted(place)}: {what}")
+        known.add(stage.name)
+    stages = tuple(
+        Stage(s.name, tuple(s.unknowns), float(s.share), s.coarser, s.method, s.settings or None) for s in model.stages
+    )
+    problem = file.parent / model.problem
+    run = None if model.run is None else RunOptions(**model.run.model_dump())
+    return Stages(problem, stages, model.method, model.settings or None, model.steps, model.seconds, model.seed, run)
+
+
+def text(stages: Stages, note: str) -> str:
+    """The file's content, under a comment."""
+    head: dict[str, Any] = {"problem": str(stages.problem), "method": stages.method, "settings": stages.settings}
+    head |= {"steps": stages.steps, "seconds": stages.seconds, "seed": stages.seed}
+    parts = [f"# {note}\n", tomli_w.dumps({key: value for key, value in head.items() if value not in (None, {})})]
+    if stages.run is not None:
+        given = {key: value for key, value in asdict(stages.run).items() if value is not None}
+        parts.append(tomli_w.dumps({"run": given}))
+    for stage in stages.stages:
+        table = {"name": stage.name, "unknowns": list(stage.unknowns), "share": stage.share}
+        table |= {"coarser": stage.coarser} if stage.coarser > 1 else {}
+        table |= {key: value for key in ("method", "settings") if (value := getattr(stage, key))}
+        parts.append(toml_lines.array_table("stages", table))
+    return "\n".join(parts)
+
+
+def write(stages: Stages, folder: Path) -> None:
+    """The file of a run in stages, with the problem's path in full. Raises `OSError`."""
+    whole = replace(stages, problem=stages.problem.resolve())
+    note = "Stages under way: `unrender resume` goes on with those that are left"
+    files.write(folder / FILE, text(whole, note).encode())
+
+
+def split(stages: Stages) -> list[tuple[int | None, float | None]]:
+    """Steps and seconds of each stage, in proportion to the shares; every stage has one step at least."""
+    whole = sum(stage.share for stage in stages.stages)
+    ends, found = 0.0, []
+    given = 0
+    for stage in stages.stages:
+        ends += stage.share
+        steps = None
+        if stages.steps is not None:
+            steps = max(1, round(stages.steps * ends / whole) - given)
+            given += steps
+        found.append((steps, None if stages.seconds is None else stages.seconds * stage.share / whole))
+    return found
+
+
+def folder_of(stages: Stages, index: int, out: Path) -> Path:
+    """The run folder of a stage."""
+    return out / f"{index + 1}-{stages.stages[index].name}"
+
+
+def _explain(detail: Any) -> tuple[Place, str]:
+    """The place and the message of one of pydantic's errors."""
+    location = detail["loc"]
+    inner = len(location) >= 2 and location[0] == "stages" and isinstance(location[1], int)
+    of_run = len(location) >= 2 and location[0] == "run"
+    place: Place = location[: 3 if inner else 2 if of_run else 1]
+    fields = (_Stage if inner else _Run if of_run else _Stages).model_fields
+    name = str(place[-1])
+    if detail["type"] == "extra_forbidden" and name not in fields:
+        there = ", ".join(fields)
+        return place, f"no such field{did_you_mean(name, fields) or f'; there are {there}'}"
+    expected = fields[name].description if name in fields else "a table"
+    if detail["type"] == "missing" and len(location) == len(place):
+        return place, f"missing, expected {expected}"
+    got = repr(detail["input"])
+    return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
