@@ -1,6 +1,7 @@
 """Table."""
 
 import itertools
+import statistics
 from typing import Any
 
 from benchmarks import markdown
@@ -31,7 +32,32 @@ def table(record: Record) -> str:
             f"{rival}'s time over the best of the Our methods, per goal (>: its budget over theirs, where it never got there):"
         ]
         parts += [_gains(record["tasks"], rival, goals)]
-    return "\n\n".join(parts)
+    parts += [
+        "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached."
+    ]
+    return "\n\n".join([*parts, _apart(record["tasks"])])
+
+
+def _apart(tasks: dict[str, Any]) -> str:
+    """A row per rival and method: the mean of their ratios on each task, and of all, with the geometric mean."""
+    rows = []
+    for method, rival in itertools.product(("OurHVPA", "OurJoint"), ("FR22", "CMA-ES", "Mitsuba")):
+        ratios = {name: _both(task["methods"], rival, method) for name, task in tasks.items()}
+        every = [ratio for found in ratios.values() for ratio in found]
+        cells = [f"{statistics.fmean(found):.2f}" if found else "—" for found in ratios.values()]
+        middle = f"{statistics.fmean(every):.2f} ({statistics.geometric_mean(every):.2f})" if every else "—"
+        rows.append([f"{rival} / {method}", *cells, middle, len(every)])
+    return markdown.table(["", *tasks, "all (geometric)", "goals"], rows)
+
+
+def _both(methods: dict[str, Any], rival: str, method: str) -> list[float]:
+    """The rival's times over the method's, of the goals that both reached in more than half of their runs."""
+    if rival not in methods or method not in methods:
+        return []
+    theirs, ours = (
+        [*entry["image"], *entry["parameter"]] for entry in (methods[m]["summary"] for m in (rival, method))
+    )
+    return [a / b for a, b in zip(theirs, ours, strict=True) if a is not None and b is not None]
 
 
 def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:

@@ -1,0 +1,262 @@
+"""docs/papers.md leaves out no equation, figure or table of the papers, and its files, names, commands and numbers are there."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.runner.catalogue import ROOT, benchmarks
+
+KNOWN = benchmarks()
+PAGE = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
+TABLE_2 = ("QUAD", "BOX2", "BOX10", "MUG", "SHADOW", "BUNNY", "TEXTURE", "CNN", "CNN5")
+PAPERS: dict[str, tuple[int, list[str]]] = {
+    "Recursive control variates": (
+        20,
+        [
+            *(f"Fig. {n}" for n in range(1, 9)),
+            *("Fig. 9, L1 and L2", "Fig. 9, tea", "Fig. 9, denoised"),
+            *(f"Fig. {n}" for n in range(10, 13)),
+            *("Sec. 7, heuristic weights", "Suppl., image viewer"),
+        ],
+    ),
+    "Meta-estimation": (21, [*(f"Fig. {n}" for n in range(1, 10)), "Sec. 7, differences"]),
+    "Smoothed derivatives": (
+        23,
+        [
+            *(f"Fig. {n}" for n in range(1, 5)),
+            *("Fig. 5, SUZANNE", "Fig. 5, BANANA", "Table 1", "Table 2, all"),
+            *(f"Table 2, {task}" for task in TABLE_2),
+            *("Table 2, convergence plots", "Suppl. Secs A to D", "Suppl. Sec. H", "Suppl. Sec. J"),
+            *("Suppl., L-BFGS", "Suppl., rendering noise", "Suppl., starts and outcomes"),
+        ],
+    ),
+    "Adaptive pixel sampling": (
+        20,
+        [
+            *(f"Fig. {n}" for n in range(1, 8)),
+            *(f"Fig. 8, {scene}" for scene in ("DODOCO", "POTTERY", "EARTH2MARS", "SMOKE")),
+            *(f"Fig. 9, {scene}" for scene in ("EARTH", "DODOCOA", "BOWL", "LEGO", "DODOCOB", "KIRBY")),
+            "Suppl., animations",
+        ],
+    ),
+}
+"""Of each paper: how many numbered equations it has, and its figures and tables, in parts where a figure has several tasks, with
+what the text says of the supplement or finds in a section."""
+VERDICT = re.compile(r"(met|beyond|short because|not comparable because|not run because)\b")
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e-?\d+)?"
+WITH_SPREAD = rf"(?: ± {NUMBER}| \({NUMBER}(?: to {NUMBER})?\))"
+OF_EVERY_BENCHMARK = {"quick", "plots_only", "out"}
+TUNING_SEEDS = {"meta.fig2_exponential": 16, "higher_order.table2": 2}
+"""Where it is not one."""
+
+
+def section(page: str, title: str) -> str:
+    """A section's text."""
+    return page.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+
+
+def rows(text: str, cells: int) -> Iterator[list[str]]:
+    """The rows of all tables of so many columns, without their heads."""
+    lines = [line[2:-2].split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    return (row for row in lines if len(row) == cells and row[0] not in ("equation", "figure", "figure, table"))
+
+
+def numbers_of(equation: str) -> list[int]:
+    """ "6, 7, 9" or "15 to 20, listings 1, 2" or "sec. 3.5"."""
+    found: list[int] = []
+    for part in re.split(r", (?=\d)", re.sub(r",? ?\b(listing|sec|suppl|algorithm).*", "", equation)):
+        first, _, last = part.partition(" to ")
+        found += range(int(first), int(last or first) + 1) if first else []
+    return found
+
+
+def left_out(page: str) -> Iterator[str]:
+    """Equations, figures and tables that have no row, or more than one, or that no paper has."""
+    for title, (equations, figures) in PAPERS.items():
+        text = section(page, title)
+        found = sorted(number for row in rows(text, 3) for number in numbers_of(row[0]))
+        if found != [*range(1, equations + 1)]:
+            yield f"{title}: equations {found}"
+        if [row[0] for row in rows(text, 5)] != figures:
+            yield f"{title}: figures {sorted({row[0] for row in rows(text, 5)} ^ set(figures)) or 'in another order'}"
+
+
+@functools.cache
+def defined(file: Path) -> set[str]:
+    """Functions, classes and methods of a file, without importing it."""
+    found: set[str] = set()
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found.add(node.name)
+            found |= {f"{node.name}.{each.name}" for each in node.body if isinstance(each, ast.FunctionDef)}
+    return found
+
+
+def wrong_names(page: str) -> Iterator[str]:
+    """Files that are not there, and names that they do not define: "`a/b.py`: `f`, `C.g`"."""
+    for path, names in re.findall(r"`([\w/]+\.py)`((?:[:,] `[\w.]+`(?!:))*)", page):
+        file = next((each for each in (ROOT / "src/unrender" / path, ROOT / path) if each.is_file()), None)
+        if file is None:
+            yield f"no file {path}"
+            continue
+        yield from (f"no {name} in {path}" for name in re.findall(r"`([\w.]+)`", names) if name not in defined(file))
+    for title in PAPERS:
+        for row in rows(section(page, title), 3):
+            if not row[2].startswith("none: ") and not re.search(r"`[\w/]+\.py`: `", row[2]):
+                yield f"{title}, equation {row[0]}: neither a file and a name nor a reason"
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """Each benchmark that a command runs, with the options it gives."""
+    found = re.findall(r"`python -m benchmarks ([\w.]+)([^`]*)`", text)
+    return [(name, [o.replace("-", "_") for o in re.findall(r"--([\w-]+)", rest)]) for name, rest in found]
+
+
+@functools.cache
+def options_of(name: str) -> set[str]:
+    """What a benchmark's `run` takes, without importing it."""
+    tree = ast.parse((KNOWN[name].folder / "run.py").read_text(encoding="utf-8"))
+    run = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "run")
+    return {each.arg for each in run.args.args} | OF_EVERY_BENCHMARK
+
+
+def wrong_commands(page: str) -> Iterator[str]:
+    """Benchmarks that the catalogue does not have, and options that their `run` does not have."""
+    for name, options in commands(page):
+        if name not in KNOWN:
+            yield f"no benchmark {name}"
+            continue
+        yield from (f"{name} has no option {option}" for option in sorted(set(options) - options_of(name)))
+    for name in re.findall(r"`((?:rcv|meta|higher_order|adaptive|volumes)\.\w+)`", page):
+        if name not in KNOWN:
+            yield f"no benchmark {name}"
+
+
+def wrong_verdicts(page: str) -> Iterator[str]:
+    """Verdicts of other words, and those that do not go with whether there is a command."""
+    for title, row in figures_of(page):
+        verdict = VERDICT.match(row[4])
+        if (
+            verdict is None
+            or (verdict[0] == "not run because") != (row[3] == "—")
+            or bool(commands(row[3])) == (row[3] == "—")
+        ):
+            yield f"{title}, {row[0]}: {row[3]}: {row[4]}"
+
+
+def figures_of(page: str) -> Iterator[tuple[str, list[str]]]:
+    """(paper, row) of all figures and tables."""
+    return ((title, row) for title in PAPERS for row in rows(section(page, title), 5))
+
+
+@functools.cache
+def numbers(text: str) -> frozenset[str]:
+    """As they are written, with their signs, alone and with the spread or the range behind them; not those in names (L2, Eq. 5)."""
+    text = re.sub(r"\b(Eq|Fig|Sec|Table)s?\.? \d+(, \d+)*( (and|to) \d+)?", "", text)
+    return frozenset(re.findall(rf"(?<![\w.]){NUMBER}", text) + re.findall(rf"(?<![\w.]){NUMBER}{WITH_SPREAD}", text))
+
+
+@functools.cache
+def results() -> dict[str, str]:
+    """The section of docs/results.md of each benchmark."""
+    found = re.split(r"\n## ", (ROOT / "docs" / "results.md").read_text(encoding="utf-8"))[1:]
+    return {commands(text)[0][0]: text for text in found}
+
+
+def wrong_numbers(page: str) -> Iterator[str]:
+    """Numbers given as ours that the results of the row's benchmark do not have; a verdict may repeat the paper's."""
+    for title, row in figures_of(page):
+        known = frozenset[str]().union(*(numbers(results()[name]) for name, _ in commands(row[3])))
+        given = (numbers(row[2]) - known) | (numbers(row[4]) - known - numbers(row[1]) - numbers(row[0]))
+        if given and row[3] != "—":
+            yield f"{title}, {row[0]}: not in the results: {sorted(given)}"
+
+
+@functools.cache
+def baselines() -> list[str]:
+    """The rows of the table of baselines that the records ask for, as regular expressions."""
+    found = []
+    for name in sorted(set(re.findall(r"^\| `([\w.]+)` \|", section(PAGE, "Baselines"), re.MULTILINE))):
+        record = json.loads((KNOWN[name].folder / "results.json").read_text())
+        tasks = next(
+            (record[key] for key in ("entries", "tasks", "budgets", "schedules") if key in record), {None: record}
+        )
+        for task, entry in tasks.items():
+            tried = "; ".join(f"{method}: {len(each['tried']) or '—'}" for method, each in entry["methods"].items())
+            cells = [
+                f"`{re.escape(name)}`",
+                re.escape(task) if task else r"[\w-]+",
+                re.escape(tried),
+                str(seeds(name, task)),
+            ]
+            found.append(r"^\| " + r" \| ".join(cells) + r" \|")
+    return found
+
+
+def seeds(name: str, task: str | None) -> int:
+    """Tuning seeds of a task."""
+    return {"spiral": 3, "TEXTURE": 1}.get(task or "", TUNING_SEEDS.get(name, 1))
+
+
+def wrong_baselines(page: str) -> Iterator[str]:
+    """Rows that differ from the records, or are too few or too many."""
+    table = section(page, "Baselines")
+    yield from (f"baselines: no row {row}" for row in baselines() if not re.search(row, table, re.MULTILINE))
+    if table.count("\n| `") != len(baselines()):
+        yield f"baselines: {len(baselines())} rows expected"
+
+
+CHECKS = (left_out, wrong_names, wrong_commands, wrong_verdicts, wrong_numbers, wrong_baselines)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_the_page_is_true(check: Any) -> None:
+    assert not list(check(PAGE))
+
+
+@pytest.mark.parametrize(
+    ("check", "old", "new", "message"),
+    [
+        (left_out, "| 12, 13 |", "| 12 |", "Recursive control variates: equations"),
+        (left_out, "| 18 to 20 |", "| 18 to 21 |", "Meta-estimation: equations"),
+        (left_out, "| Fig. 6 | with differential", "| Fig. 4 | with differential", "['Fig. 6']"),
+        (left_out, "| Table 2, CNN5 |", "| Table 2, CNN6 |", "Table 2, CNN5"),
+        (wrong_names, "`statistics/welford.py`: `update`", "`statistics/wellford.py`: `update`", "no file"),
+        (wrong_names, "`optimal_alpha`", "`best_alpha`", "no best_alpha"),
+        (wrong_names, "`RenderSession.tangent_moment`", "`RenderSession.moment`", "no RenderSession.moment"),
+        (wrong_names, "`update`, `covariance`", "`update`, `variance`", "no variance"),
+        (wrong_names, "none: an ablation that", "an ablation that", "equation 14"),
+        (wrong_commands, "benchmarks rcv.fig4_order", "benchmarks rcv.fig4", "no benchmark rcv.fig4"),
+        (wrong_commands, "--steps 400 --seeds 3", "--step 400", "no option step"),
+        (wrong_commands, "`adaptive.cost`", "`adaptive.costs`", "no benchmark adaptive.costs"),
+        (wrong_verdicts, "| beyond |", "| fine |", "Fig. 8"),
+        (wrong_verdicts, "not run because the gallery has no such scene", "met, the gallery has no such scene", "Fig. 1"),
+        (wrong_verdicts, "| met, on another scene |", "| not run because of time |", "Fig. 7"),
+        (wrong_numbers, "over FR22 1.05 (0.74)", "over FR22 1.05 (0.55)", "Table 2, all: not in the results: ['0.55', '1.05 (0.55)']"),
+        (wrong_numbers, "L1's derivative -46.8%", "L1's derivative +46.8%", "['+46.8']"),
+        (wrong_numbers, "with L2 stock ends at 1.73", "with L2 stock ends at 1.74", "['1.74']"),
+        (wrong_baselines, "OurHVPA: 2; OurJoint: 4 | 2 |", "OurHVPA: 8; OurJoint: 4 | 2 |", "BOX2"),
+        (wrong_baselines, "uniform: 4; loss: 4; adaptive: 4 | 1 |", "uniform: 4; loss: 4; adaptive: 4 | 2 |", "adaptive_smoke"),
+        (wrong_baselines, "| `meta.equal_time` | chalice |", "| meta | chalice |", "chalice"),
+    ],
+)  # fmt: skip
+def test_a_fault_is_seen(check: Any, old: str, new: str, message: str) -> None:
+    assert old in PAGE
+    assert message in "\n".join(check(PAGE.replace(old, new)))
+
+
+def test_there_is_something_to_check() -> None:
+    """A page or a results page of another form must not pass for want of matches."""
+    figures = [row for _, row in figures_of(PAGE)]
+    assert len(figures) == len(list(itertools.chain(*(names for _, names in PAPERS.values()))))
+    assert sum(len(numbers(row[2])) for row in figures) > 100
+    assert set(results()) == {name for name, each in KNOWN.items() if (each.folder / "results.json").is_file()}
