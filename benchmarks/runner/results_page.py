@@ -14,7 +14,7 @@ Ratios are of one run on one machine; times are not comparable between sections.
 
 RCV: Nicolet et al. 2023, *Recursive Control Variates for Inverse Rendering*. Meta: Balint et al. 2023, *Joint Sampling and Optimisation for
 Inverse Rendering*. HO: Wang et al. 2025, *Stochastic Gradient Estimation for Higher-order Differentiable Rendering*. Adaptive: *Image-space
-Adaptive Sampling for Fast Inverse Rendering*."""
+Adaptive Sampling for Fast Inverse Rendering*. [The papers](papers.md) has their own figures and tables beside these."""
 
 
 def write_page(file: Path = ROOT / "docs" / "results.md") -> Path:

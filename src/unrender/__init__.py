@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     )
     from unrender.core.random import Key
     from unrender.core.registry import register
+    from unrender.dealing.deal import deal
     from unrender.estimators.base import Estimate
     from unrender.estimators.filtered import FilteredGradient
     from unrender.estimators.loss_values import LossValues
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from unrender.evaluation import metrics
     from unrender.exporting.scene_folder import export
     from unrender.io.volumes import Grid, read_grid, write_grid
+    from unrender.judging.judge import judge
+    from unrender.judging.turntable import turntable
     from unrender.loops.renderer import Renderer
     from unrender.problem.coarse_to_fine import CoarseToFine
     from unrender.problem.parameter import Parameter
@@ -97,8 +100,10 @@ _HOMES = {
     "StockGradient": "estimators.stock",
     "TensorBoard": "runs.tensorboard",
     "View": "problem.view",
+    "deal": "dealing.deal",
     "estimate": "runs.optimize",
     "export": "exporting.scene_folder",
+    "judge": "judging.judge",
     "optimize": "runs.optimize",
     "read_grid": "io.volumes",
     "register": "core.registry",
@@ -106,6 +111,7 @@ _HOMES = {
     "render_pair": "problem.render",
     "resume": "runs.reopen",
     "sensitivity": "runs.sensitivity",
+    "turntable": "judging.turntable",
     "write_grid": "io.volumes",
 }
 
@@ -135,10 +141,12 @@ __all__ = [
     "UnrenderError",
     "VariantError",
     "View",
+    "deal",
     "estimate",
     "export",
     "gallery",
     "images",
+    "judge",
     "losses",
     "metrics",
     "optimize",
@@ -157,6 +165,7 @@ __all__ = [
     "sensitivity",
     "smoothed",
     "statistics",
+    "turntable",
     "use",
     "write_grid",
 ]

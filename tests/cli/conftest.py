@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,3 +73,34 @@ def problem(tmp_path: Path) -> Path:
     photo = np.broadcast_to(np.array([0.6, 0.5, 0.4], np.float32), (4, 6, 3))
     mi.Bitmap(np.ascontiguousarray(photo)).write(str(tmp_path / "photo.exr"))
     return tmp_path / "problem.toml"
+
+
+@pytest.fixture
+def run_once(unrender: Unrender, problem: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """`run_once(*options)`: the run folder `result` of a run of the problem, copied from an earlier test's with the same options.
+
+    The copy is what the run would have left here: the folder's own path in its files is this one's.
+    """
+
+    def run(*options: object) -> Path:
+        folder = problem.parent / "result"
+        words = [str(option) for option in options]
+        if (known := _runs.get(tuple(words))) is None:
+            answer = unrender("run", "problem.toml", "--out", "result", *words)
+            assert answer.status == 0, answer.error
+            kept = tmp_path_factory.mktemp("run") / "result"
+            shutil.copytree(folder, kept)
+            _runs[tuple(words)] = kept, problem.parent
+            return folder
+        kept, place = known
+        shutil.copytree(kept, folder)
+        for path in folder.rglob("*"):
+            if path.suffix in (".json", ".toml") and str(place) in (text := path.read_text(encoding="utf-8")):
+                path.write_text(text.replace(str(place), str(problem.parent)), encoding="utf-8")
+        return folder
+
+    return run
+
+
+_runs: dict[tuple[str, ...], tuple[Path, Path]] = {}
+"""{options: (a copy of the run folder, where the run was)} of this test process."""

@@ -151,7 +151,11 @@ def check_toml(text: str, place: str, file: Path | None = None) -> None:
     What is missing in a part is filled in with a scene that does not exist: that it is missing is then the first complaint.
     """
     from unrender.problem.problem import Problem
+    from unrender.stages import stages_file
 
+    if file is not None and stages_file.is_stages(file):
+        stages_file.read(file)
+        return
     if file is not None:
         Problem.from_file(file)
         return
@@ -193,7 +197,8 @@ def command(line: str, place: str) -> int:
     assert words[0] == "unrender", f"{place}: no rule for the command {words[0]}"
     check_options(words, place)
     synopsis = any(re.fullmatch(r"\[.*|.*\]|[A-Z]{3,}", word) for word in words)
-    return 0 if synopsis or words[1] == "watch" else main(small(words[1:]))
+    alone = words[1] in ("watch", "sweep") or "--workers" in words  # by their options alone
+    return 0 if synopsis or alone else main(small(words[1:]))
 
 
 def check_options(words: list[str], place: str) -> None:

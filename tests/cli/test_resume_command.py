@@ -18,11 +18,10 @@ QUICK = ["--final-spp", "4"]
 
 
 @pytest.fixture
-def stopped(unrender, problem: Path, mitsuba_variant: str) -> Path:
+def stopped(run_once, mitsuba_variant: str) -> Path:
     """A run of six steps that looks as if it had died in the eighth."""
-    words = ["run", "problem.toml", "--steps", 6, "--out", "result", "--checkpoint-every", 2, "--seed", 5]
-    assert unrender(*words, "--variant", mitsuba_variant, "--set", "learning_rate=0.02", *QUICK).status == 0
-    folder = problem.parent / "result"
+    words = ["--steps", 6, "--checkpoint-every", 2, "--seed", 5, "--set", "learning_rate=0.02", *QUICK]
+    folder = run_once(*words, "--variant", mitsuba_variant)
     record = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps({**record, "status": "running"}))
     method = (folder / "method.toml").read_text()

@@ -17,7 +17,6 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contract"))
 
-import cma  # noqa: F401 (a second to import: once, not in each child)
 from analytic import problem  # pyright: ignore[reportMissingImports]
 
 import unrender as ur
@@ -95,4 +94,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    import cma  # noqa: F401 (a second to import: once, not in each child)
+
     main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import mitsuba as mi
@@ -42,9 +42,9 @@ class Backend:
     same_paths: bool = True
     step: float = 0.05
 
-    @cache  # noqa: B019 (as many as backends)
+    @lru_cache(maxsize=1)  # noqa: B019 (one)
     def renderer(self) -> Renderer:
-        """One that all tests share, with its kernels."""
+        """That of the test before, where it was this backend's; else a new one: see `no_scene_outlives_its_file`."""
         return self.make()
 
 

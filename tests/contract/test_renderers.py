@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -28,6 +29,13 @@ def without_media(names: Iterable[str]) -> list[Any]:
     """`names` for a test, that of media in the long tier: its kernels take longest to compile."""
     names = list(names)
     return quick(names, *(name for name in names if name != "medium"))
+
+
+@pytest.fixture(autouse=True)
+def no_scene_outlives_its_test() -> Iterator[None]:
+    """See `no_scene_outlives_its_file`: with the scenes of other backends beside it, each has kernels of its own, and larger ones."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(autouse=True, scope="module")

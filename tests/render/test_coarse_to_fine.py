@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -337,13 +338,18 @@ class Stop(ur.Callback):
             raise KeyboardInterrupt
 
 
+@functools.cache
+def uninterrupted(name: str, states: Any) -> ur.Result:
+    return ur.optimize(problem(ur.CoarseToFine((3,), states=states)), *PAIRS[name], 6)
+
+
 @pytest.mark.parametrize("at", [2, 3, 4])
 @pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:
     """Interrupted before a change of resolution, at it, and after it."""
     way = ur.CoarseToFine((3,), states=states)
-    whole = ur.optimize(problem(way), *PAIRS[name], 6)
+    whole = uninterrupted(name, states)
     with pytest.raises(KeyboardInterrupt):
         ur.optimize(
             problem(way), *PAIRS[name], 6, callbacks=[Stop(at)], run_directory=tmp_path / "run", checkpoint_every=1

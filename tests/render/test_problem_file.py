@@ -156,12 +156,17 @@ MISTAKES = [
     ),
     ("[[views]]", "[[views]]\nsensor = 1.5", 6, "views[0].sensor: expected the index of a sensor"),
     # values
-    ('"L1"', '"L3"', 2, 'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual", got "L3"'),
+    (
+        '"L1"',
+        '"L3"',
+        2,
+        'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual" or "Censored", got "L3"',
+    ),
     (
         '"L1"',
         '"huber"',
         2,
-        'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual", got "huber"; did you mean Huber?',
+        'loss: expected "L1" or "L2" or "RelativeL2" or "Huber" or "Perceptual" or "Censored", got "huber"; did you mean Huber?',
     ),
     ('"L1"', '{ type = "Huber", dleta = 1 }', 2, "loss: Huber has no option dleta; did you mean delta?"),
     ('"L1"', '{ type = "Huber", delta = -1 }', 2, "loss: Huber: delta must be"),

@@ -50,10 +50,10 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
 @pytest.mark.parametrize(
     ("more", "key", "message"),
     [
-        ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors, and camera is another"),
+        ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors, of which the scene has none"),
         ({"camera": {"type": "orthographic"}}, "thing.rotation", r"limited to perspective sensors"),
         ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is no mesh \(Sphere\)"),
-        ({}, "camera.translation", "do not move sensors"),
+        ({"camera": {"type": "orthographic"}}, "camera.translation", "move perspective sensors only"),
         ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
         ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not move emitters"),
     ],

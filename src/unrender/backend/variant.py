@@ -20,11 +20,13 @@ from typing import Any
 from unrender.backend import cache, install_hints, llvm, plugins
 from unrender.core.errors import VariantError
 from unrender.core.suggestions import did_you_mean
+from unrender.core.text import reason_of
 
 __all__ = [
     "CUDA",
     "LLVM",
     "VARIANTS",
+    "cores",
     "current",
     "ensure",
     "gpu_problem",
@@ -121,7 +123,7 @@ def use(variant: str = "auto") -> str:
         try:
             mi.set_variant(chosen)
         except ImportError as error:
-            raise VariantError(f"Mitsuba cannot use {chosen}: {_one_line(error)}") from error
+            raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
     return chosen
 
 
@@ -226,7 +228,7 @@ def _trial_problem(variant: str) -> str | None:
             check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return f"the trial on the GPU did not finish ({_one_line(error)})"
+        return f"the trial on the GPU did not finish ({reason_of(error)})"
     if trial.returncode == 0:
         return None
     lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
@@ -243,7 +245,7 @@ def _mitsuba() -> Any:
     except (ImportError, OSError, NameError) as error:
         # Where a library is missing, Dr.Jit's own import trips over a name while it handles that.
         cause = error.__context__ if isinstance(error, NameError) and error.__context__ else error
-        raise VariantError(f"Mitsuba cannot be imported: {_one_line(cause)}") from error
+        raise VariantError(f"Mitsuba cannot be imported: {reason_of(cause)}") from error
     plugins.prefer_own()
     return mitsuba
 
@@ -294,5 +296,6 @@ def _silent_stderr() -> Iterator[None]:
         os.close(kept)
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+def cores() -> int:
+    """How many of the processor's cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -11,10 +11,13 @@ from unrender.cli.compare import compare
 from unrender.cli.export import export
 from unrender.cli.gallery import gallery
 from unrender.cli.import_ import import_
+from unrender.cli.judge import judge
 from unrender.cli.methods import methods
 from unrender.cli.report import report
 from unrender.cli.resume import resume
 from unrender.cli.run import run
+from unrender.cli.sweep import sweep
+from unrender.cli.turntable import turntable
 from unrender.cli.watch import watch
 
 __all__ = ["app"]
@@ -30,8 +33,11 @@ app.command()(run)
 app.command()(resume)
 app.command()(watch)
 app.command()(compare)
+app.command()(sweep)
 app.command()(report)
 app.command()(export)
+app.command()(judge)
+app.command()(turntable)
 app.command("import")(import_)
 app.command()(gallery)
 app.command()(methods)

@@ -18,6 +18,7 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 
 if TYPE_CHECKING:
+    from unrender.cluster import Workers
     from unrender.problem.problem import Problem
 
 __all__ = [
@@ -30,15 +31,21 @@ __all__ = [
     "ProblemSettings",
     "Threads",
     "Variant",
+    "WorkersOption",
+    "absolute",
     "budget",
     "check_problem",
+    "check_variant",
+    "finished_run",
     "folder",
     "literal",
     "open_problem",
+    "refuse_stages",
     "remove_if_empty",
     "settings",
     "short_name",
     "use_variant",
+    "workers",
 ]
 
 DEFAULT_STEPS = 300
@@ -78,6 +85,29 @@ NoCache = Annotated[
 ]
 
 
+WorkersOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto | N | HOST:PORT",
+        help="Several processes by Ray: one a GPU or core, so many, or those of a cluster. Default: this process alone.",
+        show_default=False,
+    ),
+]
+
+
+def workers(text: str | None) -> Workers | None:
+    """What --workers says; None for this process alone, which one worker without an address is, too. Raises `InputError`."""
+    if text is None:
+        return None
+    from unrender.cluster import Workers, load_ray
+
+    found = Workers.parse(text)
+    if found == Workers(1):
+        return None
+    load_ray()  # what is missing is known before anything that takes time
+    return found
+
+
 def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:
     """["spp=4"] as {"spp": "4"}. Raises `InputError` for what is no NAME=VALUE, or a name given twice."""
     found: dict[str, str] = {}
@@ -101,14 +131,19 @@ def literal(text: str) -> Any:
     return {"true": True, "false": False}.get(text.lower(), text)
 
 
+def check_variant(name: str) -> None:
+    """Raise `InputError` for a variant that does not exist."""
+    known = ("auto", *variant.VARIANTS)
+    if name not in known:
+        raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
+
+
 def use_variant(name: str, threads: int | None = None) -> str:
     """Choose the variant and, on the processor, the number of threads (None for one per core). Before anything is rendered.
 
     A name that does not exist is wrong input; one that cannot run here is not.
     """
-    known = ("auto", *variant.VARIANTS)
-    if name not in known:
-        raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
+    check_variant(name)
     with phases.phase("loading"):
         chosen = variant.use(name)
         if threads is not None:
@@ -130,9 +165,18 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
             raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
         if not Path(name).exists():
             raise InputError(f"{name}: no such file")
+        refuse_stages(name)
     elif name not in gallery.names():
         hint = did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
         raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
+
+
+def refuse_stages(file: str) -> None:
+    """Raise `InputError` for a file of stages where a problem file is expected."""
+    from unrender.stages import stages_file
+
+    if Path(file).is_file() and stages_file.is_stages(Path(file)):
+        raise InputError(f"{file}: a file of stages, which `unrender run` alone takes; expected a problem file")
 
 
 def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
@@ -156,6 +200,11 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
 def short_name(problem: str) -> str:
     """What folders are called after: the problem's name, or its file's without the ending."""
     return Path(problem).stem if problem.endswith(".toml") else problem
+
+
+def absolute(problem: str) -> str:
+    """As typed, with the absolute path of a file: the same wherever it is opened from."""
+    return str(Path(problem).absolute()) if _is_file(problem) else problem
 
 
 def _is_file(name: str) -> bool:
@@ -206,6 +255,13 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
     if not os.access(given, os.W_OK | os.X_OK):
         raise InputError(f"--out {given}: not writable")
     return given
+
+
+def finished_run(directory: Path) -> Path:
+    """The run folder whose result is meant by DIR: of a run in stages, the last that has begun. Raises `InputError`."""
+    from unrender.stages import run_folders
+
+    return run_folders.last_result(directory)
 
 
 def remove_if_empty(directory: Path) -> None:

@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import secrets
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant
+from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant, WorkersOption
+from unrender.cli.exit_status import FAILED
 from unrender.cli.run import exit_status
 from unrender.core import phases
 from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
-    from unrender.cli.execute import Plan
+    from unrender.cli.tasks import Job, RunTask
+    from unrender.cluster import Cluster, Workers
     from unrender.display.terminal import Console
     from unrender.methods import Method
+    from unrender.problem.problem import Problem
     from unrender.runs.progress import Progress
+    from unrender.sweeps.record import RunOutcome
 
 __all__ = ["DEFAULT_SECONDS", "compare"]
 
 DEFAULT_SECONDS = 20.0
 _DEFAULT = ("stock", "auto")
 """What people have, and what they get here without an option."""
+_POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
@@ -50,6 +58,7 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")] = None,
     problem_settings: ProblemSettings = None,
+    workers: WorkersOption = None,
     variant: Variant = "auto",
     final_spp: FinalSpp = None,
     overwrite: Overwrite = False,
@@ -57,14 +66,16 @@ def compare(
 ) -> None:
     """Compare methods at equal time on one problem, or runs made earlier.
 
-    Every run gets the same seconds of optimization. Compiling kernels before the first step is left out for all alike.
+    Every run gets the same seconds of optimization. Compiling kernels before the first step is left out for all alike. With workers,
+    several runs go at a time, each with its share of the machine.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
+    where = arguments.workers(workers)
     if all(Path(name).is_dir() for name in what):
-        run_options = methods or settings or problem_settings or seconds is not None
+        run_options = methods or settings or problem_settings or workers or seconds is not None
         return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
@@ -74,21 +85,52 @@ def compare(
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
-            from unrender.cli.execute import Plan, introduce
-
-            running = arguments.use_variant(variant)
-            problem = arguments.open_problem(what[0], options, not no_cache)
-            introduce(console, problem, running)
             command = shlex.join(context.find_root().obj or ["unrender"])
+            job = _job(what[0], options, not no_cache, command, folder)
             turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
-            plans = [Plan(problem, m, given[m.name], None, seconds, n, final_spp, command, options) for n, m in turns]
-            directories, status = _run_all(console, plans, folder, progress)
+            runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]
+            with _prepared(console, job, runs, variant, where) as comparison:
+                directories, status = _run_all(console, comparison, progress)
         finally:
             arguments.remove_if_empty(folder)
         if directories:
             _report(console, directories, folder)
     if status:
         raise typer.Exit(status)
+
+
+def _job(problem: str, options: Mapping[str, str], cached: bool, command: str, folder: Path) -> Job:
+    from unrender.cli.tasks import Job
+
+    return Job(arguments.absolute(problem), options, cached, command, str(folder.resolve()), secrets.token_hex(16))
+
+
+def _run_task(
+    method: str, settings: Mapping[str, str], seconds: float | None, seed: int, final_spp: int | None
+) -> RunTask:
+    from unrender.cli.tasks import RunTask
+
+    return RunTask(f"{method}-seed{seed}", method, settings, None, seconds, seed, final_spp)
+
+
+@contextlib.contextmanager
+def _prepared(
+    console: Console, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
+) -> Iterator[_Comparison]:
+    """The problem opened, and the workers there, where there are to be some."""
+    from unrender.cli.execute import introduce
+
+    with contextlib.ExitStack() as stack:
+        cluster = None
+        if workers is not None:
+            from unrender.cluster import connect
+
+            cluster = stack.enter_context(connect(workers, variant))
+            job = replace(job, variant=cluster.variant, threads=cluster.share.threads)
+        running = arguments.use_variant(variant)
+        problem = arguments.open_problem(job.problem, dict(job.problem_settings), job.cached)
+        introduce(console, problem, running if cluster is None else cluster.variant)
+        yield _Comparison(job, runs, problem, cluster)
 
 
 def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
@@ -116,7 +158,9 @@ def _compare_folders(
 ) -> None:
     """Compare runs made earlier. `run_options`: whether options were given that only runs made here have."""
     if run_options:
-        raise InputError("compare: run folders are compared as they are, without --methods, --set, --seconds")
+        raise InputError(
+            "compare: run folders are compared as they are, without --methods, --set, --seconds, --workers"
+        )
     from unrender import report
     from unrender.cli import comparison_table
 
@@ -132,25 +176,84 @@ def _compare_folders(
     console.print(f"page: {comparison_table.plain(str(page))}", soft_wrap=True)
 
 
-def _run_all(console: Console, plans: Sequence[Plan], folder: Path, progress: Progress) -> tuple[list[Path], int]:
-    """Carry out the plans until one is interrupted.
+@dataclass(frozen=True)
+class _Comparison:
+    """What is to be run, and by whom.
+
+    Attributes:
+        job: what the runs have in common.
+        runs: in the order in which they begin.
+        problem: opened here.
+        cluster: whose workers carry them out; None for this process.
+    """
+
+    job: Job
+    runs: Sequence[RunTask]
+    problem: Problem
+    cluster: Cluster | None
+
+
+def _run_all(console: Console, comparison: _Comparison, progress: Progress) -> tuple[list[Path], int]:
+    """Carry out the runs until one is interrupted.
 
     Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
     """
-    from unrender.cli.execute import execute
+    from unrender.cli import tasks
 
-    directories: list[Path] = []
-    status = 0
-    for plan in plans:
-        console.print(f"[bold]{plan.method.name}[/], seed {plan.seed}, {plan.seconds:g} s")
-        directory = folder / f"{plan.method.name}-seed{plan.seed}"
-        result = execute(plan, directory, console, progress)
-        if result.steps:
-            directories.append(directory)
-        status = exit_status(result) or status
-        if result.status == "interrupted":
+    folder = Path(comparison.job.folder)
+    tasks.begin_anew(folder, comparison.runs)
+    outcomes = _on_workers(console, comparison) if comparison.cluster else _here(console, comparison, progress)
+    names = [outcome.folder for outcome in outcomes if outcome.steps]
+    directories = [folder / run.name for run in comparison.runs if run.name in names]
+    interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
+    statuses = [exit_status(outcome.stopped) or (FAILED if outcome.message else 0) for outcome in outcomes]
+    return directories, exit_status(interrupted[0].stopped) if interrupted else max(statuses, default=0)
+
+
+def _here(console: Console, comparison: _Comparison, progress: Progress) -> list[RunOutcome]:
+    from unrender.cli import tasks
+
+    outcomes: list[RunOutcome] = []
+    for run in comparison.runs:
+        console.print(f"[bold]{run.method}[/], seed {run.seed}, {run.seconds:g} s")
+        outcomes.append(tasks.carry_out(comparison.job, run, comparison.problem, console, progress))
+        if outcomes[-1].status == "interrupted":
             break
-    return directories, status
+    return outcomes
+
+
+def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
+    """As many runs at a time as there are workers; a run that cannot be carried out is one line, and the others go on."""
+    from unrender.cli import tasks
+    from unrender.cli.task_display import TaskDisplay
+    from unrender.cluster import OnWorkers
+    from unrender.sweeps.record import RunOutcome
+
+    assert comparison.cluster is not None
+    job, waiting = comparison.job, list(comparison.runs)
+    folder = Path(job.folder)
+    outcomes: list[RunOutcome] = []
+    executor = OnWorkers(comparison.cluster, tasks.on_worker)
+    console.print(f"{len(waiting)} runs on {executor.slots} workers, {job.threads} threads each")
+    with tasks.open_job(job), TaskDisplay(console, len(waiting), "runs") as display:
+        while waiting or executor.pending:
+            while waiting and executor.pending < executor.slots:
+                run = waiting.pop(0)
+                display.begin(run.name, run.method, (folder / run.name,))
+                executor.start((run.name, run.seed), job, [run])
+            for ended in executor.wait(_POLL_SECONDS):
+                name, seed = ended.key
+                outcome = RunOutcome(folder=name, seed=seed, status="failed", message=ended.message)
+                if not ended.message:
+                    (outcome,), written = ended.value
+                    tasks.receive(folder, written)
+                outcomes.append(outcome)
+                what = outcome.message or f"{outcome.status}, {outcome.steps} steps"
+                display.end(name, f"{name}: {what}")
+    for outcome in outcomes:
+        if outcome.message:
+            console.print(f"{outcome.folder}: failed: {outcome.message}", markup=False, soft_wrap=True, style="red")
+    return outcomes
 
 
 def _methods_and_settings(

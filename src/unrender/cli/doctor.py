@@ -148,7 +148,7 @@ def _llvm() -> str:
 def _hardware() -> list[tuple[str, str]]:
     problem = variant.gpu_problem()
     gpu = _first_line("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = variant.cores()
     return [
         ("CPU", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
         ("GPU", (gpu or "CUDA works") if problem is None else f"not used: {problem}" + (f" ({gpu})" if gpu else "")),

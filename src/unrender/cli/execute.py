@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from unrender.methods import Method
 from unrender.problem.notebook import describe_views
 from unrender.problem.problem import Problem
 from unrender.runs import advice
+from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import image_name
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
@@ -55,8 +56,10 @@ class Plan:
     checkpoint_every: int | None = None
 
 
-def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -> Result:
-    """Run, and leave a run folder. An interrupted run is saved as far as it came."""
+def execute(
+    plan: Plan, directory: Path, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
+) -> Result:
+    """Run, and leave a run folder. An interrupted run is saved as far as it came. `callbacks` listen besides."""
     choice = plan.method.choose(plan.problem, plan.settings)
     for line in choice.reasons:
         console.print(f"{plan.method.name}: {escape(line)}", soft_wrap=True)
@@ -75,7 +78,7 @@ def execute(plan: Plan, directory: Path, console: Console, progress: Progress) -
         plan.steps,
         plan.seconds,
         plan.seed,
-        [progress, live],
+        [progress, live, *callbacks],
         directory,
         plan.checkpoint_every,
         annotations,

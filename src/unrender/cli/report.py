@@ -1,4 +1,4 @@
-"""`unrender report`: the page of a run made earlier."""
+"""`unrender report`: the page of a run, or of a sweep, made earlier."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from typing import Annotated
 
 import typer
 
+from unrender.cli import arguments
+
 __all__ = ["report"]
 
 
-def report(directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder.")]) -> None:
-    """Write the page of a run folder anew, and print where it is."""
-    from unrender import report as pages
+def report(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A run folder, that of a run in stages, or a sweep's.")
+    ],
+) -> None:
+    """Write the page of a run folder anew, or that of a sweep's best trials, and print where it is."""
+    from unrender.cli.sweep_page import write_page
     from unrender.display.terminal import echo
+    from unrender.sweeps.record import SWEEP, read_sweep
 
-    echo(pages.page(directory))
+    if (directory / SWEEP).is_file():
+        echo(write_page(directory, read_sweep(directory)))
+        return
+    from unrender import report as pages
+
+    echo(pages.page(arguments.finished_run(directory)))

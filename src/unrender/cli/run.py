@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from unrender.cli import arguments
+from unrender.cli import arguments, dealing, stages
 from unrender.cli.arguments import (
     CheckpointEvery,
     FinalSpp,
@@ -18,7 +18,9 @@ from unrender.cli.arguments import (
     ProblemSettings,
     Threads,
     Variant,
+    WorkersOption,
 )
+from unrender.cli.dealing import Compress
 from unrender.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
@@ -53,24 +55,32 @@ def run(
     checkpoint_every: CheckpointEvery = None,
     threads: Threads = None,
     no_cache: NoCache = False,
+    workers: WorkersOption = None,
+    compress: Compress = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
+
+    PROBLEM may also be a file of stages: a run folder for each, which begins with what the one before it found.
 
     Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
-    console = Console(highlight=False)
-    given = arguments.settings(settings, "--set")
-    options = arguments.settings(problem_settings, "--problem-set")
+    console, command = Console(highlight=False), shlex.join(context.find_root().obj or ["unrender"])
+    given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
             from unrender.cli.execute import Plan, execute, introduce
             from unrender.methods import method
 
-            chosen = method(method_name)
+            chosen, processes = method(method_name), dealing.check(workers, compress)
             steps, seconds = _budget_settings(given, steps, seconds)
+            if stages.is_stages(problem):
+                stages.refuse_settings(method_name, given, options, workers)
+                plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
+                return stages.go_on(stages.begin(Path(problem), *plan), console, progress)
+            steps, seconds = arguments.budget(steps, seconds)
             chosen.start(given)
             arguments.check_problem(problem, options)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
@@ -78,41 +88,55 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            command = shlex.join(context.find_root().obj or ["unrender"])
-            plan = Plan(opened, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
-            result = execute(plan, folder, console, progress)
+            rest = (steps, seconds, seed, final_spp, command, options, checkpoint_every)
+            with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
+                result = execute(Plan(dealt, chosen, given, *rest), folder, console, progress)
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)
 
 
-def conclude(console: Console, problem: Problem, result: Result, folder: Path, progress: Progress) -> None:
-    """Write the page, say what came out, and leave with the status of an interrupted or failed run where it is one."""
+def conclude(
+    console: Console,
+    problem: Problem,
+    result: Result,
+    folder: Path,
+    progress: Progress,
+    again: Path | None = None,
+    page: bool = True,
+) -> None:
+    """Write the page, say what came out, and leave with the status of an interrupted or failed run where it is one.
+
+    Args:
+        console, problem, result, folder, progress: of the run.
+        again: what `unrender resume` is to be given then; None for the run folder.
+        page: whether it is written.
+    """
     from rich.markup import escape
 
     from unrender.cli.execute import summarise
 
-    page = None
-    if result.steps:
+    written = None
+    if result.steps and page:
         with phases.phase("page"):
             from unrender import report
 
-            page = report.page(folder)
+            written = report.page(folder)
     summarise(console, problem, result, progress)
-    if page is not None:
-        console.print(f"page: {escape(str(page))}", soft_wrap=True)
-    if status := exit_status(result):
-        again = "to go on" if result.status == "interrupted" else "to try once more from its last step"
-        console.print(f"{again}: unrender resume {escape(shlex.quote(str(folder)))}", soft_wrap=True)
+    if written is not None:
+        console.print(f"page: {escape(str(written))}", soft_wrap=True)
+    if status := exit_status(result.stopped):
+        why = "to go on" if result.status == "interrupted" else "to try once more from its last step"
+        console.print(f"{why}: unrender resume {escape(shlex.quote(str(again or folder)))}", soft_wrap=True)
         raise typer.Exit(status)
 
 
-def exit_status(result: Result) -> int:
-    """Of a command whose run ended so."""
+def exit_status(stopped: str) -> int:
+    """Of a command whose run ended for that reason (`Result.stopped`)."""
     from unrender.runs import result as results
 
     statuses = {results.INTERRUPTED: INTERRUPTED, results.TERMINATED: TERMINATED, results.NON_FINITE: FAILED}
-    return statuses.get(result.stopped, 0)
+    return statuses.get(stopped, 0)
 
 
 def _budget_settings(
@@ -134,4 +158,4 @@ def _budget_settings(
             seconds = float(text)
         except ValueError as error:
             raise InputError(f"--set seconds={text}: expected a number") from error
-    return arguments.budget(steps, seconds)
+    return steps, seconds

@@ -24,7 +24,11 @@ _NICE = 10
 
 def watch(
     directories: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Run folders: of runs under way, finished, or yet to begin.")
+        list[Path],
+        typer.Argument(
+            metavar="DIR...",
+            help="Run folders: of runs under way, finished, or yet to begin; or folders of sweeps or stages.",
+        ),
     ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of 127.0.0.1; 0 takes a free one.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open nothing.")] = False,
@@ -35,6 +39,7 @@ def watch(
     """
     from unrender.watch import server
 
+    directories = [run for directory in directories for run in _runs(directory)]
     for directory in directories:
         if directory.exists() and not directory.is_dir():
             raise InputError(f"{directory}: a file, expected a run folder")
@@ -51,6 +56,14 @@ def watch(
             with contextlib.suppress(OSError):
                 os.nice(_NICE)  # what is watched goes first; only now, since the browser would inherit it
             server.serve([directory.absolute() for directory in directories], address, opened, found)
+
+
+def _runs(directory: Path) -> list[Path]:
+    """The run folders of a folder of stages or of a sweep; of any other, itself."""
+    from unrender.stages import run_folders
+    from unrender.sweeps import folders
+
+    return [run for stage in run_folders.listed(directory) for run in folders.watched(stage)]
 
 
 def _similar(directory: Path) -> str:

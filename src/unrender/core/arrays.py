@@ -6,6 +6,7 @@ against closed forms and runs unchanged on the device.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,6 +16,7 @@ __all__ = [
     "Array",
     "absolute",
     "add_first_axis",
+    "add_rows",
     "all_finite",
     "arange",
     "clip",
@@ -47,6 +49,8 @@ __all__ = [
     "shape",
     "sign",
     "sqrt",
+    "sum_in_double",
+    "sum_over_rows",
     "total",
     "where",
     "zeros_like",
@@ -230,6 +234,34 @@ def gather_rows(x: Array, index: Array) -> Array:
     return type(x)(flat, (dr.width(index), width))
 
 
+def add_rows(x: Array, index: Array, count: int) -> Array:
+    """The inverse of `gather_rows`: rows of `x` (N, C) are added to the rows `index` (N,) of zeros, (count, C)."""
+    if not is_drjit(x):
+        found = np.zeros((count, x.shape[1]), x.dtype)
+        np.add.at(found, index, x)
+        return found
+    width = x.shape[1]
+    kind = type(index)
+    element = dr.arange(kind, dr.width(index) * width)
+    row = element // width
+    flat = dr.zeros(dr.array_t(x), count * width)
+    dr.scatter_add(flat, x.array, dr.gather(kind, index, row) * width + (element - row * width))
+    return type(x)(flat, (count, width))
+
+
+def sum_over_rows(x: Array) -> Array:
+    """The sum over all axes but the last, (..., C) -> (1, C), left lazy on Dr.Jit."""
+    if not is_drjit(x):
+        return x.reshape(-1, x.shape[-1]).sum(axis=0)[None]
+    width, count = x.shape[-1], len(x.array)
+    kind = dr.uint32_array_t(dr.array_t(x))
+    # Element by element along a channel: a sum of contiguous values has a fixed order.
+    sums = [
+        dr.sum(dr.gather(dr.array_t(x), x.array, dr.arange(kind, count // width) * width + c)) for c in range(width)
+    ]
+    return type(x)(dr.concat(sums), (1, width))
+
+
 def gather(x: Array, index: Array) -> Array:
     """The elements `index` of a one-dimensional array."""
     return dr.gather(type(x), x, index) if is_drjit(x) else x[index]
@@ -270,6 +302,18 @@ def random_below(bounds: Array, like: Array, seed: int) -> Array:
     kind = type(bounds)
     number = dr.rng(seed).random(dr.array_t(like), dr.width(bounds))
     return dr.minimum(kind(number * bounds), bounds - 1)
+
+
+def sum_in_double(parts: Sequence[Array]) -> Array:
+    """The sum of arrays of equal shapes in their order, in double precision, rounded to theirs once; lazy on Dr.Jit."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    wide: Any = dr.float64_array_t(type(first)) if is_drjit(first) else np.float64
+    found = wide(first)
+    for part in parts[1:]:
+        found = found + wide(part)
+    return type(first)(found) if is_drjit(first) else found.astype(first.dtype)
 
 
 def rows(x: Array) -> Array:

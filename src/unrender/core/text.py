@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["LONGEST_LINE", "one_line", "printable", "shorten", "visible"]
+__all__ = ["LONGEST_LINE", "one_line", "printable", "reason_of", "shorten", "visible"]
 
 LONGEST_LINE = 1000
 """Characters of the longest message."""
@@ -32,6 +32,11 @@ def shorten(text: str, longest: int) -> str:
 def one_line(text: str) -> str:
     """The text as one printable line of at most `LONGEST_LINE` characters."""
     return shorten(visible(shorten(text, 4 * LONGEST_LINE)), LONGEST_LINE)
+
+
+def reason_of(error: BaseException, longest: int | None = None) -> str:
+    """What an error says, on one line of at most so many characters; its kind where it says nothing."""
+    return " ".join(str(error).split())[:longest] or type(error).__name__
 
 
 def printable(value: Any) -> str:

@@ -7,11 +7,13 @@ from typing import Any
 
 import typer
 from rich import console
+from rich.console import Group
+from rich.console import RenderableType as Renderable
 from rich.segment import Segment
 
 from unrender.core.text import visible
 
-__all__ = ["Console", "echo"]
+__all__ = ["Console", "Group", "Renderable", "echo"]
 
 _KEPT = "\n\t"
 

@@ -12,7 +12,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
-from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups
+from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups, prepared
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
@@ -146,7 +146,7 @@ class PathGradient:
         pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
         whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):
-            image = self.image.prepare(problem, image)
+            image = prepared(problem, self.image, image)
         next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1)
         arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)
         loss = sum(arrays.number(value) for value in step.losses)

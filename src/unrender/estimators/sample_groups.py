@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any, Protocol, runtime_checkable
 
-from unrender.core import trees
+from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -21,7 +20,18 @@ from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
-__all__ = ["PIXELS", "GradientSample", "check_pixels", "fresh_weights", "gather", "leave_one_out_groups"]
+__all__ = [
+    "PIXELS",
+    "FrameGradient",
+    "GatherRequest",
+    "GradientSample",
+    "check_pixels",
+    "fresh_weights",
+    "gather",
+    "gather_frame",
+    "leave_one_out_groups",
+    "prepared",
+]
 
 PIXELS = 1 << 32
 """The stream of a step's key that draws its pixels; the streams below are its frames'."""
@@ -58,6 +68,33 @@ class GradientSample:
     image: Any
 
 
+@dataclass(frozen=True)
+class GatherRequest:
+    """What `gather` is asked for; see there.
+
+    Attributes:
+        parameters: the current ones.
+        image, state: the image estimator and its state.
+        spp, adjoint_spp: samples per pixel.
+        key: of the random numbers.
+        pair_request: of the previous state's gradient.
+        batch: the pixels; None for whole views.
+        tolerance: see `PathGradient`.
+        fresh: whether the gradient of this step's samples alone is wanted, too.
+    """
+
+    parameters: Tree
+    image: ImageEstimator
+    state: Any
+    spp: int
+    key: Key
+    adjoint_spp: int | None = None
+    pair_request: PairRequest | None = None
+    batch: MiniBatch | None = None
+    tolerance: float = 0.0
+    fresh: bool = False
+
+
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
     """How many groups `spp` samples are divided into; 1 where they cannot be, or where the adjoint has paths of its own."""
     return 1 if adjoint_spp is not None else max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
@@ -90,15 +127,15 @@ def gather(
     of the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space
     allows, and their difference is a finite difference of gradients. With a pixel mini-batch, of its pixels alone, in one launch for
     all views; the image estimator's state advances where whole views are rendered. For `tolerance` see `PathGradient`.
+
+    Where the problem's views are dealt to workers, they do it (`Problem.gatherer`).
     """
+    request = GatherRequest(parameters, image, state, spp, key, adjoint_spp, pair_request, batch, tolerance, fresh)
+    if problem.gatherer is not None:
+        return problem.gatherer.gather(request)
     sample = batch.sample if batch else None
     frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
-    parts = [
-        _gather_frame(
-            problem, parameters, image, state, frame, spp, key.fold(index), adjoint_spp, pair_request, tolerance, fresh
-        )
-        for index, frame in enumerate(frames)
-    ]
+    parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
     for frame, part in zip(frames, parts, strict=True):
@@ -107,9 +144,9 @@ def gather(
             for name, value in part.info.items():
                 info.setdefault(name, {})[frame.view] = value
     return GradientSample(
-        gradient=reduce(trees.add, [part.gradient for part in parts]),
-        previous=reduce(trees.add, [part.previous for part in parts]),
-        fresh=reduce(trees.add, [part.fresh for part in parts]),
+        gradient=_sum([part.gradient for part in parts]),
+        previous=_sum([part.previous for part in parts]),
+        fresh=_sum([part.fresh for part in parts]),
         losses=[part.loss for part in parts],
         images=images,
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
@@ -118,8 +155,18 @@ def gather(
     )
 
 
+def prepared(problem: Problem, image: ImageEstimator, state: Any) -> Any:
+    """`ImageEstimator.prepare`, by the workers where the problem's views are dealt to some."""
+    return image.prepare(problem, state) if problem.gatherer is None else problem.gatherer.prepared(state)
+
+
+def _sum(parts: list[Tree]) -> Tree:
+    """In double precision: however the views are divided among workers, the result is the same but for its last bit, now and then."""
+    return trees.map(lambda *each: arrays.sum_in_double(each), *parts)
+
+
 @dataclass(frozen=True)
-class _FrameGradient:
+class FrameGradient:
     """The part of one frame in a `GradientSample`; `kept` is its contribution to the image estimator's next state."""
 
     gradient: Tree
@@ -132,19 +179,16 @@ class _FrameGradient:
     kept: Any
 
 
-def _gather_frame(
-    problem: Problem,
-    parameters: Tree,
-    image: ImageEstimator,
-    state: Any,
-    frame: Frame,
-    spp: int,
-    key: Key,
-    adjoint_spp: int | None,
-    pair_request: PairRequest | None,
-    tolerance: float,
-    with_fresh: bool,
-) -> _FrameGradient:
+def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Key) -> FrameGradient:
+    """The part of one frame; `key` is the frame's own."""
+    parameters, image, state, spp, adjoint_spp = (
+        request.parameters,
+        request.image,
+        request.state,
+        request.spp,
+        request.adjoint_spp,
+    )
+    pair_request = request.pair_request
     groups = leave_one_out_groups(spp, adjoint_spp)
     session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
     found, kept = image.estimate(problem, parameters, state, frame, spp, groups, key.fold(0), pair_request)
@@ -152,10 +196,10 @@ def _gather_frame(
     loss = frame.loss_value(mean)
     paths, traced = found.paths, spp
     if groups == 1:
-        request = frame.request(adjoint_spp or spp, key.fold(1).uint32())
-        paths = _paths(session, parameters, request, pair_request)
-        traced += request.spp
-    derivative = _derivative(problem, frame, found.variance, tolerance)
+        samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
+        paths = _paths(session, parameters, samples, pair_request)
+        traced += samples.spp
+    derivative = _derivative(problem, frame, found.variance, request.tolerance)
     others = found.others()
     weights = derivative(others)
     previous: Tree = {}
@@ -165,9 +209,9 @@ def _gather_frame(
         weights_previous = derivative(found.previous_others())
         gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
     fresh: Tree = {}
-    if with_fresh and found.fresh is not None:
+    if request.fresh and found.fresh is not None:
         fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
-    return _FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept)
+    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept)
 
 
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:

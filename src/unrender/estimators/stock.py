@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import reduce
 
 from unrender.core import arrays, checks, trees
+from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -57,6 +58,11 @@ class StockGradient:
     def init(self, problem: Problem, parameters: Tree) -> StockState:
         """See `Estimator.init`. Raises `InputError` for a parameter that Mitsuba cannot differentiate."""
         problem.renderer.prepare(list(parameters), None)
+        known = problem.renderer.parameters()
+        if camera := next((key for key in parameters if known[key].viewpoint), ""):
+            raise InputError(
+                f"parameter {camera}: Mitsuba's loop has no gradient of what moves a sensor; --method plain has"
+            )
         if isinstance(problem.renderer, StockRenderer):
             return StockState()
         return StockState(self._path.init(problem, parameters))

@@ -99,7 +99,8 @@ def open_scene(scene: Any, keys: Any, max_depth: int) -> tuple[RendererPort, tup
     if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
         raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
     checks.integer("Renderer", "max_depth", max_depth, at_least=1)
-    return open_renderer(scene, max_depth), tuple(names)
+    keys = [name for name in names if isinstance(name, str)]
+    return open_renderer(scene, max_depth, keys), tuple(names)
 
 
 def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...], scene: Any) -> Problem:

@@ -22,11 +22,13 @@ class PixelSample:
         views: index of the view of each, (N,), integer array of the renderer.
         pixels: row-major index within the view's film, (N,).
         weights: 1 / (N p), (N, 1): weighted sums over the mini-batch are unbiased sums over all pixels.
+        positions: of each in the mini-batch that this is a part of, (N,); None for a whole one. See `SampleRequest`.
     """
 
     views: Array
     pixels: Array
     weights: Array
+    positions: Array | None = None
 
 
 class Frame(Protocol):
@@ -97,9 +99,9 @@ class PixelBatch:
         """See `Frame.request`."""
         sensors = [view.sensor for view in self.problem.views]
         if len(set(sensors)) == 1:
-            return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels)
-        table = self.problem.references.sensors
-        return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels, arrays.gather(table, self.sample.views))
+            return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels, positions=self.sample.positions)
+        table = arrays.gather(self.problem.references.sensors, self.sample.views)
+        return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels, table, self.sample.positions)
 
     def loss_value(self, image: Array) -> Array:
         """See `Frame.loss_value`."""

@@ -12,7 +12,10 @@ from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.io import resampling
 
-__all__ = ["CoarseToFine", "of"]
+__all__ = ["NEVER", "CoarseToFine", "of"]
+
+NEVER = 1 << 40
+"""A step that no run comes to: `CoarseToFine((NEVER,), 4)` is four times as coarse throughout."""
 
 
 @dataclass(frozen=True)

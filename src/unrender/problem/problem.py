@@ -19,6 +19,7 @@ from unrender.losses import L2, Loss
 from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
+from unrender.problem.gatherer import Gatherer
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.validation import (
@@ -36,6 +37,7 @@ from unrender.problem.validation import (
     renderer_notices,
 )
 from unrender.problem.view import View
+from unrender.rendering.exposure import EXPOSURE, ExposedRenderer, without_exposure
 from unrender.rendering.renderer import Renderer
 
 __all__ = ["Bounds", "Problem"]
@@ -77,6 +79,7 @@ class Problem:
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
+        gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
 
     Raises:
         InputError: in one line, which field is wrong and what was expected.
@@ -100,7 +103,13 @@ class Problem:
         self.given_views: tuple[View, ...] = check_sequence(views, View, "views")
         self.origin: dict[str, Any] = {"scene": str(Path(scene).resolve())} if isinstance(scene, (str, Path)) else {}
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
-        self.renderer: Renderer = open_renderer(scene, max_depth)
+        keys = [parameter.key for parameter in self.parameters if isinstance(parameter.key, str)]
+        self.renderer: Renderer = open_renderer(scene, max_depth, keys)
+        if any(parameter.key == EXPOSURE for parameter in self.parameters):
+            sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
+            rows = self.renderer.rows if isinstance(self.renderer, ExposedRenderer) else {}
+            if not rows.keys() >= set(sensors):  # else these are some of its views, and it keeps the rows of all
+                self.renderer = ExposedRenderer(without_exposure(self.renderer), sensors)
 
         known = self.renderer.parameters()
         checked: dict[str, CheckedParameter] = {}
@@ -126,6 +135,7 @@ class Problem:
         for key, value in (truth or {}).items():
             self.truth[key], notice = check_truth(key, value, self.shapes())
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
@@ -160,6 +170,12 @@ class Problem:
         found.parameterisations = self.parameterisations | {key: one for key, (one, _) in made.items()}
         transforms = {key: transform for key, (_, transform) in made.items() if transform is not None}
         found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
+        return found
+
+    def gathered_by(self, gatherer: Gatherer | None) -> Problem:
+        """The same problem, its gradients computed by workers that its views are dealt to."""
+        found = copy.copy(self)
+        found.gatherer = gatherer
         return found
 
     def __repr__(self) -> str:

@@ -14,10 +14,12 @@ from unrender.core.trees import Tree
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import SampleRequest
 
-__all__ = ["as_tree", "render", "render_pair"]
+__all__ = ["as_tree", "render", "render_pair", "view_request"]
 
 _PATHS_PER_PASS = 1 << 21
 """Paths per pass, within the memory of a small machine."""
+_MANY_SENSORS = 4
+"""From so many on, all views share one kernel: recording one for each would take longer than rendering."""
 
 
 @exclusive("render")
@@ -53,10 +55,24 @@ def render(
     total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
     while done < spp:
         take = min(per_pass, spp - done)
-        request = SampleRequest(sensor, take, key.fold(done).uint32())
-        total += take * arrays.numpy(session.image(point, request).images[0])
+        request = view_request(problem, view, take, key.fold(done).uint32())
+        total += take * arrays.numpy(session.image(point, request).images[0]).reshape(total.shape)
         done += take
     return (total / spp).astype(np.float32)
+
+
+def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequest:
+    """The request for a view: of its sensor or, where there are many, of all pixels of its film, each with the sensor's index. Images are
+    then (groups, H * W, 3), and all views of one size share their kernels.
+    """
+    sensor, sensors = problem.views[view].sensor, {other.sensor for other in problem.views}
+    known = problem.renderer.parameters()
+    if len(sensors) < _MANY_SENSORS or any(known[parameter.key].rigid for parameter in problem.parameters):
+        return SampleRequest(sensor, spp, seed)
+    height, width = problem.renderer.resolutions()[sensor]
+    like = problem.renderer.array(np.zeros(1))
+    of_pixels = arrays.like_integers(np.full(height * width, sensor), like)
+    return SampleRequest(min(sensors), spp, seed, 1, arrays.arange(like, height * width), of_pixels)
 
 
 @exclusive("render_pair")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -303,9 +303,9 @@ def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> 
         raise FieldError(("truth", key), str(error)) from error
 
 
-def open_renderer(scene: Any, max_depth: int) -> Renderer:
-    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. Raises
-    `FieldError`."""
+def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Renderer:
+    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. `keys`:
+    parameters that will be asked for. Raises `FieldError`."""
     if isinstance(scene, _Renderer) and not isinstance(scene, type):
         return scene
     loaded = type(scene).__module__.partition(".")[0] == "mitsuba"
@@ -323,7 +323,7 @@ def open_renderer(scene: Any, max_depth: int) -> Renderer:
     from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
     try:
-        return MitsubaRenderer(scene, max_depth)
+        return MitsubaRenderer(scene, max_depth, keys)
     except InputError as error:
         raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
 

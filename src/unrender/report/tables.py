@@ -18,6 +18,7 @@ STOP_REASONS = {
     "seconds": "stopped when time was up",
     "interrupted": "interrupted: this is what was reached",
     "terminated": "terminated: this is what was reached",
+    "pruned": "pruned: its error was above the median of the sweep's trials",
     "callback": "stopped by a callback",
     "non-finite": "failed, given up: gradients were not finite; this is what was finite",
 }

@@ -81,6 +81,8 @@ def prepare(
     seed: int,
 ) -> tuple[Run, RunState]:
     """A run before its first step."""
+    if problem.gatherer is not None:
+        problem.gatherer.check(estimator)
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 
 from unrender.core import arrays, trees
+from unrender.problem.coarse_to_fine import NEVER
 from unrender.problem.upsampling import NotCarried, Upsampler, restarted, upsampled
 from unrender.runs.noise import GradientNoise
 from unrender.runs.run import Run, RunState
@@ -26,7 +27,7 @@ def unfinished(run: Run) -> list[str]:
     """One line for each parameter that did not come to its scene's own resolution."""
     found = []
     for key, way in run.problem.coarse_to_fine.items():
-        if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key]:
+        if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and way.steps[-1] < NEVER:
             size = "x".join(map(str, reversed(shape[:-1])))
             found.append(
                 f"parameter {key}: still {size} at the end, after {run.step} steps of at least {way.steps[-1] + 1}"

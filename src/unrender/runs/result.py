@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.backend.variant import LLVM, current, llvm_version
+from unrender.backend.variant import LLVM, cores, current, llvm_version
 from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.runs.folder import schema
@@ -24,11 +23,13 @@ from unrender.runs.folder.history import lines, steps_in
 if TYPE_CHECKING:
     from unrender.runs.figure import ResultFigure
 
-__all__ = ["INTERRUPTED", "NON_FINITE", "TERMINATED", "Result", "deciding_versions", "hardware", "versions"]
+__all__ = ["INTERRUPTED", "NON_FINITE", "PRUNED", "TERMINATED", "Result", "deciding_versions", "hardware", "versions"]
 
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 """Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a command to stop, SIGTERM, and gradients that
 were not finite."""
+PRUNED = "pruned"
+"""Likewise, of a sweep's run whose error is above other runs' (finished)."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,8 +46,8 @@ class Result:
             first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
         seconds: of optimization.
         warmup_seconds: of tracing and compiling kernels before the first step.
-        stopped: "steps", "seconds" or "callback" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated" (SIGTERM);
-            "non-finite" (failed).
+        stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated"
+            (SIGTERM); "non-finite" (failed).
         skipped: steps whose gradient or loss was not finite, and which were not applied.
         warnings: one line each.
         info: of the last estimate, as NumPy arrays.
@@ -217,8 +218,7 @@ def hardware() -> dict[str, Any]:
 
 @cache
 def _hardware() -> dict[str, Any]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": _processor(), "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+    return {"processor": _processor(), "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def _processor() -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import trees
+from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
@@ -37,6 +37,7 @@ __all__ = ["StoredRun", "load_run", "resume_run"]
 
 _MOST_SHOWN = 6
 _WARNINGS = "warnings"
+_SENT = "sent"
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,10 @@ def resume_run(
             raise InputError(f"run folder {folder}: no checkpoint can be used")
     terminate_if_told(run)
     return result
+
+
+class _SentOtherwise(InputError):
+    """A checkpoint of a run whose workers were sent parameters in another way."""
 
 
 class _UnusableCheckpoint(InputError):
@@ -227,6 +232,8 @@ class _Restore(Hook):
     def _unpack(self, found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
         try:
             return _unpack(found, fresh, warm)
+        except _SentOtherwise:
+            raise
         except InputError as error:
             raise _UnusableCheckpoint(str(error)) from error
 
@@ -235,13 +242,19 @@ def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> d
     """The snapshot in a checkpoint, which must have the types and shapes of one of this run's."""
     saved = unpack(found.packed, [fresh, warm])
     where = f"checkpoint of step {found.manifest.step}"
+    if isinstance(saved, dict) and (_SENT in saved) != (_SENT in fresh):
+        words = (
+            "whole: resume it without --compress",
+            "as 16-bit differences: resume it with --workers and --compress",
+        )
+        raise _SentOtherwise(f"{where}: the run sent its parameters {words[_SENT in saved]}")
     if not isinstance(saved, dict) or list(saved) != list(fresh):
         raise InputError(f"{where}: expected the state of a run, got {repr(saved)[:60]}")
     warnings = saved[_WARNINGS]
     if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
         raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
-        if name != _WARNINGS:
+        if name not in (_WARNINGS, _SENT):
             check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
@@ -254,4 +267,23 @@ def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> d
     for name in ("parameters", "optimizer"):
         if part := not_finite(saved[name], name):
             raise InputError(f"{where}: {part}: not finite")
+    if _SENT in saved:
+        _check_sent(saved[_SENT], expected, f"{where}: {_SENT}")
     return saved
+
+
+def _check_sent(sent: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
+    """Raise `InputError` for what is no `Outbox.snapshot` of parameters of these shapes, or of coarser ones."""
+    if not isinstance(sent, dict) or (sent and sent.keys() != shapes.keys()):
+        raise InputError(f"{where}: expected what workers have of {', '.join(shapes)}, got {repr(sent)[:60]}")
+    for key, pair in sent.items():
+        if not isinstance(pair, dict) or pair.keys() != {"exact", "sent"}:
+            raise InputError(f"{where}: {key}: expected exact and sent, got {repr(pair)[:60]}")
+        for name, value in pair.items():
+            if not isinstance(value, np.ndarray) and (name == "sent" or not arrays.is_drjit(value)):
+                raise InputError(f"{where}: {key}: {name}: expected an array, got {repr(value)[:60]}")
+            shape = arrays.shape(value)
+            if len(shape) != len(shapes[key]) or any(a > b for a, b in zip(shape, shapes[key], strict=True)):
+                raise InputError(f"{where}: {key}: {name}: expected shape {shapes[key]}, got {shape}")
+        if part := not_finite(pair, f"{where}: {key}"):
+            raise InputError(f"{part}: not finite")

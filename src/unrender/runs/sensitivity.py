@@ -13,8 +13,8 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.problem.problem import Problem
-from unrender.problem.render import as_tree
-from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.problem.render import as_tree, view_request
+from unrender.rendering.renderer import RenderSession
 
 __all__ = ["around", "hardly_seen", "sensitivity"]
 
@@ -106,7 +106,7 @@ def _projections(
     found = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     signs = np.random.default_rng(key.uint32())
     for view in range(len(problem.views)):
-        rendering = session.image(parameters, SampleRequest(view, spp, key.fold(2 * view + half).uint32()))
+        rendering = session.image(parameters, view_request(problem, view, spp, key.fold(2 * view + half).uint32()))
         weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
         for name, value in session.adjoint(parameters, rendering.paths, problem.renderer.array(weights)).items():
             found[name] += arrays.numpy(value).reshape(found[name].shape)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,13 @@ class AnalyticPaths:
     numbers: np.ndarray
     groups: int
     pixels: np.ndarray | None
+
+    @cached_property
+    def centred(self) -> np.ndarray:
+        """(2, groups, pixels * channels): each group's mean of 2 u - 1, for both of its numbers."""
+        pixels, channels, spp, _ = self.numbers.shape
+        parts = (2 * self.numbers - 1).reshape(pixels * channels, self.groups, spp // self.groups, 2)
+        return parts.mean(axis=2).T
 
 
 class AnalyticRenderer:
@@ -117,10 +125,8 @@ class AnalyticRenderer:
     def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
         """See `RenderSession.adjoint`."""
         rows = self._rows(paths.pixels)
-        flat = np.zeros(self.matrix.shape[1])
-        for group, weight in zip(self._grouped(paths), weights, strict=True):
-            factor = 1 + self.noise * (2 * group[..., 0] - 1).mean(axis=-1)
-            flat += (weight.reshape(-1) * factor.reshape(-1)) @ self.matrix[rows] / paths.groups
+        factors = 1 + self.noise * paths.centred[0]
+        flat = (np.asarray(weights).reshape(paths.groups, -1) * factors).mean(axis=0) @ self.matrix[rows]
         gradient, start = {}, 0
         for key, value in self._values.items():
             part = flat[start : start + value.size].reshape(value.shape)
@@ -154,20 +160,16 @@ class AnalyticRenderer:
 
     def _paths(self, request: SampleRequest) -> AnalyticPaths:
         count = self.shape[0] * self.shape[1] if request.pixels is None else len(request.pixels)
-        numbers = np.random.default_rng(request.seed).random((count, 3, request.spp, 2))
+        drawn = count if request.positions is None else int(np.max(request.positions)) + 1
+        numbers = np.random.default_rng(request.seed).random((drawn, 3, request.spp, 2))
+        if request.positions is not None:
+            numbers = numbers[request.positions]
         return AnalyticPaths(numbers, request.groups, request.pixels)
-
-    def _grouped(self, paths: AnalyticPaths) -> list[np.ndarray]:
-        return np.split(paths.numbers, paths.groups, axis=2)
 
     def _images(self, parameters: Tree, paths: AnalyticPaths) -> np.ndarray:
         rows = self._rows(paths.pixels)
         linear = (self.matrix @ self._flat(parameters))[rows]
         shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
-        images = []
-        for group in self._grouped(paths):
-            u = (2 * group - 1).mean(axis=2).reshape(-1, 2)
-            images.append(
-                (self.offset[rows] + linear * (1 + self.noise * u[:, 0]) + self.grain * u[:, 1]).reshape(shape)
-            )
-        return np.stack(images)
+        multiplied, added = paths.centred
+        images = self.offset[rows] + linear * (1 + self.noise * multiplied) + self.grain * added
+        return images.reshape(paths.groups, *shape)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
@@ -42,7 +43,7 @@ from unrender.runs.folder.schema import (
 )
 from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.hooks import Hook
-from unrender.runs.result import TERMINATED, Result, deciding_versions
+from unrender.runs.result import PRUNED, TERMINATED, Result, deciding_versions
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
@@ -144,10 +145,10 @@ class RunWriter(Hook):
     def on_result(self, descent: Descent, result: Result) -> Result:
         """Write the last checkpoint and the result, render the final pictures, and write the result with them.
 
-        Without pictures for a run that was told to terminate: whoever did waits for seconds at most.
+        Without pictures for a run that was told to terminate, since whoever did waits for seconds at most, and for one that was pruned.
         """
         self.write_checkpoint(descent, result)
-        if result.stopped != TERMINATED:
+        if result.stopped not in (TERMINATED, PRUNED):
             if result.status != "finished" or self._written_step != result.steps:
                 # What took long is safe, and how it ended is known, before what takes seconds more.
                 self._save(result, "running" if result.status == "finished" else result.status)
@@ -165,7 +166,7 @@ class RunWriter(Hook):
         if not self._started or not self._lock.is_held():
             return
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        message = " ".join(str(error).split())[:300] or type(error).__name__
+        message = reason_of(error, 300)
         self._guarded("end", lambda: self._write_record(descent.result(), status, message))
 
     # ------------------------------------------------------------------ the parts of a step
@@ -192,8 +193,8 @@ class RunWriter(Hook):
         result = result or descent.result()
         if result.steps == self._written_step and not self._checkpoint_at_once:
             return
-        state = descent.snapshot()
         started = time.perf_counter()
+        state = descent.snapshot()  # which takes time where workers hold a part of it
         self._checkpoint_at_once = False
         self._guarded("checkpoint", lambda: self._write_checkpoint(result, descent.run.seed, state))
         self._written_at = time.perf_counter()

@@ -1,0 +1,145 @@
+"""Kills of workers, nodes and the driver of a dealt run, at random instants."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.workers.machines import ADDRESS, Machines, processes_below
+
+__all__ = ["KINDS", "METHODS", "campaign"]
+
+METHODS: dict[str, list[str]] = {
+    "plain": ["--method", "plain", "--set", "spp=2"],
+    "rcv": ["--method", "rcv", "--set", "spp=2"],
+    "coupled": ["--method", "coupled", "--set", "image=rcv"],
+}
+KINDS = ("worker", "node", "driver")
+_PROBLEM = ["two-planets", "-p", "resolution=16", "-p", "texture_resolution=16", "-p", "reference_spp=32"]
+_COMMON = ["--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1, "--checkpoint-every", 10]
+_LONGEST = 300.0
+"""Seconds without a step after which a run counts as one that hangs for ever, and is killed."""
+
+
+class _Watched:
+    """A command whose steps are counted by its history as it grows.
+
+    Args:
+        process: of the command.
+        folder: its run folder.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], folder: Path):
+        self.process, self._history = process, folder / "history.jsonl"
+        self._steps, self._since, self.longest = 0, time.monotonic(), 0.0
+
+    def steps(self) -> int:
+        """Done so far."""
+        with contextlib.suppress(OSError):
+            found = self._history.read_bytes().count(b"\n")
+            if found != self._steps:
+                self._steps = found
+                self._since = time.monotonic()
+        self.longest = max(self.longest, time.monotonic() - self._since)
+        return self._steps
+
+    def until(self, steps: int) -> bool:
+        """Wait for so many steps; false where the command ended, or hangs."""
+        while self.process.poll() is None and self.steps() < steps:
+            if time.monotonic() - self._since > _LONGEST:
+                self.end()
+                return False
+            time.sleep(0.05)
+        return self.process.poll() is None
+
+    def restart_clock(self) -> None:
+        """Count the longest wait from now on."""
+        self._since, self.longest = time.monotonic(), 0.0
+
+    def end(self) -> None:
+        """Kill it (SIGKILL)."""
+        for pid in processes_below(self.process.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.wait()
+
+
+def campaign(
+    machines: Machines, folder: Path, method: str, number: int, steps: int, dice: random.Random
+) -> dict[str, Any]:
+    """So many kills of a method's runs, of the three kinds in turn."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    whole = _begin(machines, folder / "whole", method, steps)
+    if whole.process.wait(1200):
+        raise RuntimeError((folder / "whole.log").read_text()[-500:])
+    expected = _parameters(folder / "whole")
+    rows = []
+    for index in range(number):
+        kind = KINDS[index % len(KINDS)]
+        place = folder / f"killed{index}"
+        row = {"kind": kind, **_kill(machines, place, method, steps, kind, dice)}
+        with contextlib.suppress(OSError, ValueError):
+            found = _parameters(place)
+            row["right"] = all(np.array_equal(found[key], value) for key, value in expected.items())
+        rows.append({"right": False, **row})
+        print(method, rows[-1], flush=True)
+        if row.get("right"):
+            shutil.rmtree(place)
+    # A run that ended before its kill says nothing.
+    rows = [row for row in rows if row["killed_at"] is not None and row["killed_at"] < steps]
+    return {
+        "kills": len(rows),
+        "right": sum(row["right"] for row in rows),
+        "longest_wait": max((row["wait"] for row in rows), default=0.0),
+        "rows": rows,
+    }
+
+
+def _begin(machines: Machines, place: Path, method: str, steps: int) -> _Watched:
+    words = ["run", *_PROBLEM, *METHODS[method], "--steps", steps, *_COMMON, "--workers", f"2@{ADDRESS}"]
+    log = place.with_suffix(".log")
+    return _Watched(machines.begin("-m", "unrender", *words, "--out", place, log=log), place)
+
+
+def _kill(machines: Machines, place: Path, method: str, steps: int, kind: str, dice: random.Random) -> dict[str, Any]:
+    """One run, with a kill; the longest that it then took to go on, and the status that it ended with."""
+    step = dice.randrange(1, steps - 1)
+    run = _begin(machines, place, method, steps)
+    if not run.until(step):
+        return {"wait": run.longest, "status": run.process.poll(), "killed_at": None}
+    time.sleep(dice.uniform(0, 0.2))
+    killed_at = run.steps()
+    run.restart_clock()
+    if kind == "worker":
+        workers = machines.workers()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(dice.choice(workers), signal.SIGKILL)
+    elif kind == "node":
+        machines.kill(1)
+    else:
+        run.end()
+        words = ["resume", place, "--workers", f"2@{ADDRESS}"]
+        run = _Watched(machines.begin("-m", "unrender", *words, log=place.with_suffix(".log")), place)
+        run.until(killed_at + 1)
+        run.restart_clock()  # a new process takes its time to start
+    run.until(steps)
+    wait = run.longest
+    status = run.process.wait(600)
+    if not machines.is_up(1):
+        machines.start(1)
+    return {"wait": wait, "status": status, "killed_at": killed_at}
+
+
+def _parameters(place: Path) -> dict[str, np.ndarray]:
+    with np.load(place / "parameters.npz", allow_pickle=False) as stored:
+        return dict(stored)

@@ -1,0 +1,102 @@
+"""How many workers there are to be, where, and what each may use. Nothing here needs Ray."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from unrender.core.errors import InputError
+
+__all__ = ["Share", "Workers", "share"]
+
+_ADDRESS = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?):([0-9]{1,5})\Z")
+_MOST = 100_000
+
+
+@dataclass(frozen=True)
+class Workers:
+    """What `--workers` says.
+
+    Attributes:
+        count: how many; None for one a GPU, or one a processor core where no GPU is to be used.
+        address: HOST:PORT of a Ray cluster to join; None for this machine (or for the cluster that RAY_ADDRESS names).
+    """
+
+    count: int | None = None
+    address: str | None = None
+
+    @classmethod
+    def parse(cls, text: str, option: str = "--workers") -> Workers:
+        """`auto`, a number, HOST:PORT, or NUMBER@HOST:PORT. Raises `InputError`."""
+        number, at, address = text.strip().rpartition("@")
+        if not at and not _ADDRESS.match(address):
+            number, address = address, ""
+        counted = number in ("", "auto") or (number.isascii() and number.isdigit() and 1 <= int(number[:7]) <= _MOST)
+        located = not (at or address) or (
+            (found := _ADDRESS.match(address)) is not None and 0 < int(found.group(2)) < 65536
+        )
+        if not counted or not located or not text.strip():
+            if "://" in text:
+                hint = "; start the command on a machine of the cluster, and give the address of its head node"
+            else:
+                hint = ""
+            raise InputError(
+                f"{option} {text}: expected auto, a number, the address HOST:PORT of a Ray cluster, or NUMBER@HOST:PORT{hint}"
+            )
+        return cls(None if number in ("", "auto") else int(number), address or None)
+
+
+@dataclass(frozen=True)
+class Share:
+    """What the workers are, and what each may use.
+
+    Attributes:
+        count: how many workers, >= 1.
+        cpus: of a machine's cores for each: a whole number, or 1/k where k workers share one.
+        gpus: of a machine's GPUs for each: 0, 1, or 1/k.
+    """
+
+    count: int
+    cpus: float
+    gpus: float
+
+    @property
+    def threads(self) -> int:
+        """Threads of the processor for each worker."""
+        return max(1, int(self.cpus))
+
+
+def share(machines: Sequence[tuple[float, float]], count: int | None, gpu: bool, most: int | None = None) -> Share:
+    """How workers share the machines.
+
+    Args:
+        machines: (cores, GPUs) of each.
+        count: how many workers; None for one a GPU, or one a core without `gpu`.
+        gpu: whether they compute on GPUs.
+        most: of how many there is work for, where `count` is None; None for any number.
+
+    Raises:
+        InputError: no machine has a core (a GPU).
+    """
+    cores = [int(c) for c, g in machines if c >= 1 and (not gpu or g >= 1)]
+    gpus = [int(g) for c, g in machines if c >= 1 and g >= 1]
+    devices = gpus if gpu else cores
+    if not devices:
+        raise InputError(f"workers: the cluster has no machine with a {'GPU' if gpu else 'processor core'} to use")
+    total = sum(devices)
+    count = min(total, most or total) if count is None else count
+    if not gpu:
+        return Share(count, _most_each(cores, count), 0.0)
+    each = min(_most_each(gpus, count), 1.0)
+    fitting = [int(g / each + 1e-9) for g in gpus]
+    per_worker = min(c // n if c >= n else 1 / -(-n // c) for c, n in zip(cores, fitting, strict=True))
+    return Share(count, float(per_worker), each)
+
+
+def _most_each(devices: Sequence[int], count: int) -> float:
+    """The most that each of `count` workers can have, none of them on two machines: a whole number, or 1/k."""
+    for each in range(max(devices), 0, -1):
+        if sum(n // each for n in devices) >= count:
+            return float(each)
+    return 1 / -(-count // sum(devices))

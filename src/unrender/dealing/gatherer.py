@@ -1,0 +1,343 @@
+"""The driver of a problem whose views are dealt: from a request of an estimator to calls of the shares, and from their replies to a sum."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.dealing import capacity
+from unrender.dealing.assignment import total
+from unrender.dealing.batches import split
+from unrender.dealing.hosts import Hosts
+from unrender.dealing.memories import Memories, Memory, Recipe
+from unrender.dealing.messages import Call, ImageState, Pair, Reply, payload_bytes
+from unrender.dealing.outbox import Outbox, Sent
+from unrender.estimators.filtered import FilteredGradient
+from unrender.estimators.meta import MetaEstimator
+from unrender.estimators.path import PathGradient
+from unrender.estimators.sample_groups import GatherRequest, GradientSample
+from unrender.images.denoised import Denoised
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import (
+    RecursiveControlVariate,
+    RecursiveControlVariateState,
+    Snapshot,
+)
+from unrender.problem.problem import Problem
+from unrender.runs.folder.state import pack, unpack
+
+__all__ = ["DealtViews", "Traffic"]
+
+_MOST_LOSSES = 5
+"""Times that shares may be lost in one step."""
+_PICTURES_EVERY = 25
+"""Steps between images for people to look at."""
+
+
+@dataclass
+class Traffic:
+    """What went between driver and workers in the last step.
+
+    Attributes:
+        sent, received: bytes of arrays, of all shares together.
+        seconds: from the first call to the last reply.
+        busy: seconds that the slowest share computed.
+        lost: shares lost so far.
+        repeated: steps repeated for them so far.
+    """
+
+    sent: int = 0
+    received: int = 0
+    seconds: float = 0.0
+    busy: float = 0.0
+    lost: int = 0
+    repeated: int = 0
+
+
+class DealtViews:
+    """A `Gatherer`: each share of the views computes its part of a step, sums are in the shares' order.
+
+    Args:
+        problem: the whole one.
+        shares: the views of each.
+        hosts: where they live.
+        compress: see `Outbox`.
+        variant: see `Gatherer.variant`.
+
+    Attributes:
+        traffic: of the last step.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        shares: tuple[tuple[int, ...], ...],
+        hosts: Hosts,
+        compress: bool = False,
+        variant: str = "",
+    ):
+        self.variant = variant
+        self._problem, self._shares, self._hosts = problem, shares, hosts
+        self._outbox, self._memories = Outbox(compress), Memories()
+        self._arrays: list[set[int]] = [set() for _ in shares]
+        self._present: list[set[int]] = [set() for _ in shares]
+        self._recent: list[set[int]] = [set() for _ in shares]
+        self._calls = 0
+        self.traffic = Traffic()
+
+    # ------------------------------------------------------------------ Gatherer
+
+    def check(self, estimator: Any) -> None:
+        """See `Gatherer.check`."""
+        found = estimator
+        while isinstance(found, FilteredGradient):
+            found = found.inner
+        name = type(found).__name__
+        if not isinstance(found, (PathGradient, MetaEstimator)):
+            raise InputError(
+                f"{name} renders all views of a problem itself, so they cannot be dealt to workers; "
+                "methods plain, rcv, meta, coupled, adaptive and most choices of auto can"
+            )
+        image = found.image.inner if isinstance(found.image, Denoised) else found.image
+        if not isinstance(image, (Plain, RecursiveControlVariate)):
+            raise InputError(f"{name}: what {type(image).__name__} remembers of views cannot be dealt to workers")
+        capacity.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
+
+    def gather(self, request: GatherRequest) -> GradientSample:
+        """See `Gatherer.gather`."""
+        self.traffic.sent = self.traffic.received = 0
+        self.traffic.seconds = self.traffic.busy = 0.0
+        memory = self._memory(request.state)
+        sample = None if request.batch is None else request.batch.sample
+        call, sent = self._call(request, memory)
+        kept: Any = (None,) * len(self._problem.views)
+        if sample is None and isinstance(request.state, RecursiveControlVariateState):
+            kept, call = self._memories.after(memory, call, sent)
+        parts = [None] * len(self._shares) if sample is None else split(self._problem, sample, self._shares)
+        calls = {index: replace(call, batch=part) for index, part in enumerate(parts) if sample is None or part}
+        if isinstance(kept, Memory) and kept.recipe.call is not None:
+            kept.recipe.call = replace(call, replay=True, pictures=False)
+        started = time.perf_counter()
+        replies = self._replies(calls, sent, memory)
+        self.traffic.seconds = time.perf_counter() - started
+        if isinstance(kept, Memory):
+            self._bound(kept)
+        return self._sample(request, [replies[index] for index in sorted(replies)], kept)
+
+    def prepared(self, state: Any) -> Any:
+        """See `Gatherer.prepared`."""
+        if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
+            return replace(state, snapshot=state.views)
+        return state
+
+    def collected(self, state: Any) -> Any:
+        """See `Gatherer.collected`."""
+        if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
+            whole = replace(state, views=self._views(state.views.recipe), snapshot=None)
+            return whole if state.snapshot is None else replace(whole, snapshot=_snapshot(whole))
+        if dataclasses.is_dataclass(state) and not isinstance(state, type):
+            parts = {each.name: getattr(state, each.name) for each in dataclasses.fields(state) if each.init}
+            found = {name: self.collected(part) for name, part in parts.items()}
+            changed = {name: part for name, part in found.items() if part is not parts[name]}
+            return replace(state, **changed) if changed else state
+        if isinstance(state, (tuple, list)) and type(state) in (tuple, list):
+            found = [self.collected(part) for part in state]
+            same = all(a is b for a, b in zip(found, state, strict=True))
+            return state if same else type(state)(found)
+        return state
+
+    def snapshot(self) -> Any:
+        """See `Gatherer.snapshot`."""
+        return self._outbox.snapshot()
+
+    def restore(self, saved: Any) -> None:
+        """See `Gatherer.restore`."""
+        self._outbox.restore(saved)
+
+    # ------------------------------------------------------------------ from a request to calls
+
+    def _memory(self, state: Any) -> Memory | None:
+        """What the workers are to remember of a state; handed over to them where they do not have it."""
+        if not isinstance(state, RecursiveControlVariateState) or not state.views:
+            return None
+        if isinstance(state.views, Memory):
+            return state.views
+        packed = (pack(tuple(state.views[view] for view in share)) for share in self._shares)
+        return self._memories.stored(tuple(packed))
+
+    def _call(self, request: GatherRequest, memory: Memory | None) -> tuple[Call, dict[int, Sent]]:
+        """The call that all shares have in common, and its arrays."""
+        sent: dict[int, Sent] = {}
+
+        def numbered(tree: Tree) -> dict[str, int]:
+            found = self._outbox.numbered(tree)
+            sent.update({one.number: one for one in found.values()})
+            return self._outbox.values(found)
+
+        pair, state = request.pair_request, None
+        if isinstance(request.state, RecursiveControlVariateState):
+            past = request.state.parameters
+            known = None if past is None else numbered(past)
+            number = None if memory is None else memory.number
+            state = ImageState(known, number, request.state.snapshot is not None, request.state.step)
+        asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step)
+        self._calls += 1
+        call = Call(
+            numbered(request.parameters),
+            request.image,
+            state,
+            request.spp,
+            request.key,
+            request.adjoint_spp,
+            asked,
+            tolerance=request.tolerance,
+            fresh=request.fresh,
+            pictures=self._calls % _PICTURES_EVERY == 1,
+            single=self._outbox.compress,
+        )
+        return call, sent
+
+    def _addressed(self, share: int, call: Call, sent: Mapping[int, Sent]) -> Call:
+        """The call with the arrays that a share lacks, and without what it need not keep."""
+        present = self._arrays[share]
+        missing = {number: one.payload(present) for number, one in sorted(sent.items()) if number not in present}
+        old = present - set(sent) - self._recent[share]
+        gone = {number for number in self._present[share] if not self._memories.is_alive(number)}
+        if call.state is not None:
+            gone.discard(-1 if call.state.memory is None else call.state.memory)
+        self._arrays[share] = (present | set(missing)) - old
+        self._recent[share] = set(sent)
+        self._present[share] -= gone
+        if call.result is not None:
+            self._present[share].add(call.result)
+        return replace(call, arrays=missing, drop_arrays=tuple(sorted(old)), drop_memories=tuple(sorted(gone)))
+
+    # ------------------------------------------------------------------ calls, and shares that are lost
+
+    def _replies(self, calls: Mapping[int, Call], sent: Mapping[int, Sent], memory: Memory | None) -> dict[int, Reply]:
+        """All replies. A share that is lost is given what it remembered, by repeating its steps, and called again."""
+        found: dict[int, Reply] = {}
+        for share in self._hosts.movable():
+            if memory is not None:
+                self._collect(memory.recipe)
+            self._hosts.move(share)
+            self._forget({share} | self._hosts.emptied())
+        for _ in range(_MOST_LOSSES):
+            open_ = {share: call for share, call in calls.items() if share not in found}
+            ready = list(open_) if memory is None else self._ensured(open_, memory.recipe)
+            addressed = {share: self._addressed(share, open_[share], sent) for share in ready}
+            self.traffic.sent += sum(payload_bytes(call) for call in addressed.values())
+            replies = self._hosts.run(addressed)
+            self.traffic.received += sum(payload_bytes(reply) for reply in replies.values())
+            self.traffic.busy = max([self.traffic.busy, *(reply.seconds for reply in replies.values())])
+            found |= replies
+            lost = (set(open_) - set(replies)) | self._hosts.emptied()
+            self._forget(lost)
+            self.traffic.lost += len(lost)
+            if len(found) == len(calls):
+                return found
+        views = ", ".join(str(view) for share in sorted(set(calls) - set(found)) for view in self._shares[share])
+        raise InputError(f"workers: those of views {views} were lost {_MOST_LOSSES} times in one step")
+
+    def _forget(self, shares: Iterable[int]) -> None:
+        for share in shares:
+            for present in (self._arrays, self._present, self._recent):
+                present[share] = set()
+
+    def _ensured(self, shares: Iterable[int], recipe: Recipe) -> list[int]:
+        """Those shares that remember what a recipe makes, made again where need be; without those that were lost meanwhile."""
+        made = [share for share in shares if self._ensure(share, recipe)]
+        return [share for share in made if recipe.number in self._present[share]]
+
+    def _ensure(self, share: int, recipe: Recipe) -> bool:
+        """See that a share remembers what a recipe makes; false where it was lost meanwhile."""
+        if recipe.number in self._present[share]:
+            return True
+        chain = recipe.chain()
+        first = next((n for n in reversed(range(len(chain))) if chain[n].number in self._present[share]), -1)
+        for one in chain[first + 1 :]:
+            if one.stored is not None:
+                done = self._hosts.store(share, one.number, one.stored[share])
+                self._present[share].add(one.number)
+            else:
+                call = one.call
+                assert call is not None
+                done = bool(self._hosts.run({share: self._addressed(share, call, one.sent)}))
+                self.traffic.repeated += 1
+            self._forget(self._hosts.emptied() | (set() if done else {share}))
+            if one.number not in self._present[share]:
+                return False
+        return True
+
+    # ------------------------------------------------------------------ what is remembered, collected
+
+    def _bound(self, memory: Memory) -> None:
+        """Collect what is remembered where it would take many steps to make it again."""
+        if memory.recipe.is_long:
+            self._collect(memory.recipe)
+
+    def _collect(self, recipe: Recipe) -> None:
+        if recipe.stored is not None:
+            return
+        found: dict[int, Any] = {}
+        shares = range(len(self._shares))
+        for _ in range(_MOST_LOSSES):
+            if len(self._ensured(shares, recipe)) == len(shares):
+                fetched = self._hosts.fetch(recipe.number)
+                self._forget(self._hosts.emptied() | (set(shares) - set(fetched)))
+                found |= fetched
+            if len(found) == len(shares):
+                recipe.store(tuple(found[share] for share in shares))
+                return
+        raise InputError(f"workers: some were lost {_MOST_LOSSES} times while what they remember was collected")
+
+    def _views(self, recipe: Recipe) -> tuple[Any, ...]:
+        """What is remembered of each view, in the views' order."""
+        self._collect(recipe)
+        assert recipe.stored is not None
+        found: dict[int, Any] = {}
+        for share, packed in zip(self._shares, recipe.stored, strict=True):
+            found |= zip(share, unpack(packed), strict=True)
+        return tuple(found[view] for view in sorted(found))
+
+    # ------------------------------------------------------------------ from replies to a sum
+
+    def _sample(self, request: GatherRequest, replies: Sequence[Reply], kept: Any) -> GradientSample:
+        def summed(of: Callable[[Reply], Mapping[str, np.ndarray]]) -> Tree:
+            return {key: self._problem.renderer.array(x) for key, x in total(map(of, replies)).items()}
+
+        losses = sorted((view, reply.losses[view]) for reply in replies for view in reply.losses)
+        batch = request.batch
+        info: dict[str, dict[int, Any]] = {}
+        if batch is not None and batch.probability:
+            info["pixel_probability"] = batch.probability
+        images: dict[int, Any] = {}
+        for reply in replies:
+            images |= reply.images
+            for name, maps in reply.info.items():
+                info.setdefault(name, {}).update(maps)
+        state = request.state
+        if batch is None or batch.sample is None:
+            state = request.image.advance(request.parameters, request.state, kept)
+        return GradientSample(
+            gradient=summed(lambda reply: reply.gradient),
+            previous=summed(lambda reply: reply.previous),
+            fresh=summed(lambda reply: reply.fresh),
+            losses=[loss for _, loss in losses],
+            images=images,
+            samples=(batch.samples if batch else 0) + sum(reply.samples for reply in replies),
+            info=info,
+            image=state,
+        )
+
+
+def _snapshot(state: RecursiveControlVariateState) -> Snapshot | None:
+    """The snapshot of a state with all views."""
+    return RecursiveControlVariate().prepare(None, state).snapshot  # pyright: ignore[reportArgumentType]

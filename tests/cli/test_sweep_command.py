@@ -1,0 +1,200 @@
+"""`unrender sweep`, and `--workers`, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from unrender.cli import tasks
+
+TOY = ["quad", "--method", "plain", "--steps", 20, "--final-spp", 1]
+GRID = [*TOY, "--over", "learning_rate=0.03,0.3"]
+
+
+def sweep_json(folder: str = "s") -> dict[str, Any]:
+    return json.loads(Path(folder, "sweep.json").read_text())
+
+
+def trials(folder: str) -> list[tuple]:
+    return [(t["settings"], t["status"], t["error"], t["runs"][0]["steps"]) for t in sweep_json(folder)["trials"]]
+
+
+@pytest.mark.slow
+def test_a_grid_in_this_process(unrender, mitsuba_variant: str) -> None:
+    answer = unrender("sweep", *GRID, "--seeds", 2, "--out", "s", "--variant", mitsuba_variant)
+    assert (answer.status, answer.error) == (0, "")
+    record = sweep_json()
+    assert (record["status"], record["best"], record["best_line"]) == ("finished", 1, "-s learning_rate=0.3")
+    assert "best: -s learning_rate=0.3\nto run it: unrender run quad --method plain --steps 20 -s" in answer.out
+    assert Path("s/compare.html").exists()
+    runs = [run for trial in record["trials"] for run in trial["runs"]]
+    assert [run["folder"] for run in runs] == [f"trial-{i:03d}-seed{k}" for i in range(2) for k in range(2)]
+    for run in runs:
+        stored = json.loads(Path("s", run["folder"], "run.json").read_text())
+        assert (stored["status"], stored["steps"], stored["seed"]) == ("finished", 20, run["seed"])
+    best = record["trials"][1]
+    assert best["error"] == pytest.approx(sum(run["error"] for run in best["runs"]) / 2)
+    assert unrender("run", *TOY, "-s", "learning_rate=0.3", "--out", "r", "--variant", mitsuba_variant).status == 0
+    alone, within = (json.loads(Path(p, "run.json").read_text()) for p in ("r", "s/trial-001-seed0"))
+    assert alone["settings"]["options"] == within["settings"]["options"]
+    again = unrender("sweep", *GRID, "--out", "s")
+    assert (again.status, "holds earlier results" in again.error) == (2, True)
+
+
+@pytest.mark.slow
+def test_an_interrupted_sweep_goes_on_where_it_was(
+    unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str
+) -> None:
+    command = ["sweep", *TOY, "--over", "learning_rate=0.001:1:log", "--trials", 4, "--variant", mitsuba_variant]
+    assert unrender(*command, "--out", "whole").status == 0
+    carry_out, begun = tasks.carry_out, []
+
+    def interrupted(job: tasks.Job, task: tasks.RunTask, *others: Any) -> Any:
+        begun.append(task.name)
+        if len(begun) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return carry_out(job, task, *others)
+
+    with monkeypatch.context() as patches:
+        patches.setattr(tasks, "carry_out", interrupted)
+        answer = unrender(*command, "--out", "s")
+    assert (answer.status, answer.error) == (130, "unrender: interrupted\n")
+    assert "to go on: unrender sweep s" in answer.out
+    assert (sweep_json()["status"], len(sweep_json()["trials"])) == ("interrupted", 2)
+    stamps = [os.stat(f"s/trial-00{i}-seed0/run.json").st_mtime_ns for i in range(2)]
+    assert unrender("sweep", "s").status == 0
+    assert sweep_json()["status"] == "finished"
+    assert trials("s") == trials("whole")
+    assert stamps == [os.stat(f"s/trial-00{i}-seed0/run.json").st_mtime_ns for i in range(2)]
+    assert unrender("report", "s").out.strip() == "s/compare.html"
+    more = unrender("sweep", "s", "--trials", 5)
+    assert (more.status, len(trials("s"))) == (0, 5)
+    refused = unrender("sweep", "s", "--steps", 3)
+    assert (refused.status, "goes on as it was begun, without --steps" in refused.error) == (2, True)
+
+
+def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
+    unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str
+) -> None:
+    carry_out = tasks.carry_out
+
+    def broken(job: tasks.Job, task: tasks.RunTask, *others: Any) -> Any:
+        if task.settings["learning_rate"] == "0.003":
+            raise RuntimeError("out\nof memory")
+        return carry_out(job, task, *others)
+
+    over = ["--over", "learning_rate=0.003,0.03"]
+    with monkeypatch.context() as patches:
+        patches.setattr(tasks, "carry_out", broken)
+        answer = unrender("sweep", *TOY, *over, "--out", "s", "--variant", mitsuba_variant)
+    assert answer.status == 0
+    assert "failed (trial 0): RuntimeError: out of memory\n" in answer.out
+    assert [trial["status"] for trial in sweep_json()["trials"]] == ["failed", "finished"]
+    assert sweep_json()["best"] == 1
+    assert unrender("sweep", "s").status == 0  # tried once more
+    assert [trial["status"] for trial in sweep_json()["trials"]] == ["finished", "finished"]
+
+
+def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant: str) -> None:
+    rates = "learning_rate=0.3,0.2,0.1,0.05,0.003,0.002,0.001,0.0003"
+    answer = unrender(
+        "sweep", *TOY, "--over", rates, "--prune", "--window", 1, "--out", "s", "--variant", mitsuba_variant
+    )
+    assert answer.status == 0
+    found = trials("s")
+    assert [status for _, status, _, _ in found] == ["finished"] * 4 + ["pruned"] * 4
+    assert all(steps < 20 for _, status, _, steps in found if status == "pruned")
+    assert not Path("s/trial-007-seed0/pictures.npz").exists()
+    assert "(pruned at 20%)" in answer.out
+
+
+@pytest.mark.parametrize("command", [["sweep", *GRID], ["compare", "quad", "--seconds", 1]])
+def test_without_ray_one_line_says_what_to_install(unrender, monkeypatch: pytest.MonkeyPatch, command: list) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    answer = unrender(*command, "--workers", 2, "--out", "s")
+    assert answer.status == 2
+    assert answer.error.count("\n") == 1
+    assert "pip install 'unrender[ray]'" in answer.error
+    assert not Path("s").exists()
+
+
+def test_without_optuna_one_line_says_what_to_install(unrender, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    answer = unrender("sweep", *GRID, "--search", "tpe", "--out", "s")
+    assert (answer.status, "pip install 'unrender[sweep]'" in answer.error, Path("s").exists()) == (2, True, False)
+
+
+# ---------------------------------------------------------------------- on workers
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[Any]:
+    """Starts the command in a process of its own, in a group of its own, which is ended with the test."""
+    pytest.importorskip("ray")
+    begun: list[subprocess.Popen] = []
+
+    def start(*arguments: object) -> subprocess.Popen:
+        command = [sys.executable, "-m", "unrender", *map(str, arguments)]
+        process = subprocess.Popen(
+            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        begun.append(process)
+        return process
+
+    yield start
+    for process in begun:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+LONG = [
+    *("poster", "-p", "resolution=16", "-m", "plain", "--over", "learning_rate=0.003,0.01,0.03", "--final-spp", 2),
+    *("--steps", 3000, "--threads", 1),
+]
+
+
+def wait_for(folder: Path, pattern: str, count: int) -> list[Path]:
+    until = time.monotonic() + 200
+    while len(found := sorted(folder.glob(pattern))) < count:
+        assert time.monotonic() < until, f"no {pattern}"
+        time.sleep(0.1)
+    return found
+
+
+@pytest.mark.slow
+def test_workers_find_what_one_process_does_though_one_is_killed(started: Any, tmp_path: Path, unrender) -> None:
+    process = started("sweep", *LONG, "--steps", 600, "--workers", 2, "--out", "s")
+    lock = wait_for(tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 1)[0].parents[2] / "lock"
+    os.kill(json.loads(lock.read_text())["pid"], signal.SIGKILL)
+    out, error = process.communicate(timeout=300)
+    assert (process.returncode, error) == (0, "")
+    assert "3/3 trial" in out
+    record = sweep_json("s")
+    assert sorted(trial["attempts"] for trial in record["trials"]) == [1, 1, 2]
+    alone = unrender("sweep", *LONG, "--steps", 600, "--out", "alone")
+    assert alone.status == 0
+    assert trials("s") == trials("alone")
+
+
+@pytest.mark.slow
+def test_an_interrupt_ends_workers_and_what_was_reached_is_kept(started: Any, tmp_path: Path) -> None:
+    process = started("sweep", *LONG, "--steps", 200_000, "--workers", 2, "--out", "s")
+    wait_for(tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 2)
+    os.killpg(process.pid, signal.SIGINT)
+    began = time.monotonic()
+    out, error = process.communicate(timeout=60)
+    assert time.monotonic() - began < 30
+    assert (process.returncode, error) == (130, "unrender: interrupted\n")
+    assert "to go on: unrender sweep s" in out
+    assert json.loads((tmp_path / "s/sweep.json").read_text())["status"] == "interrupted"
+    assert json.loads((tmp_path / "s/trial-000-seed0/run.json").read_text())["steps"] > 0

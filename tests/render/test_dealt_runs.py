@@ -1,0 +1,100 @@
+"""Views dealt to workers of Ray, and dealt runs resumed."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from tests.contract import analytic
+from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
+from unrender.backend import variant
+from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.outbox import Outbox
+from unrender.dealing.ray_hosts import RayHosts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "compress"), [("plain", True), ("rcv", False), ("coupled", True)])
+def test_a_dealt_run_is_resumed_to_the_same_bits(name: str, compress: bool, tmp_path: Path) -> None:
+    problem = analytic.problem(ur.losses.L1(), views=VIEWS)
+    whole = descend(dealt(problem, 2, compress), name, run_directory=tmp_path / "whole", checkpoint_every=4)
+    descend(dealt(problem, 2, compress), name, steps=8, run_directory=tmp_path / "half", checkpoint_every=4)
+    again: dict[str, Any] = {"estimator": ESTIMATORS[name](), "optimizer": ur.optimizers.Adam(learning_rate=0.02)}
+    resumed = ur.resume(tmp_path / "half", dealt(problem, 2, compress), steps=12, **again)
+    assert apart(whole, resumed) == 0
+    if compress:
+        with pytest.raises(ur.InputError, match="16-bit differences: resume it with --workers and --compress"):
+            ur.resume(tmp_path / "half", problem, steps=13, **again)
+    else:
+        assert apart(whole, ur.resume(tmp_path / "half", dealt(problem, 3), steps=13, **again)) > 0
+        descend(dealt(problem, 4), name, steps=8, run_directory=tmp_path / "alone")
+        assert apart(whole, ur.resume(tmp_path / "alone", problem, steps=12, **again)) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("bad", "line"),
+    [
+        (lambda good: [], "sent: expected what workers have of colour, map, got \\[\\]"),
+        (lambda good: {"map": good["map"]}, "sent: expected what workers have of colour, map, got {'map'"),
+        (lambda good: {**good, "map": {"exact": good["map"]["exact"]}}, "sent: map: expected exact and sent, got"),
+        (lambda good: {**good, "map": {**good["map"], "sent": "x"}}, "sent: map: sent: expected an array, got 'x'"),
+        (lambda good: {**good, "map": {**good["map"], "sent": np.ones((2, 3, 1))}}, "expected shape .2, 2, 1., got"),
+        (lambda good: {**good, "map": {**good["map"], "sent": np.full((2, 2, 1), np.nan)}}, "'sent'.: not finite"),
+    ],
+)
+def test_a_checkpoint_of_other_arrays_is_one_line(
+    bad: Callable[[Any], Any], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, good = dealt(analytic.problem(views=2), 2, compress=True), Outbox.snapshot
+    with monkeypatch.context() as patch:
+        patch.setattr(Outbox, "snapshot", lambda self: bad(good(self)) if self._last else good(self))
+        descend(problem, "plain", steps=2, run_directory=tmp_path / "run")
+    again: dict[str, Any] = {"estimator": ESTIMATORS["plain"](), "optimizer": ur.optimizers.Adam(learning_rate=0.02)}
+    with pytest.raises(ur.InputError, match=line):
+        ur.resume(tmp_path / "run", problem, steps=3, **again)
+
+
+class Kill(ur.Callback):
+    """Ends the process of the last share, as the system does where memory is short."""
+
+    def on_step(self, run: Any, record: Any) -> None:
+        if run.step == 6:
+            hosts = run.problem.gatherer._hosts
+            assert isinstance(hosts, RayHosts)
+            os.kill(hosts._of[-1].place.process, signal.SIGKILL)  # pyright: ignore[reportOptionalMemberAccess]
+
+
+@pytest.mark.slow
+def test_two_workers_descend_as_one_process_and_a_kill_changes_nothing() -> None:
+    pytest.importorskip("ray")
+    variant.use_threads(1)
+    room = ur.gallery.problem("indirect-room", resolution=16, texture_resolution=8, reference_spp=16)
+    image = np.asarray(room.views[0].reference)
+    views = [ur.View(image * (1 + 0.1 * index)) for index in range(4)]
+    problem = ur.Problem(room.renderer, room.parameters, views, room.loss, room.max_depth)
+
+    def run(problem: ur.Problem, *callbacks: ur.Callback) -> dict[str, np.ndarray]:
+        estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+        adam = ur.optimizers.Adam(learning_rate=0.02)
+        return ur.optimize(problem, estimator, adam, steps=12, progress=False, callbacks=callbacks).parameters
+
+    alone = run(problem)
+    lines: list[str] = []
+    with ur.deal(problem, workers=2, threads=1, tell=lines.append) as together:
+        whole = run(together)
+        broken = run(together, Kill())
+        gatherer = together.gatherer
+        assert isinstance(gatherer, DealtViews)
+        assert gatherer.traffic.lost == 1
+    assert len(lines) == 1
+    assert "of views 1, 3: lost; others take over" in lines[0]
+    for key, value in alone.items():
+        assert np.array_equal(whole[key], broken[key])
+        assert np.abs(whole[key] - value).max() < 1e-5 * np.abs(value).max()

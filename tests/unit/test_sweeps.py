@@ -1,0 +1,264 @@
+"""Searches, their order and pruning, on errors that a formula gives."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from unrender.core.errors import InputError
+from unrender.methods import method
+from unrender.sweeps import folders, pruning
+from unrender.sweeps.axes import Axis, parse_axes
+from unrender.sweeps.record import RunOutcome, SweepPlan, SweepRecord, read_sweep, write_sweep
+from unrender.sweeps.search import Grid, Random, Search
+from unrender.sweeps.trials import Started, Trials, trial_record
+
+PLAIN = method("plain")
+
+
+def axes(*given: str) -> tuple[Axis, ...]:
+    return parse_axes(given, PLAIN)
+
+
+# ---------------------------------------------------------------------- axes and searches
+
+
+def test_a_grid_has_every_combination_once_the_last_axis_fastest() -> None:
+    grid = Grid(axes("learning_rate=0.001:0.1:log:3", "spp=2:4", "schedule=none,cosine(300),steps(100, 0.5)"))
+    found = [tuple(grid.ask(i).values()) for i in range(grid.trials)]
+    assert len(set(found)) == 27
+    assert found[0] == ("0.001", "2", "none")
+    assert found[1] == ("0.001", "2", "cosine(300)")
+    assert found[9] == ("0.01", "2", "none")
+    assert found[-1] == ("0.1", "4", "steps(100, 0.5)")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("spp=2:16:log", [math.log((k + 0.5) / (k - 0.5)) / math.log(16.5 / 1.5) for k in range(2, 17)]),
+        ("spp=2:5", [0.25] * 4),
+        ("spp=2,4,8", [1 / 3] * 3),
+    ],
+)
+def test_random_values_have_their_chances(text: str, expected: list[float]) -> None:
+    count = 4000
+    search = Random(axes(text), count, seed=3)
+    drawn = [int(search.ask(i)["spp"]) for i in range(count)]
+    frequencies = [drawn.count(value) / count for value in sorted(set(drawn))]
+    errors = [math.sqrt(p * (1 - p) / count) for p in expected]
+    assert np.all(np.abs(np.array(frequencies) - expected) < 4 * np.array(errors))
+
+
+def test_random_numbers_are_even_in_the_logarithm_and_can_be_typed() -> None:
+    search = Random(axes("learning_rate=0.001:1:log"), 2000, seed=1)
+    drawn = [search.ask(i)["learning_rate"] for i in range(2000)]
+    shares = (np.log10([float(text) for text in drawn]) + 3) / 3
+    assert abs(shares.mean() - 0.5) < 4 / math.sqrt(12 * 2000)
+    assert shares.min() >= 0
+    assert shares.max() <= 1
+    assert all(len(text.replace("0.", "").lstrip("0")) <= 4 for text in drawn)
+    assert Random(axes("learning_rate=0.001:1:log"), 5, seed=1).ask(4)["learning_rate"] == drawn[4]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["spp"], "expected NAME=VALUE,VALUE"),
+        (["spp=2,"], "a value is empty"),
+        (["spp=2,2"], "2 is given twice"),
+        (["spp=2,4", "spp=8"], "spp is given twice"),
+        (["beta_1=0.1,0.2"], "fixed by --set"),
+        (["spp=0:4"], "expected a whole number above 0"),
+        (["spp=2:4.5"], "expected whole numbers"),
+        (["learning_rate=1:0.1"], "the lower one first"),
+        (["learning_rate=0.1:inf"], "two finite numbers"),
+        (["learning_rate=-1:1:log"], "above 0"),
+        (["learning_rate=0.1:1:log:3:4"], r"expected LOW:HIGH\[:log\]\[:POINTS\]"),
+        (["learning_rate=0.1:1:0"], "from 1 to 10000 points"),
+        (["lerning_rate=0.1:1"], "did you mean learning_rate"),
+        (["one_rate=0:1"], "a number, one_rate is true or false"),
+        ([], "nothing to vary"),
+    ],
+)
+def test_axes_that_make_no_sense_are_one_line(given: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_axes(given, PLAIN, ["beta_1"])
+
+
+def test_a_grid_without_points_or_too_large_is_refused() -> None:
+    with pytest.raises(InputError, match="needs a number of points"):
+        Grid(axes("learning_rate=0.1:1"))
+    with pytest.raises(InputError, match="the grid has 1000000 points"):
+        Grid(axes("learning_rate=0.1:1:1000", "beta_1=0.1:0.9:1000"))
+
+
+# ---------------------------------------------------------------------- the order of trials
+
+
+def error_of(settings: dict[str, str], share: float = 1.0) -> float:
+    """Least at a learning rate of 0.03 and 5 samples; falls with the share of the budget."""
+    rate, spp = float(settings["learning_rate"]), float(settings.get("spp", 5))
+    return (math.log10(rate / 0.03) ** 2 + 0.1 * math.log(spp / 5) ** 2) + (1 - share)
+
+
+def outcome(started: Started) -> RunOutcome:
+    errors: dict[float, float] = {}
+    status, error = "finished", error_of(started.settings)
+    for share in pruning.RUNGS:
+        errors[share] = error_of(started.settings, share)
+        if pruning.is_hopeless(errors, started.limits):
+            status, error = "pruned", errors[share]
+            break
+    return run(status=status, error=error, rungs={str(share): value for share, value in errors.items()})
+
+
+def carry_out(trials: Trials, workers: int, order: random.Random) -> list[tuple]:
+    """As if `workers` finished in a random order; a trial in seven fails."""
+    under_way: list[Started] = []
+    while not trials.done:
+        while len(under_way) < workers and (started := trials.next()) is not None:
+            under_way.append(started)
+        one = under_way.pop(order.randrange(len(under_way)))
+        message = "lost" if one.number % 7 == 3 else ""
+        runs = [] if message else [outcome(one)]
+        trials.end(trial_record(one.number, one.settings, runs, message=message))
+    return [(t.settings, t.status, t.error) for _, t in sorted(trials.ended.items())]
+
+
+def searches(kind: str) -> Search:
+    space = axes("learning_rate=0.0003:3:log", "spp=2:16:log")
+    if kind == "tpe":
+        pytest.importorskip("optuna")
+        from unrender.sweeps.tpe import TPE
+
+        return TPE(space, 24, 5)
+    return Random(space, 24, 5)
+
+
+@pytest.mark.parametrize("kind", ["random", "tpe"])
+def test_the_outcome_does_not_depend_on_workers_nor_on_who_is_first(kind: str) -> None:
+    found = [
+        carry_out(Trials(searches(kind), prune=True, window=6), workers, random.Random(workers))
+        for workers in (1, 2, 3, 6, 20)
+    ]
+    assert all(one == found[0] for one in found)
+    statuses = [status for _, status, _ in found[0]]
+    assert {"finished", "pruned", "failed"} == set(statuses)
+
+
+def test_that_test_sees_a_trial_that_looks_at_whatever_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    def limits(self: Trials, number: int) -> dict[float, float]:
+        ended = [trial for trial in self.ended.values() if trial.status == "finished"]
+        return pruning.medians(
+            {1.0: t.error, **{float(s): e for s, e in t.runs[0].rungs.items()}} for t in ended if t.error
+        )
+
+    monkeypatch.setattr(Trials, "_limits", limits)
+    one, other = (carry_out(Trials(searches("random"), True, 6), n, random.Random(n)) for n in (1, 6))
+    assert one != other
+
+
+def test_a_sweep_taken_up_again_has_the_trials_it_would_have_had() -> None:
+    whole = Trials(searches("tpe"), True, 4)
+    expected = carry_out(whole, 2, random.Random(0))
+    half = {n: t for n, t in whole.ended.items() if n < 9 or n == 10}
+    again = Trials(searches("tpe"), True, 4, ended=half)
+    assert carry_out(again, 3, random.Random(1)) == expected
+
+
+def test_trials_of_other_settings_are_refused() -> None:
+    trials = Trials(searches("random"), ended={0: trial_record(0, {"learning_rate": "0.5"}, [], message="x")})
+    with pytest.raises(InputError, match="trial 0 was made with -s learning_rate=0"):
+        trials.next()
+
+
+def best(kind: str) -> float:
+    return min(e for _, _, e in carry_out(Trials(searches(kind)), 1, random.Random(0)) if e is not None)
+
+
+def test_tpe_finds_more_than_random_settings_do() -> None:
+    assert best("tpe") < best("random")
+
+
+def test_pruning_keeps_the_best_and_saves_steps() -> None:
+    full = carry_out(Trials(Random(axes("learning_rate=0.0003:3:log"), 64, 2)), 1, random.Random(0))
+    trials = Trials(Random(axes("learning_rate=0.0003:3:log"), 64, 2), prune=True)
+    pruned = carry_out(trials, 1, random.Random(0))
+    assert min(e for _, s, e in pruned if s == "finished") == min(e for _, s, e in full if s == "finished")
+    runs = [run for trial in trials.ended.values() for run in trial.runs]
+    reached = [1.0 if run.status == "finished" else max(map(float, run.rungs)) for run in runs]
+    assert sum(reached) < 0.6 * len(runs)
+
+
+def test_medians_are_of_those_that_came_to_their_end() -> None:
+    assert pruning.medians([{0.3: 1.0}] * 3) == {}
+    assert pruning.medians([{0.3: e, 1.0: 2 * e} for e in (1, 2, 3, 4)]) == {0.3: 2.5, 1.0: 5.0}
+
+
+@pytest.mark.parametrize(
+    ("errors", "hopeless"),
+    [
+        ({0.1: 9.0}, False),  # a single look tells no pace
+        ({0.1: 9.0, 0.2: 0.9}, False),  # below the median
+        ({0.1: 9.0, 0.2: 8.0}, True),  # 8 (8/9)⁸ = 3.1
+        ({0.1: 9.0, 0.2: 5.0}, False),  # 5 (5/9)⁸ = 0.05
+        ({0.1: 2.0, 0.2: 2.0}, True),
+        ({0.1: 2.0, 0.2: 3.0}, True),
+    ],
+)
+def test_those_that_fall_fast_are_spared(errors: dict[float, float], hopeless: bool) -> None:
+    assert pruning.is_hopeless(errors, {0.1: 1.0, 0.2: 1.0, 1.0: 0.1}) is hopeless
+    assert not pruning.is_hopeless(errors, {})
+
+
+# ---------------------------------------------------------------------- records
+
+
+def run(**given: object) -> RunOutcome:
+    return RunOutcome.model_validate({"folder": "f", "seed": 0, "status": "finished", **given})
+
+
+def test_a_trial_is_the_mean_over_its_seeds() -> None:
+    trial = trial_record(0, {"spp": "2"}, [run(error=1.0), run(error=2.0), run(error=6.0)])
+    assert (trial.status, trial.error) == ("finished", 3.0)
+    assert trial.standard_error == pytest.approx(np.std([1, 2, 6], ddof=1) / math.sqrt(3))
+    assert trial_record(0, {}, [run(error=1.0), run(error=None)]).status == "failed"
+    assert trial_record(0, {}, [run(error=1.0, status="failed")]).status == "failed"
+    assert trial_record(0, {}, [run(error=1.0, status="pruned")]).status == "pruned"
+    assert trial_record(0, {"schedule": "cosine(300)"}, []).line == "-s 'schedule=cosine(300)'"
+
+
+def test_a_record_is_read_as_it_was_written_and_a_malformed_one_is_one_line(tmp_path: Path) -> None:
+    plan = SweepPlan(problem="quad", method="plain", over=["spp=2,4"], search="grid", trials=2, seed=5, seeds=2)
+    record = SweepRecord(plan=plan, trials=[trial_record(1, {"spp": "2"}, [run(error=1.0)])])
+    write_sweep(tmp_path, record)
+    assert read_sweep(tmp_path) == record
+    folder = tmp_path.name
+    assert [str(path.relative_to(tmp_path.parent)) for path in folders.watched(tmp_path)] == [
+        f"{folder}/trial-{i:03d}-seed{seed}" for i in range(2) for seed in (5, 6)
+    ]
+    assert folders.watched(tmp_path / "trial-000-seed5") == [tmp_path / "trial-000-seed5"]
+    assert folders.best(tmp_path, record) == [tmp_path / "f"]
+    given = json.loads((tmp_path / "sweep.json").read_text())
+    for change, message in [
+        ({"plan": 3}, "plan"),
+        ({"trials": given["trials"] * 2}, "ascending numbers"),
+        ({"format": 2}, "format"),
+        ({"trials": [{**given["trials"][0], "error": "much"}]}, "trials.0.error"),
+        (
+            {"trials": [{**given["trials"][0], "runs": [{"folder": "..", "seed": 0, "status": "pruned"}]}]},
+            "folder",
+        ),
+    ]:
+        (tmp_path / "sweep.json").write_text(json.dumps({**given, **change}))
+        with pytest.raises(InputError, match=message):
+            read_sweep(tmp_path)
+    (tmp_path / "sweep.json").unlink()
+    with pytest.raises(InputError, match="holds no sweep"):
+        read_sweep(tmp_path)
