@@ -245,7 +245,7 @@ def test_a_folder_that_holds_the_users_own_file_is_no_run(unrender: Unrender, st
 def test_resume_complains_of_a_file_of_stages_that_is_malformed(unrender: Unrender, staged: Path) -> None:
     (staged / "result").mkdir()
     for text, line in (
-        ("[[stages]\n", "result/stages.toml: not valid TOML"),
+        ("[[stages]\n", "result/stages.toml:1: not valid TOML"),
         (STAGES.replace("name", "nam"), "stages.toml:6: stages[0].nam: no such field"),
     ):
         (staged / "result" / "stages.toml").write_text(text)

@@ -9,7 +9,7 @@ from typing import Any
 
 from unrender.core.errors import InputError
 
-__all__ = ["LARGEST", "Place", "array_table", "check", "find", "parse"]
+__all__ = ["LARGEST", "Place", "array_table", "check", "dotted", "find", "parse"]
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -46,9 +46,16 @@ def parse(text: str, where: str) -> dict[str, Any]:
     check(text, where)
     try:
         return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message = str(error)
+        head, _, tail = message.rpartition(" (at ")
+        line, _, column = tail.rstrip(")").removeprefix("line ").partition(", ")
+        if not line.isdigit():
+            raise InputError(f"{where}:{text.rstrip().count(chr(10)) + 1}: not valid TOML: {message}") from error
+        raise InputError(f"{where}:{line}: not valid TOML: {head} ({column})") from error
     except RecursionError as error:
         raise InputError(f"{where}: not valid TOML: nested too deeply") from error
-    except ValueError as error:  # tomllib's own among them, and those of numbers without end
+    except ValueError as error:  # of numbers without end
         raise InputError(f"{where}: not valid TOML: {str(error)[:200]}") from error
 
 
@@ -63,6 +70,14 @@ def array_table(heading: str, fields: Mapping[str, Any]) -> str:
     tables = {key: value for key, value in fields.items() if isinstance(value, Mapping)}
     rows = [f"{key} = {inline(value)}\n" for key, value in tables.items()]
     return f"[[{heading}]]\n{tomli_w.dumps(plain)}{''.join(rows)}"
+
+
+def dotted(place: Place) -> str:
+    """("parameters", 0, "bounds") as parameters[0].bounds."""
+    text = ""
+    for part in place:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
 
 
 def find(text: str, place: Place) -> int:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from unrender.core.errors import InputError
+from unrender.io.toml_lines import Place, dotted
 
-__all__ = ["FieldError", "Place", "dotted"]
-
-Place = tuple[str | int, ...]
-"""The way to a field, e.g. ("parameters", 0, "bounds")."""
+__all__ = ["FieldError"]
 
 
 class FieldError(InputError):
     """What is wrong with one field of a problem.
 
     Args:
-        place: the way to the field.
+        place: the way to the field, e.g. ("parameters", 0, "bounds").
         what: one line: what is wrong and what would be right.
         owner: what people call the field, e.g. "parameter wall.data: bounds"; None writes the place.
     """
@@ -23,11 +21,3 @@ class FieldError(InputError):
         super().__init__(f"{owner or dotted(place)}: {what}")
         self.place = place
         self.what = what
-
-
-def dotted(place: Place) -> str:
-    """("parameters", 0, "bounds") as parameters[0].bounds."""
-    text = ""
-    for part in place:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
-    return text

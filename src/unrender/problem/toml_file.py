@@ -29,16 +29,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pydantic
-from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
+from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.io import bounded_files, toml_lines
-from unrender.io.toml_lines import tomllib
+from unrender.io import toml_models
+from unrender.io.toml_models import Table
 from unrender.problem import coarse_to_fine
-from unrender.problem.errors import FieldError, Place, dotted
+from unrender.problem.errors import FieldError
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
@@ -48,11 +46,7 @@ __all__ = ["read"]
 _Number = StrictFloat | StrictInt
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class _Parameter(_Model):
+class _Parameter(Table):
     key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
     initial: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
@@ -75,14 +69,14 @@ class _Parameter(_Model):
     )
 
 
-class _View(_Model):
+class _View(Table):
     reference: StrictStr = Field(description="the path of a picture (.exr, .hdr, .png, .jpg, .npy)")
     sensor: StrictInt = Field(0, description="the index of a sensor of the scene, from 0")
     weight: _Number = Field(1.0, description="a number above 0")
     mask: StrictStr | None = Field(None, description="the path of a picture with values from 0 to 1")
 
 
-class _Problem(_Model):
+class _Problem(Table):
     scene: StrictStr = Field(description="the path of a Mitsuba .xml file")
     parameters: list[_Parameter] = Field(description="at least one [[parameters]] table", min_length=1)
     views: list[_View] = Field(description="at least one [[views]] table", min_length=1)
@@ -100,44 +94,17 @@ def read(path: str | Path) -> Problem:
         InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
     """
     file = Path(path)
-    text = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
+    model, text = toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
     try:
-        model = _Problem.model_validate(_parse(file, text))
         problem = _build(model, file)
         problem.origin["file"] = str(file.resolve())
         return problem
-    except pydantic.ValidationError as error:
-        # An unknown field first: where its name is misspelt, the right one is missing too.
-        details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
-        raise InputError(_message(file, text, *_explain(details[0]))) from error
     except FieldError as error:
         place = error.place
         if place[0] == "truth":  # in a file it stands with the parameter
             keys = [parameter.key for parameter in model.parameters]
             place = ("parameters", keys.index(str(place[1])), "truth")
-        raise InputError(_message(file, text, place, error.what)) from error
-
-
-def _message(file: Path, text: str, place: Place, what: str) -> str:
-    return f"{file}:{toml_lines.find(text, place)}: {dotted(place)}: {what}"
-
-
-def _parse(file: Path, text: str) -> dict[str, Any]:
-    toml_lines.check(text, str(file))
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        message = str(error)
-        head, _, tail = message.rpartition(" (at ")
-        line, _, column = tail.rstrip(")").removeprefix("line ").partition(", ")
-        where = f"{file}:{line}: not valid TOML: {head} ({column})"
-        if not line.isdigit():
-            where = f"{file}:{text.rstrip().count(chr(10)) + 1}: not valid TOML: {message}"
-        raise InputError(where) from error
-    except RecursionError as error:
-        raise InputError(f"{file}: not valid TOML: nested too deeply") from error
-    except ValueError as error:
-        raise InputError(f"{file}: not valid TOML: {str(error)[:200]}") from error
+        raise toml_models.error_at(file, text, place, error.what) from error
 
 
 def _build(model: _Problem, file: Path) -> Problem:
@@ -179,27 +146,3 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
 
 def _value(value: Any, folder: Path) -> Any:
     return folder / value if isinstance(value, str) else value
-
-
-def _explain(detail: Any) -> tuple[Place, str]:
-    """The place and the message of one of pydantic's errors."""
-    place, model = _field(detail["loc"])
-    fields = model.model_fields
-    name = place[-1] if place else ""
-    if detail["type"] == "extra_forbidden":
-        names = ", ".join(fields)
-        return place, f"no such field{did_you_mean(str(name), fields) or f'; there are {names}'}"
-    expected = fields[str(name)].description if name in fields else "a table"
-    if detail["type"] == "missing" and len(detail["loc"]) == len(place):
-        return place, f"missing, expected {expected}"
-    got = repr(detail["input"])
-    return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
-
-
-def _field(location: tuple[int | str, ...]) -> tuple[Place, type[_Model]]:
-    """The place of the field that an error is about, without pydantic's own additions about unions and tuples, and the
-    model that the field belongs to."""
-    inner = {"parameters": _Parameter, "views": _View}
-    if len(location) >= 2 and location[0] in inner and isinstance(location[1], int):
-        return location[:3], inner[str(location[0])]
-    return location[:1], _Problem

@@ -27,14 +27,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import pydantic
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
+from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.io import bounded_files, files, toml_lines
-from unrender.problem.errors import Place, dotted
+from unrender.io import bounded_files, files, toml_lines, toml_models
+from unrender.io.toml_lines import Place
+from unrender.io.toml_models import Table
 
 __all__ = [
     "FILE",
@@ -121,15 +120,11 @@ class Stages:
         return {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in both.items()}
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
 _Positive = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
 _Setting = StrictStr | StrictInt | StrictFloat | bool
 
 
-class _Stage(_Model):
+class _Stage(Table):
     name: StrictStr = Field(description="lower-case letters, digits and dashes, at most 40")
     unknowns: list[StrictStr] = Field(
         description="a list of at least one key of the problem's parameters", min_length=1
@@ -143,14 +138,14 @@ class _Stage(_Model):
 _Count = Annotated[StrictInt, Field(ge=1)]
 
 
-class _Run(_Model):
+class _Run(Table):
     variant: StrictStr = Field("auto", description="a variant of Mitsuba")
     threads: _Count | None = Field(None, description="a whole number of at least 1")
     checkpoint_every: _Count | None = Field(None, description="a whole number of at least 1")
     final_spp: _Count | None = Field(None, description="a whole number of at least 1")
 
 
-class _Stages(_Model):
+class _Stages(Table):
     problem: StrictStr = Field(description="the path of a problem file")
     stages: list[_Stage] = Field(description="at least one [[stages]] table", min_length=1, max_length=_MOST)
     method: StrictStr = Field("auto", description="the name of a method, see `unrender methods`")
@@ -187,16 +182,11 @@ def read(path: str | Path) -> Stages:
         InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, what was expected.
     """
     file = Path(path)
-    content = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
-    try:
-        model = _Stages.model_validate(toml_lines.parse(content, str(file)))
-    except pydantic.ValidationError as error:
-        details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
-        place, what = _explain(details[0])
-        raise InputError(f"{file}:{toml_lines.find(content, place)}: {dotted(place)}: {what}") from error
+    model, content = toml_models.read(file, _Stages, {"stages": _Stage, "run": _Run})
     known: set[str] = set()
     for index, stage in enumerate(model.stages):
-        place, what = ("stages", index, "name"), ""
+        place: Place = ("stages", index, "name")
+        what = ""
         if not _NAME.fullmatch(stage.name):
             what = f"expected {_Stage.model_fields['name'].description}, got {stage.name!r:.60}"
         elif stage.name in known:
@@ -204,7 +194,7 @@ def read(path: str | Path) -> Stages:
         elif len(set(stage.unknowns)) < len(stage.unknowns):
             place, what = ("stages", index, "unknowns"), "a key is given twice"
         if what:
-            raise InputError(f"{file}:{toml_lines.find(content, place)}: {dotted(place)}: {what}")
+            raise toml_models.error_at(file, content, place, what)
         known.add(stage.name)
     stages = tuple(
         Stage(s.name, tuple(s.unknowns), float(s.share), s.coarser, s.method, s.settings or None) for s in model.stages
@@ -255,21 +245,3 @@ def split(stages: Stages) -> list[tuple[int | None, float | None]]:
 def folder_of(stages: Stages, index: int, out: Path) -> Path:
     """The run folder of a stage."""
     return out / f"{index + 1}-{stages.stages[index].name}"
-
-
-def _explain(detail: Any) -> tuple[Place, str]:
-    """The place and the message of one of pydantic's errors."""
-    location = detail["loc"]
-    inner = len(location) >= 2 and location[0] == "stages" and isinstance(location[1], int)
-    of_run = len(location) >= 2 and location[0] == "run"
-    place: Place = location[: 3 if inner else 2 if of_run else 1]
-    fields = (_Stage if inner else _Run if of_run else _Stages).model_fields
-    name = str(place[-1])
-    if detail["type"] == "extra_forbidden" and name not in fields:
-        there = ", ".join(fields)
-        return place, f"no such field{did_you_mean(name, fields) or f'; there are {there}'}"
-    expected = fields[name].description if name in fields else "a table"
-    if detail["type"] == "missing" and len(location) == len(place):
-        return place, f"missing, expected {expected}"
-    got = repr(detail["input"])
-    return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
