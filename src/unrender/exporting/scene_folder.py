@@ -103,8 +103,7 @@ def export(
     """
     variant.ensure()
     out, asked = Path(out), check_formats(formats)
-    files.remove_leftovers(out.parent, (out.name,))
-    _check_place(out, overwrite)
+    files.check_replaceable(out, _OWN, maps.RECORD, overwrite, f"export to {out}", "an earlier export")
     problem, parameters = _opened(what)
     renderer = without_exposure(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
@@ -157,21 +156,6 @@ def _write(
         for name in _OF_SCENE:
             files.remove(folder / name)
     return notices, renamed
-
-
-def _check_place(out: Path, overwrite: bool) -> None:
-    try:
-        if out.exists() and not out.is_dir():
-            raise InputError(f"export to {out}: a file, expected a folder")
-        found = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    except OSError as error:
-        raise InputError(f"export to {out}: {error.strerror or error}") from error
-    if not found:
-        return
-    if maps.RECORD not in found or not found <= _OWN:
-        raise InputError(f"export to {out}: the folder holds other things; give a new one")
-    if not overwrite:
-        raise InputError(f"export to {out}: holds an earlier export; give --overwrite (overwrite=True) to replace it")
 
 
 def _fill(

@@ -26,6 +26,7 @@ from unrender.core.errors import InputError
 
 __all__ = [
     "COMPRESSED_BYTES",
+    "check_replaceable",
     "flush",
     "make_folder",
     "remove",
@@ -200,6 +201,32 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 # ---------------------------------------------------------------------- what processes left that died
+
+
+def check_replaceable(place: Path, own: Collection[str], record: str, overwrite: bool, label: str, what: str) -> None:
+    """Raise `InputError` where a folder to be written by `write_folder` would replace what is not its own.
+
+    Leftovers of a process that died while it wrote there are removed first.
+
+    Args:
+        place: where the folder is to stand; it need not exist.
+        own: names that such a folder may hold.
+        record: that of `own` which tells such a folder from others.
+        overwrite: whether an earlier one may be replaced.
+        label: before the colon of the message, e.g. "--out judge".
+        what: such a folder, e.g. "an earlier judgement".
+    """
+    remove_leftovers(place.parent, (place.name,))
+    try:
+        if place.exists() and not place.is_dir():
+            raise InputError(f"{label}: a file, expected a folder")
+        found = {path.name for path in place.iterdir()} if place.is_dir() else set()
+    except OSError as error:
+        raise InputError(f"{label}: {error.strerror or error}") from error
+    if found and (record not in found or not found <= set(own)):
+        raise InputError(f"{label}: the folder holds other things; give a new one")
+    if found and not overwrite:
+        raise InputError(f"{label}: holds {what}; give --overwrite (overwrite=True) to replace it")
 
 
 def write_folder(place: Path, fill: Callable[[Path], _T]) -> _T:

@@ -95,7 +95,7 @@ def judge(
     if not isinstance(spp, int) or spp < 1:
         raise InputError(f"judge: spp must be a whole number of at least 1, got {spp!r}")
     place = Path(run) / "judge" if out is None else Path(out)
-    _check_place(place, overwrite)
+    files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
     light = None if environment is None else scenes.read_light(Path(environment))
     problem, found = reopen.problem_of(run), folders.read(run)
     given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
@@ -128,20 +128,6 @@ def judge(
     if not measured:
         notices.append("nothing is measured: the photographs show another light; --held-out names ones that show this")
     return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
-
-
-def _check_place(place: Path, overwrite: bool) -> None:
-    files.remove_leftovers(place.parent, (place.name,))
-    try:
-        if place.exists() and not place.is_dir():
-            raise InputError(f"--out {place}: a file, expected a folder")
-        found = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    except OSError as error:
-        raise InputError(f"--out {place}: {error.strerror or error}") from error
-    if found and (RECORD not in found or not found <= _OWN):
-        raise InputError(f"--out {place}: the folder holds other things; give a new one")
-    if found and not overwrite:
-        raise InputError(f"--out {place}: holds an earlier judgement; give --overwrite to replace it")
 
 
 def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
