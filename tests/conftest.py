@@ -38,6 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.fixturenames.insert(0, "mitsuba_variant")
 
 
+def pytest_collection_finish() -> None:
+    """What was collected stays to the end: `gc.collect` need not go through it after each file."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session")
 def mitsuba_variant() -> str:
     """The variant of this test session: the CPU's, so that numbers are the same everywhere, or `UNRENDER_VARIANT`."""
@@ -51,6 +57,7 @@ def mitsuba_variant() -> str:
     if workers > 1:
         # Each worker would start a thread per core, and they would wait for each other. With one thread Mitsuba's EXR writer hangs.
         dr.set_thread_count(max(2, dr.thread_count() // workers))
+    gc.freeze()  # Mitsuba's module, and no scene yet
     return name
 
 
