@@ -63,7 +63,8 @@ def test_run_by_methods_that_know_their_variance(unrender, problem: Path, mitsub
     assert unrender("report", "result").status == 0
 
 
-@pytest.mark.parametrize("settings", quick([[], ["--set", "optimizer=newton"]], []), ids=["newton-cg", "newton"])
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [[], ["--set", "optimizer=newton"]], ids=["newton-cg", "newton"])
 def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_variant: str, settings: list[str]):
     """`mug`: its handle is hidden at the start."""
     del problem

@@ -103,7 +103,7 @@ def agree(a: np.ndarray, b: np.ndarray, scale: float = 1.0) -> bool:
 # ---------------------------------------------------------------------------------------------------- images
 
 
-@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("name", without_media(BACKENDS))
 def test_shapes_are_those_that_the_renderer_tells(name: str) -> None:
     backend = BACKENDS[name]
     renderer = backend.renderer()
@@ -212,7 +212,7 @@ def check_adjoint(backend: Backend, renderer: Renderer) -> None:
     assert error < 0.005 + 3.5 * noise, (error, noise)
 
 
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", without_media(DIFFERENTIABLE))
 def test_the_adjoint_is_the_derivative_of_the_image(name: str) -> None:
     check_adjoint(BACKENDS[name], BACKENDS[name].renderer())
 

@@ -16,6 +16,7 @@ import scipy.sparse.linalg
 from resizable import KEY, FieldRenderer, upsampled
 
 import unrender as ur
+from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.filtered import FilteredGradientState
@@ -343,7 +344,7 @@ def uninterrupted(name: str, states: Any) -> ur.Result:
     return ur.optimize(problem(ur.CoarseToFine((3,), states=states)), *PAIRS[name], 6)
 
 
-@pytest.mark.parametrize("at", [2, 3, 4])
+@pytest.mark.parametrize("at", quick([2, 3, 4], 3))
 @pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:

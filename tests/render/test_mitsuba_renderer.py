@@ -148,6 +148,7 @@ def test_a_kernel_that_is_compiled_each_step_is_noticed() -> None:
     assert counts[1:] == [1, 1]
 
 
+@pytest.mark.slow
 def test_moving_geometry_runs_in_primary_space() -> None:
     key = "small-box.vertex_positions"
     renderer = MitsubaRenderer(box(), 3)

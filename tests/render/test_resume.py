@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.optimizers.adam import AdamState
@@ -187,7 +188,7 @@ CHANGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("name", quick(CHANGES, "a space in the scene", "the reference", "the method"))
 def test_what_changed_is_shown_and_can_be_forced(wall: Path, name: str) -> None:
     folder = wall.parent / "run"
     interrupted(ur.Problem.from_file(wall), folder)

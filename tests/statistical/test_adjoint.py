@@ -14,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from zoo import DEPTH, SIZE, SUBJECTS, scene, size, spp, subject, two_states
+from zoo import ALL, DEPTH, SIZE, scene, size, spp, subject, two_states
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -39,14 +39,13 @@ def derivative_on_the_same_paths(
 
 
 @pytest.mark.slow  # in the quick tier, test_adjoint_pair.py compares the same replay
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths(name: str) -> None:
-    description, changes = subject(name)
+def test_the_adjoint_is_the_derivative_of_the_image_on_its_paths() -> None:
+    description, changes = subject(ALL)
     renderer = MitsubaRenderer(description, DEPTH)
     current, _ = two_states(renderer, changes)
     session = renderer.prepare(list(current), "path")
-    request = SampleRequest(0, spp(name), 7)
-    weight = np.random.default_rng(2).uniform(0.5, 1.5, (size(name), size(name), 3))
+    request = SampleRequest(0, spp(ALL), 7)
+    weight = np.random.default_rng(2).uniform(0.5, 1.5, (size(ALL), size(ALL), 3))
     paths = session.image(current, request).paths
     gradient = session.adjoint(current, paths, renderer.array(weight[None]))
     for key in current:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_adjoint import STEP, total
-from zoo import DEPTH, LIGHTS, MATERIALS, ONE_SUBJECT, SIZE, SUBJECTS, scene, size, spp, subject, two_states
+from zoo import ALL, DEPTH, EACH, LIGHTS, MATERIALS, SIZE, scene, size, spp, subject, two_states
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -22,7 +22,7 @@ def close(a: Any, b: Any, rel: float) -> bool:
     return bool(np.abs(a - b).max() <= rel * np.abs(b).max())
 
 
-@pytest.mark.parametrize("name", ONE_SUBJECT)
+@pytest.mark.parametrize("name", EACH)
 def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shared_paths(name: str) -> None:
     description, changes = subject(name)
     renderer = MitsubaRenderer(description, DEPTH)
@@ -62,14 +62,13 @@ def test_equal_states_have_equal_gradients() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SUBJECTS)
-def test_in_primary_space_each_state_has_its_own_adjoint(name: str) -> None:
+def test_in_primary_space_each_state_has_its_own_adjoint() -> None:
     """That of the previous scene is what the current one gives at the same parameters and random numbers, to rounding."""
-    description, changes = subject(name)
+    description, changes = subject(ALL)
     renderer = MitsubaRenderer(description, DEPTH)
     current, previous = two_states(renderer, changes)
     session = renderer.prepare(list(current), "primary")
-    weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, size(name), size(name), 3)))
+    weight = renderer.array(np.random.default_rng(4).uniform(0.5, 1.5, (2, size(ALL), size(ALL), 3)))
     request = SampleRequest(0, 8, 5, groups=2)
     pair = session.image_pair(current, previous, request, "primary")
     _, found = session.adjoint_pair(current, previous, pair.paths, weight, weight)

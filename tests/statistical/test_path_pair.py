@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from zoo import DEPTH, LIGHTS, ONE_SUBJECT, everything, scene, subject, texture, tiles, two_states
+from zoo import DEPTH, LIGHTS, TOGETHER, everything, scene, subject, texture, tiles, two_states
 from zscores import agree
 
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -23,7 +23,7 @@ def runs(images: tuple[Any, ...]) -> np.ndarray:
     return np.stack([np.array(image) for image in images]).astype(np.float64)
 
 
-@pytest.mark.parametrize("name", ONE_SUBJECT)
+@pytest.mark.parametrize("name", TOGETHER)
 def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     description, changes = subject(name)
     renderer = MitsubaRenderer(description, DEPTH)
@@ -38,7 +38,7 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
             assert verdict, figures
 
 
-@pytest.mark.parametrize("name", ONE_SUBJECT)
+@pytest.mark.parametrize("name", TOGETHER)
 def test_the_kernel_agrees_with_mitsuba_path(name: str) -> None:
     renderer = MitsubaRenderer(subject(name)[0], DEPTH)
     session = renderer.prepare(["floor.bsdf.reflectance.data"], None)

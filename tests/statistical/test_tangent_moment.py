@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from zoo import DEPTH, ONE_SUBJECT, SIZE, scene, size, subject, tiles, two_states
+from zoo import DEPTH, SIZE, TOGETHER, scene, size, subject, tiles, two_states
 
 import unrender as ur
 from tiers import quick
@@ -20,7 +20,7 @@ from unrender.rendering.renderer import SampleRequest
 STEP = 4e-3
 
 
-@pytest.mark.parametrize("name", ONE_SUBJECT)
+@pytest.mark.parametrize("name", TOGETHER)
 def test_it_is_the_squared_derivative_of_each_path(name: str) -> None:
     """One sample per pixel, so that an image is its paths; all parameters grow together."""
     description, changes = subject(name)

@@ -148,11 +148,11 @@ ALL = "all materials"
 ROW = 4
 """Balls in a row of the scene that holds all materials."""
 
-# What a test over materials is run for: the scene of all of them, whose kernels are compiled once, and with more time each alone.
-SUBJECTS = quick([ALL, *MATERIALS], ALL)
-# For what compiles kernels of its own, half a minute of them for all materials together: one with textures and a rough
-# part in the quick tier, all of them together and each alone in the long one.
-ONE_SUBJECT = quick([ALL, *MATERIALS], "blend")
+# What a test over materials is run for. In the quick tier, one with textures and a rough part; in the long one either the scene of all
+# materials, whose kernels take half a minute to compile, where what is compared is compared for each of them (by its tile of the image,
+# or by its parameters), or each material alone.
+TOGETHER = quick([ALL, "blend"], "blend")
+EACH = quick(MATERIALS, "blend")
 
 
 def subject(name: str) -> tuple[dict[str, Any], dict[str, float]]:
