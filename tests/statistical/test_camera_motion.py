@@ -102,10 +102,10 @@ def test_a_camera_that_turns_and_a_planted_fault_of_three_per_cent() -> None:
         (glowing, "sensor.translation", 1, 0.01),
         (glowing, "sensor.x_fov", 1, 0.2),
         (glowing, "sensor.principal_point_offset_x", 1, 0.01),
-        (round_things, "sensor.translation", 2, 0.01),
-        (mirrored, "sensor.translation", 3, 0.01),
-        (glossy, "sensor.translation", 2, 0.01),
-        (lamplit, "sensor.translation", 4, 0.01),
+        (round_things, "sensor.translation.x", 2, 0.01),
+        (mirrored, "sensor.translation.x", 3, 0.01),
+        (glossy, "sensor.translation.x", 2, 0.01),
+        (lamplit, "sensor.translation.z", 4, 0.01),
     ],
 )
 def test_cameras_in_several_scenes(description: Any, key: str, depth: int, step: float) -> None:

@@ -360,9 +360,9 @@ def test_pytorch_and_drjit_are_not_mixed() -> None:
     ("name", "steps"),
     [
         ("control variate, two groups", 60),
-        slow("control variate, two groups", 2000),
-        slow("coupled", 2000),
-        slow("uniform pixels, control variate", 2000),
+        slow("control variate, two groups", 600),
+        slow("coupled", 600),
+        slow("uniform pixels, control variate", 600),
     ],
 )
 def test_a_loop_keeps_nothing_of_its_steps(name: str, steps: int) -> None:
