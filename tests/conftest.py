@@ -63,14 +63,11 @@ def mitsuba_variant() -> str:
 
 
 @pytest.fixture
-def one_thread(mitsuba_variant: str) -> Iterator[None]:
+def one_thread(mitsuba_variant: str, threads_as_before: None) -> None:
     """Threads add up gradients in whatever order they come (with three or more, seen often): bits repeat with one."""
     import drjit as dr
 
-    count = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(count)
+    dr.set_thread_count(1)  # `threads_as_before` sets it back
 
 
 @pytest.fixture(autouse=True)
@@ -99,6 +96,17 @@ def no_scene_outlives_its_file() -> Iterator[None]:
     more of them, tests of media take three times as long."""
     yield
     gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def threads_as_before() -> Iterator[None]:
+    """Commands and dealt runs set how many threads Dr.Jit has. With one, a later test that writes OpenEXR would wait for ever."""
+    before = sys.modules["drjit"].thread_count() if "drjit" in sys.modules else None
+    yield
+    if before is not None:
+        dr = sys.modules["drjit"]
+        if dr.thread_count() != before:
+            dr.set_thread_count(before)
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import documents
-import drjit as dr
 import matplotlib
 import pytest
 from documents import ROOT, Runner, blocks, previous_pages
@@ -118,9 +117,7 @@ def small_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None
     monkeypatch.setattr(ur, "optimize", optimize_briefly)
     monkeypatch.setattr(ur, "resume", resume_briefly)
     monkeypatch.setattr(ur.gallery, "problem", problem_of_noisy_references)
-    threads = dr.thread_count()
     yield
-    dr.set_thread_count(threads)
     import matplotlib.pyplot as plt
 
     plt.close("all")

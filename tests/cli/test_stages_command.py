@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
@@ -53,15 +52,6 @@ RUN = (
     "--final-spp",
     2,
 )
-
-
-@pytest.fixture(autouse=True)
-def threads_as_before(mitsuba_variant: str) -> Iterator[None]:
-    """The command sets the process's count, and Mitsuba writes OpenEXR with two at least."""
-    assert mitsuba_variant
-    count = dr.thread_count()
-    yield
-    dr.set_thread_count(count)
 
 
 @pytest.fixture
