@@ -275,6 +275,11 @@ def _huge(capture: Path) -> None:
     _photograph(capture).write_bytes(data)
 
 
+def _raw(capture: Path) -> None:
+    _photograph(capture).rename(capture / "images" / "view_2.nef")
+    _frame("file_path", "images/view_2.nef")(capture)
+
+
 def _frame(name: str, value: Any) -> Callable[[Path], None]:
     return lambda capture: edit(capture, lambda document: document["frames"][2].update({name: value}))
 
@@ -313,6 +318,11 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a focal length in words": (_top("fl_x", "50 mm"), "fl_x: expected a number, got '50 mm'"),
     "an unknown camera": (_top("camera_model", "EQUIRECTANGULAR"), "camera_model: expected OPENCV"),
     "a mask that is not there": (_frame("mask_path", "masks/no.png"), "masks/no.png: no such file"),
+    "a raw file": (_raw, "view_2.nef: camera raw files are not read; develop them to .exr"),
+    "a photograph twice": (_frame("file_path", "images/view_1.png"), "view_1.png: given twice, with different poses"),
+    "frames in a table": (_top("frames", {"0": {}}), "transforms.json: frames: expected a list of at least one frame"),
+    "a frame of words": (_top("frames", ["images/view_0.png"]), "transforms.json: frames[0]: expected a table with file_path"),
+    "a lens in words": (_top("k1", "barrel"), "k1: expected a number, got 'barrel'"),
 }
 
 

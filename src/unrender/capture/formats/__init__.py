@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from unrender.capture.capture import Capture
 from unrender.capture.formats import colmap, llff, transforms
 from unrender.core.errors import InputError
@@ -52,6 +54,7 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             capture = each.read(folder, masks)
             if not capture.photographs:
                 raise InputError(f"{folder}: none of its photographs is there")
+            _check_photographs(capture)
             _check_masks(capture)
             return capture
     if kind is not None:
@@ -59,6 +62,17 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
     if (folder / "lights.txt").is_file():
         raise InputError(f"{folder}: one camera under several lights (lights.txt) is not supported yet")
     raise InputError(f"{folder}: no camera poses: expected {'; '.join(each.files for each in FORMATS.values())}")
+
+
+def _check_photographs(capture: Capture) -> None:
+    """Raise `InputError` where a photograph was taken by two cameras."""
+    cameras: dict[Path, np.ndarray] = {}
+    for photograph in capture.photographs:
+        pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
+        if not np.array_equal(pose, photograph.camera_to_world):
+            raise InputError(
+                f"{printable(str(photograph.file))}: given twice, with different poses; expected one for each"
+            )
 
 
 def _check_masks(capture: Capture) -> None:
