@@ -71,7 +71,7 @@ def _check_photographs(capture: Capture) -> None:
         pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
         if not np.array_equal(pose, photograph.camera_to_world):
             raise InputError(
-                f"{printable(str(photograph.file))}: given twice, with different poses; expected one for each"
+                f"{capture.folder}: {printable(photograph.name)}: given twice, with different poses; expected one each"
             )
 
 
