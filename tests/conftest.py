@@ -67,6 +67,7 @@ def one_thread(mitsuba_variant: str, threads_as_before: None) -> None:
     """Threads add up gradients in whatever order they come (with three or more, seen often): bits repeat with one."""
     import drjit as dr
 
+    dr.sync_thread()
     dr.set_thread_count(1)  # `threads_as_before` sets it back
 
 
@@ -106,6 +107,7 @@ def threads_as_before() -> Iterator[None]:
     if before is not None:
         dr = sys.modules["drjit"]
         if dr.thread_count() != before:
+            dr.sync_thread()
             dr.set_thread_count(before)
 
 

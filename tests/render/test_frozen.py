@@ -94,3 +94,23 @@ def test_the_function_s_own_error_is_the_one_that_counts(warned: list[str]) -> N
 
     with pytest.raises(ValueError, match="of the function"):
         FrozenFunction(function)(nothing, mi.Float([1.0, 2.0]))
+
+
+def test_a_recording_of_one_thread_is_not_replayed_by_two(warned: list[str]) -> None:
+    """Sums have a place for each thread: a replay by more would write beyond them."""
+    calls: list[int] = []
+
+    def function(x: Any, index: Any) -> Any:
+        calls.append(1)
+        sums = dr.zeros(mi.Float, 4)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, x, index)
+        return sums
+
+    once = FrozenFunction(function)
+    x, index = dr.full(mi.Float, 1.0, 1 << 16), dr.arange(mi.UInt32, 1 << 16) % 4
+    dr.eval(x, index)
+    for threads, traced in ((1, 1), (1, 1), (2, 2), (2, 2), (1, 3)):
+        dr.set_thread_count(threads)
+        assert dr.allclose(once(nothing, x, index), 1 << 14)
+        assert len(calls) == traced
+    assert not warned

@@ -32,12 +32,17 @@ class FrozenFunction:
         self._tracing = _Tracing()
         self._frozen: Callable[..., Any] | None = _recorder(function, self._tracing) if recordable else None
         self._recorded = False
+        self._threads = dr.thread_count()
 
     def __call__(self, prepare: Callable[[], None], *arguments: Any) -> Any:
         """What the function returns. `prepare` is called before each attempt, to undo what a failed one has left."""
         prepare()
         if self._frozen is None:
             return self._function(*arguments)
+        if dr.thread_count() != self._threads:
+            # A recording keeps sums with a place for each thread: replayed by more, it would write beyond them.
+            self._threads, self._recorded = dr.thread_count(), False
+            self._frozen = _recorder(self._function, self._tracing)
         self._tracing.happened = False
         try:
             result = _without_garbage_collection(self._frozen, *arguments)
