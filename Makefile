@@ -1,4 +1,5 @@
 # make demo        recover a scene from images, this library against the usual loop, at equal time; a page with the result
+# make asset       from photographs, which it renders, to an asset: import, descent in stages, judgement, turntable, exports
 # make test        lint, types, and the quick tests: every feature, in a few minutes
 # make test-all    every test
 # make test-slow   the tests that `make test` leaves out
@@ -11,11 +12,11 @@
 #   PYTHON=python3.12   the interpreter, 3.10 to 3.14
 #   WORKERS=4           test processes; one for each core, at most 4, unless said otherwise
 #   DRJIT_CACHE_DIR=x   the folder that keeps compiled kernels, .pytest_cache/kernels; in an empty one a run takes twice the time
-#   SECONDS=30          of the demo, per method
+#   SECONDS=30          of the demo, per method; of the asset, of all stages together
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all test-slow test-unit lint docs clean
+.PHONY: help demo asset test test-all test-slow test-unit lint docs clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
@@ -46,6 +47,16 @@ help:
 demo: .venv/ready
 	$(BIN)/unrender compare indirect-room --seconds $(SECONDS) --out out/demo --overwrite $(TUNED)
 	@echo "the result, to open in a browser: file://$(CURDIR)/out/demo/compare.html"
+
+asset: .venv/ready
+	rm -rf out/asset
+	$(BIN)/python -c 'import unrender; unrender.gallery.photographs("out/asset/photographs")'
+	$(BIN)/unrender import out/asset/photographs --out out/asset/problem
+	$(BIN)/unrender run out/asset/problem/stages.toml --seconds $(SECONDS) --out out/asset/run
+	$(BIN)/unrender judge out/asset/run --out out/asset/judge
+	$(BIN)/unrender turntable out/asset/run --out out/asset/turntable.gif
+	$(BIN)/unrender export out/asset/run --format mitsuba,glb,obj,environment,blender --out out/asset/export
+	@echo "held-out photographs beside renders: file://$(CURDIR)/out/asset/judge/sheet.png; the asset: out/asset/export"
 
 test: .venv/ready
 	$(call WITH_LINT,-m "not slow")

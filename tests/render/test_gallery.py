@@ -775,3 +775,13 @@ def test_the_sun_of_the_vase_casts_the_light_that_its_direction_says():
     away.wi = mi.Vector3f((sunlit_vase._SUN * [1, -1, 1]).tolist())
     assert np.array(sky.eval(si)).min() > 100
     assert np.array(sky.eval(away)).max() < 1
+
+
+def test_photographs_are_written_where_nothing_is(tmp_path):
+    place = ur.gallery.photographs(tmp_path / "new" / "vase", views=3, size=8, spp=1)
+    assert sorted(path.name for path in place.rglob("*.*")) == ["00.png", "01.png", "02.png", "transforms.json"]
+    with pytest.raises(ur.InputError, match="holds other things"):
+        ur.gallery.photographs(tmp_path / "new")
+    with pytest.raises(ur.InputError, match="photographs: views must be"):
+        ur.gallery.photographs(tmp_path / "few", views=2)
+    assert not (tmp_path / "few").exists()
