@@ -261,7 +261,8 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
 
 
 def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    def connect(workers: Workers, name: str, most: int) -> Any:
+    def connect(workers: Workers, name: str, store_bytes: int, most: int) -> Any:
+        assert store_bytes == 256 << 20
         raise ur.InputError(str(share([(16, 0)], workers.count, gpu=False, most=most)))
 
     monkeypatch.setattr("unrender.dealing.deal.connect", connect)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import unrender as ur
@@ -24,6 +26,10 @@ class Other(Exception):
     """What it raises in other cases, none of which arise here."""
 
 
+class Full(Exception):
+    """What it raises where the object store has no room."""
+
+
 class Actor:
     """A worker; its methods are remote at once.
 
@@ -34,11 +40,14 @@ class Actor:
 
     def __init__(self, ray: Ray, number: int, ready: float | None):
         self.ray, self.number, self.ready = ray, number, ready
-        self.dead, self.dies_in = False, -1
+        self.dead, self.dies_in, self.pace = False, -1, 0.1
+        self.dropped: list[int] = []
 
     def __getattr__(self, name: str) -> Any:
         def remote(*arguments: Any) -> SimpleNamespace:
             share = arguments[0] if arguments else -1
+            if name == "drop":
+                self.dropped.append(share)
             return SimpleNamespace(actor=self, name=name, share=share)
 
         return SimpleNamespace(remote=remote)
@@ -52,9 +61,8 @@ class Ray:
     """
 
     def __init__(self, ready: Sequence[float | None]):
-        self.now, self.actors, self._ready = 0.0, list[Actor](), ready
+        self.now, self.actors, self._ready, self.full = 0.0, list[Actor](), ready, False
         names = (
-            "RayError",
             "ObjectLostError",
             "WorkerCrashedError",
             "NodeDiedError",
@@ -62,7 +70,7 @@ class Ray:
             "RayTaskError",
         )
         names = (*names, "TaskUnschedulableError", "ObjectFetchTimedOutError")
-        self.exceptions = SimpleNamespace(RayActorError=Died, **dict.fromkeys(names, Other))
+        self.exceptions = SimpleNamespace(RayActorError=Died, RayError=Full, **dict.fromkeys(names, Other))
 
     def remote(self, **_: Any) -> Callable[[type], Any]:
         def start(*_: Any) -> Actor:
@@ -87,9 +95,11 @@ class Ray:
             raise Died
         if reference.name == "place":
             return Place("here", actor.number, 0)
-        return Reply({}, {}, {}, {}, 0, {}, {}, 0.0) if reference.name == "run" else None
+        return Reply({}, {}, {}, {}, 0, {}, {}, actor.pace) if reference.name == "run" else None
 
     def put(self, value: Any) -> Any:
+        if self.full:
+            raise Full("no room\nand much more")
         return value
 
     def kill(self, actor: Actor) -> None:
@@ -133,6 +143,9 @@ def test_workers_that_do_not_start_are_waited_for_together_and_join_later() -> N
     found.move(3)
     assert len(found.run(dict.fromkeys(range(4), CALL))) == 4
     assert not ray.actors[1].dead
+    assert found.movable() == [2]
+    found.move(2)
+    assert [len(worker.shares) for worker in found._workers] == [2, 2]
     assert found.movable() == []
 
 
@@ -142,3 +155,72 @@ def test_no_worker_that_starts_is_one_line() -> None:
         hosts(ray, 3, [])
     assert ray.now == 60
     assert all(actor.dead for actor in ray.actors)
+
+
+def test_a_straggler_loses_its_views_and_another_worker_is_started_in_its_place() -> None:
+    ray = Ray([0.0, 0.0, 0.0, 5.0])
+    found = hosts(ray, 3, told := [])
+    calls = dict.fromkeys(range(3), CALL)
+    ray.actors[1].pace = 1.0
+    for _ in range(8):
+        assert found.movable() == []
+        found.run(calls)
+    assert found.movable() == [1]
+    found.move(1)
+    assert told == ["worker of views 1 on here: 1 s a step, far above the others: moved to here"]
+    assert found.emptied() == {1}
+    assert (ray.actors[1].dead, ray.actors[1].dropped) == (True, [])
+    assert len(found.run(calls)) == 3
+    assert found.movable() == []
+    ray.now = 5.0
+    assert found.movable() == [1]
+    found.move(1)
+    assert [len(worker.shares) for worker in found._workers] == [1, 1, 1]
+    assert ray.actors[0].dropped == [1]
+
+
+def test_stragglers_are_replaced_a_few_times_at_most() -> None:
+    ray = Ray([0.0])
+    found = hosts(ray, 2, [])
+    for _ in range(100):
+        for share in found.movable():
+            found.move(share)
+        for actor in ray.actors[1:]:
+            actor.pace = 1.0
+        found.run(dict.fromkeys(range(2), CALL))
+    assert len(ray.actors) == 5
+    assert [len(worker.shares) for worker in found._workers] == [2]
+
+
+def test_a_share_that_can_move_nowhere_stays() -> None:
+    ray = Ray([0.0, 0.0, None])
+    found = hosts(ray, 2, [])
+    calls = dict.fromkeys(range(2), CALL)
+    ray.actors[1].pace = 1.0
+    for _ in range(8):
+        found.run(calls)
+    assert found.movable() == [1]
+    ray.actors[0].dies_in = 0
+    assert sorted(found.run(calls)) == [1]
+    found.move(1)  # whose worker is the only one by now
+    assert not ray.actors[1].dead
+    assert len(found.run(calls)) == 2
+
+
+def test_a_share_whose_new_worker_dies_at_once_stays_with_the_old_one() -> None:
+    ray = Ray([0.0, 100.0, None])
+    found = hosts(ray, 3, [])
+    ray.now = 101.0
+    assert found.movable() == [2]
+    ray.actors[1].dead = True
+    found.move(2)
+    assert ray.actors[0].dropped == []
+    assert len(found.run(dict.fromkeys(range(3), CALL))) == 3
+
+
+def test_a_full_object_store_is_one_line() -> None:
+    ray = Ray([0.0])
+    found = hosts(ray, 2, [])
+    ray.full = True
+    with pytest.raises(ur.InputError, match=r"^workers: Full: no room$"):
+        found.run({share: dataclasses.replace(CALL, arrays={0: np.ones(3)}) for share in range(2)})

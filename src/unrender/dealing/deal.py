@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import shutil
 from collections.abc import Callable, Iterator
 
+from unrender.backend.variant import cores
 from unrender.cluster import Workers, connect
 from unrender.core.errors import InputError
 from unrender.dealing.assignment import deal as dealt_views
@@ -18,6 +20,9 @@ from unrender.problem.problem import Problem
 __all__ = ["deal"]
 
 _log = logging.getLogger("unrender")
+_LEAST_STORE = 256 << 20
+_GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5
+"""Gradients in a reply at most, bytes of a number, and what a store is larger than its contents by."""
 
 
 @contextlib.contextmanager
@@ -66,7 +71,7 @@ def deal(
     if parsed.count is not None and parsed.count > views:
         tell(f"workers: {views} for {views} views, in place of {parsed.count}")
         parsed = Workers(views, parsed.address)
-    with connect(parsed, variant, most=views) as cluster:
+    with connect(parsed, variant, store_bytes=_store_bytes(problem, parsed), most=views) as cluster:
         resolutions = problem.renderer.resolutions()
         pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
         shares = dealt_views(pixels, cluster.share.count)
@@ -76,3 +81,14 @@ def deal(
             yield problem.gathered_by(DealtViews(problem, shares, hosts, compress, cluster.variant))
         finally:
             hosts.close()
+
+
+def _store_bytes(problem: Problem, workers: Workers) -> int:
+    """Of a cluster that is started here: room for the replies of all workers at once, within half of what shared memory has left."""
+    numbers = sum(math.prod(shape) for shape in problem.shapes().values())
+    count = workers.count or min(len(problem.views), cores())
+    try:
+        free = shutil.disk_usage("/dev/shm").free // 2
+    except OSError:
+        return _LEAST_STORE
+    return max(_LEAST_STORE, min(int(_SLACK * _GRADIENTS * _DOUBLE * numbers * (count + 1)), free))

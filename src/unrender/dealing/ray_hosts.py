@@ -29,6 +29,8 @@ _COMPILING = 3
 """Steps of a share in a new place, until its kernels are compiled."""
 _LAGGING, _IN_A_ROW, _LEAST = 4.0, 5, 0.05
 """Times the others' median, steps in a row, and seconds, from which a worker counts as lagging."""
+_SUCCESSORS = 3
+"""Workers that are started in place of ones that lagged, at most: where a machine is slow, the next one there lags, too."""
 
 
 @dataclass(eq=False)
@@ -86,6 +88,7 @@ class RayHosts:
         self._threads = threads or cluster.share.threads
         self._lags = [_Lag() for _ in shares]
         self._emptied: set[int] = set()
+        self._successors = 0
         self._starting: list[_Worker] = []
         self._workers = [self._start() for _ in shares]
         self._of: list[_Worker] = []
@@ -123,7 +126,7 @@ class RayHosts:
         """See `Hosts.run`."""
         common = self._put({share: call.arrays for share, call in calls.items()})
         references = {
-            share: self._of[share].handle.run.remote(share, replace(call, arrays={}), common[share])
+            share: self._called(share, "run", share, replace(call, arrays={}), common[share])
             for share, call in calls.items()
         }
         replies: dict[int, Reply] = self._collected(references)
@@ -137,40 +140,52 @@ class RayHosts:
 
     def store(self, share: int, number: int, packed: Packed) -> bool:
         """See `Hosts.store`."""
-        return share in self._collected({share: self._of[share].handle.store.remote(share, number, packed)})
+        return share in self._collected({share: self._called(share, "store", share, number, packed)})
 
     def fetch(self, number: int) -> dict[int, Packed]:
         """See `Hosts.fetch`."""
-        return self._collected(
-            {share: worker.handle.fetch.remote(share, number) for share, worker in enumerate(self._of)}
-        )
+        return self._collected({share: self._called(share, "fetch", share, number) for share in range(self.count)})
 
     def movable(self) -> list[int]:
-        """See `Hosts.movable`."""
+        """See `Hosts.movable`: one share at most, of a worker that lags, else of one that has two more than another."""
         for worker in [worker for worker in self._starting if self._is_done(worker)]:
             self._starting.remove(worker)
             if worker.place is not None:
                 self._workers.append(worker)
-        idle = any(not worker.shares for worker in self._workers)
-        crowded = [share for share, worker in enumerate(self._of) if len(worker.shares) > 1] if idle else []
-        others = len(self._workers) > 1
-        return crowded[-1:] or [n for n, lag in enumerate(self._lags) if lag.behind >= _IN_A_ROW and others][:1]
+        if len(self._workers) < 2:
+            return []
+        behind = [share for share in range(self.count) if self._lags[share].behind >= _IN_A_ROW]
+        most, least = (of(len(worker.shares) for worker in self._workers) for of in (max, min))
+        crowded = [share for share, worker in enumerate(self._of) if len(worker.shares) == most]
+        return behind[:1] or (crowded[-1:] if most > least + 1 else [])
 
     def move(self, share: int) -> None:
-        """See `Hosts.move`."""
+        """See `Hosts.move`. Nothing where the share has moved meanwhile, or there is nowhere else."""
+        if share not in self.movable():
+            return
         old, lag = self._of[share], self._lags[share]
-        new = min((w for w in self._workers if w is not old), key=lambda worker: len(worker.shares))
-        if lag.behind >= _IN_A_ROW:
+        lagged = lag.behind >= _IN_A_ROW
+        new = min((w for w in self._workers if w is not old), key=lambda w: (self._is_behind(w), len(w.shares)))
+        if lagged:
             self._tell(
                 f"{self._named(share)}: {lag.seconds:.2g} s a step, far above the others: moved to {_where(new)}"
             )
         self._lags[share] = _Lag()
         old.shares.discard(share)
-        if self._hold(share, new) and not old.shares and lag.behind >= _IN_A_ROW:
-            self._workers.remove(old)
-            self._kill(old)
-        elif old in self._workers:
+        self._hold(share, new)
+        if self._of[share] is old or old not in self._workers:
+            return  # the new one was lost meanwhile, or the old one
+        if old.shares or not lagged:
             old.handle.drop.remote(share)
+            return
+        self._workers.remove(old)
+        self._kill(old)
+        if self._successors < _SUCCESSORS:
+            self._successors += 1
+            self._starting.append(self._start())
+
+    def _is_behind(self, worker: _Worker) -> bool:
+        return any(self._lags[share].behind >= _IN_A_ROW for share in worker.shares)
 
     # ------------------------------------------------------------------ replies, and what does not come
 
@@ -186,6 +201,10 @@ class RayHosts:
                 one = self._guarded(lambda one=one: self._ray.put(one))
             found |= dict.fromkeys(members, one)
         return found
+
+    def _called(self, share: int, name: str, *arguments: Any) -> Any:
+        """The reference to what a share's worker will answer. Large arguments go by way of the object store, too."""
+        return self._guarded(lambda: getattr(self._of[share].handle, name).remote(*arguments))
 
     def _guarded(self, action: Callable[[], Any]) -> Any:
         try:
@@ -321,7 +340,7 @@ class RayHosts:
         return share in self._collected({share: self._holding(share)})
 
     def _holding(self, share: int) -> Any:
-        return self._of[share].handle.hold.remote(share, self._views[share], self._blobs[share])
+        return self._called(share, "hold", share, self._views[share], self._blobs[share])
 
     def _kill(self, worker: _Worker) -> None:
         with contextlib.suppress(Exception):
