@@ -49,6 +49,8 @@ def processes_below(root: int) -> dict[int, str]:
 class Link:
     """Two network namespaces, "unrender-0" and "unrender-1", joined by a pair of interfaces. A context manager.
 
+    Without a delay the rate is kept by the kernel (`tc`, token bucket filter); with one, by a `DelayLine`, since kernels may lack `netem`.
+
     Args:
         megabits: that it lets through a second, each way; None for as many as come.
         milliseconds: there and back.
@@ -62,7 +64,7 @@ class Link:
         self._remove()
         for n in range(2):
             _call("ip", "netns", "add", self.name(n))
-        if self._megabits is None:
+        if self._megabits is None or not self._milliseconds:
             ends = [("netns", self.name(n)) for n in range(2)]
             _call("ip", "link", "add", self.name(0), *ends[0], "type", "veth", "peer", self.name(1), *ends[1])
         else:
@@ -73,6 +75,9 @@ class Link:
             self.call(n, "ip", "address", "add", f"{_NETWORK}.{n + 1}/24", "dev", self.name(n))
             for device in (self.name(n), "lo"):
                 self.call(n, "ip", "link", "set", device, "up")
+            if self._megabits is not None and self._line is None:
+                limit = ("rate", f"{self._megabits}mbit", "burst", "256kb", "latency", "400ms")
+                self.call(n, "tc", "qdisc", "add", "dev", self.name(n), "root", "tbf", *limit)
         return self
 
     def __exit__(

@@ -22,7 +22,7 @@ from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
     from unrender.cli.tasks import Job, RunTask
-    from unrender.cluster import Cluster, Workers
+    from unrender.cluster import Cluster, Ended, Workers
     from unrender.display.terminal import Console
     from unrender.methods import Method
     from unrender.problem.problem import Problem
@@ -223,7 +223,8 @@ def _here(console: Console, comparison: _Comparison, progress: Progress) -> list
 
 
 def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
-    """As many runs at a time as there are workers; a run that cannot be carried out is one line, and the others go on."""
+    """As many runs at a time as there are workers; a run that cannot be carried out is one line, and the others go on. After an
+    interrupt: those that were carried out by then, and what the others had reached, where they saved it within seconds."""
     from unrender.cli import tasks
     from unrender.cli.task_display import TaskDisplay
     from unrender.cluster import OnWorkers
@@ -234,22 +235,29 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
     folder = Path(job.folder)
     outcomes: list[RunOutcome] = []
     executor = OnWorkers(comparison.cluster, tasks.on_worker)
+
+    def take(ended: Ended) -> None:
+        name, seed = ended.key
+        outcome = RunOutcome(folder=name, seed=seed, status="failed", message=ended.message)
+        if not ended.message:
+            (outcome,), written = ended.value
+            tasks.receive(folder, written)
+        outcomes.append(outcome)
+        display.end(name, f"{name}: {outcome.message or f'{outcome.status}, {outcome.steps} steps'}")
+
     console.print(f"{len(waiting)} runs on {executor.slots} workers, {job.threads} threads each")
     with tasks.open_job(job), TaskDisplay(console, len(waiting), "runs") as display:
-        while waiting or executor.pending:
-            while waiting and executor.pending < executor.slots:
-                run = waiting.pop(0)
-                display.begin(run.name, run.method, (folder / run.name,))
-                executor.start((run.name, run.seed), job, [run])
-            for ended in executor.wait(_POLL_SECONDS):
-                name, seed = ended.key
-                outcome = RunOutcome(folder=name, seed=seed, status="failed", message=ended.message)
-                if not ended.message:
-                    (outcome,), written = ended.value
-                    tasks.receive(folder, written)
-                outcomes.append(outcome)
-                what = outcome.message or f"{outcome.status}, {outcome.steps} steps"
-                display.end(name, f"{name}: {what}")
+        try:
+            while waiting or executor.pending:
+                while waiting and executor.pending < executor.slots:
+                    run = waiting.pop(0)
+                    display.begin(run.name, run.method, (folder / run.name,))
+                    executor.start((run.name, run.seed), job, [run])
+                for ended in executor.wait(_POLL_SECONDS):
+                    take(ended)
+        except KeyboardInterrupt:  # what has been done is compared; `main` knows the status
+            for ended in executor.saved():
+                take(ended)
     for outcome in outcomes:
         if outcome.message:
             console.print(f"{outcome.folder}: failed: {outcome.message}", markup=False, soft_wrap=True, style="red")

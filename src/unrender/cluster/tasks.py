@@ -141,6 +141,16 @@ class OnWorkers:
             self._cancel()
             raise
 
+    def saved(self) -> list[Ended]:
+        """After an interrupt: the tasks that ended in good order, before it or because of it."""
+        ready = self._ray.wait(list(self._begun), num_returns=len(self._begun), timeout=0)[0] if self._begun else []
+        found = []
+        for reference in ready:
+            task = self._begun.pop(reference)
+            with contextlib.suppress(self._ray.exceptions.RayError):
+                found.append(Ended(task.key, self._ray.get(reference), "", task.attempts))
+        return found
+
     def _start(self, task: _Begun) -> None:
         self._begun[self._remote.remote(*task.arguments)] = task
 
