@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from unrender.cluster import Cluster, Ended, InProcess, OnWorkers, Share, Workers, connect, load_ray, share
+from unrender.cluster.head import HeadNode
 from unrender.core.errors import InputError
 
 
@@ -98,6 +99,28 @@ def test_the_package_imports_neither_ray_nor_optuna() -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_a_head_node_that_is_lost_is_one_line_and_one_that_comes_back_is_none() -> None:
+    now, up = [0.0], [True]
+
+    def reach(address: str, seconds: float) -> None:
+        assert (address, seconds) == ("head:1", 2.0)
+        if not up[0]:
+            raise OSError(111, "Connection refused")
+
+    def watch(answers: bool, until: float) -> None:
+        up[0] = answers
+        while now[0] < until:
+            now[0] += 1
+            head.check()
+
+    head = HeadNode("head:1", lambda: now[0], reach)
+    for answers, until in ((True, 30), (False, 44), (True, 60)):
+        watch(answers, until)
+    with pytest.raises(InputError, match=r"head node at head:1 is lost \(Connection refused\); start one"):
+        watch(False, 90)
+    assert 75 < now[0] < 80
+
+
 # ---------------------------------------------------------------------- tasks
 
 
@@ -134,6 +157,8 @@ class FakeRay:
         name = reference[1][0]
         if name == "bad":
             raise Raised
+        if self.cancelled and name != "fine":
+            raise Died("cancelled")
         if self.begun.count(name) <= self.deaths.get(name, 0):
             raise Died("The worker died unexpectedly. Look at its logs.")
         return f"{name} done"
@@ -153,6 +178,28 @@ def test_a_death_costs_its_task_alone_which_is_begun_again_twice() -> None:
     assert ended["doomed"].message == "its worker died 3 times: The worker died unexpectedly"
     assert ended["bad"] == Ended("bad", None, "no such file", 1)
     assert [ray.begun.count(name) for name in ("fine", "unlucky", "doomed", "bad")] == [1, 2, 3, 1]
+
+
+def test_after_an_interrupt_only_tasks_that_ended_in_good_order_are_told() -> None:
+    class Interrupted(FakeRay):
+        def wait(self, references: list, num_returns: int, timeout: float) -> tuple[list, list]:
+            if not self.cancelled and timeout:
+                raise KeyboardInterrupt
+            return super().wait(references, num_returns, timeout)
+
+        def cancel(self, reference: Any) -> None:
+            self.cancelled.append(reference)
+
+    ray = Interrupted({})
+    workers = OnWorkers(Cluster(ray, "llvm_ad_rgb", Share(4, 1.0, 0.0), None), str)
+    for name in ("fine", "late"):
+        workers.start(name, name)
+    with pytest.raises(KeyboardInterrupt):
+        workers.wait(0.5)
+    assert len(ray.cancelled) == 2
+    assert workers.saved() == [Ended("fine", "fine done")]
+    assert (workers.pending, workers.saved()) == (0, [])
+    assert ray.begun == ["fine", "late"]  # none is begun again
 
 
 def test_in_this_process_a_failure_is_a_line_and_an_interrupt_passes() -> None:

@@ -7,17 +7,17 @@ import logging
 import os
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from unrender.backend import variant
+from unrender.cluster.head import HeadNode, reach
 from unrender.cluster.workers import Share, Workers, share
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
@@ -31,6 +31,7 @@ _SETTINGS = {
     "RAY_enable_metrics_collection": "0",
     "RAY_DISABLE_IMPORT_WARNING": "1",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    "RAY_IGNORE_UNHANDLED_ERRORS": "1",
 }
 """No telemetry, no metrics, nothing on standard error that is not an error; the environment's own settings win."""
 _STORE_BYTES = 256 << 20
@@ -47,12 +48,14 @@ class Cluster:
         variant: that the workers compute with: what `prepare_worker` is to be given.
         share: how many workers there are to be, and what each may use.
         address: of the cluster; None for one that was started here.
+        head: its head node.
     """
 
     ray: Any
     variant: str
     share: Share
     address: str | None
+    head: HeadNode = field(default_factory=HeadNode)
 
     @property
     def resources(self) -> dict[str, float]:
@@ -153,6 +156,7 @@ def connect(
             variant.CUDA if gpu else variant.LLVM,
             share(machines, workers.count, gpu, most),
             workers.address or address,
+            HeadNode(ray.get_runtime_context().gcs_address),
         )
 
 
@@ -175,13 +179,13 @@ def _temporary_folder() -> Iterator[Path]:
 
 def _check_answers(address: str) -> None:
     """Raise `InputError` where nobody listens, which Ray takes two minutes to say."""
-    host, colon, port = address.rpartition(":")
+    _, colon, port = address.rpartition(":")
     if not colon or not port.isdigit():
         return  # RAY_ADDRESS may hold "auto"
     try:
-        socket.create_connection((host.strip("[]"), int(port)), _ANSWER_SECONDS).close()
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
+        reach(address, _ANSWER_SECONDS)
+    except OSError as error:
+        reason = error.strerror or str(error)
         raise InputError(f"workers: no Ray cluster answers at {address}: {reason}") from error
 
 

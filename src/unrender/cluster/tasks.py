@@ -113,7 +113,7 @@ class OnWorkers:
     """
 
     def __init__(self, cluster: Cluster, function: Callable[..., Any]):
-        self._ray = cluster.ray
+        self._ray, self._head = cluster.ray, cluster.head
         self._remote = cluster.ray.remote(function).options(
             **cluster.resources, max_retries=0, scheduling_strategy="SPREAD", name="unrender"
         )
@@ -130,7 +130,8 @@ class OnWorkers:
         self._start(_Begun(key, arguments, 1))
 
     def wait(self, seconds: float) -> list[Ended]:
-        """See `Executor.wait`."""
+        """See `Executor.wait`. Raises `InputError` where the cluster's head node is lost."""
+        self._head.check()
         try:
             ready = set(self._ray.wait(list(self._begun), num_returns=1, timeout=seconds)[0])
             if ready:  # all that have ended by now

@@ -219,6 +219,7 @@ class RayHosts:
         started = last = time.monotonic()
         lost: list[_Worker] = []
         while open_:
+            self._cluster.head.check()
             done, _ = self._ray.wait(list(open_.values()), num_returns=1, timeout=_POLL)
             for share in [share for share, reference in open_.items() if reference in done]:
                 last = time.monotonic()
