@@ -1,4 +1,4 @@
-"""Kills of workers, nodes and the driver of a dealt run, at random instants."""
+"""Kills of workers, nodes, the driver of a dealt run, and of the head node with the driver, at random instants."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.workers.machines import ADDRESS, Machines, processes_below
+from benchmarks.workers.machines import Machines, processes_below
 
 __all__ = ["KINDS", "METHODS", "campaign"]
 
@@ -23,7 +24,7 @@ METHODS: dict[str, list[str]] = {
     "rcv": ["--method", "rcv", "--set", "spp=2"],
     "coupled": ["--method", "coupled", "--set", "image=rcv"],
 }
-KINDS = ("worker", "node", "driver")
+KINDS = ("worker", "node", "driver", "head")
 _PROBLEM = ["two-planets", "-p", "resolution=16", "-p", "texture_resolution=16", "-p", "reference_spp=32"]
 _COMMON = ["--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1, "--checkpoint-every", 10]
 _LONGEST = 300.0
@@ -75,8 +76,8 @@ class _Watched:
 
 def campaign(
     machines: Machines, folder: Path, method: str, number: int, steps: int, dice: random.Random
-) -> dict[str, Any]:
-    """So many kills of a method's runs, of the three kinds in turn."""
+) -> Iterator[dict[str, Any]]:
+    """So many kills of a method's runs, of the kinds in turn; what has been found after each."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     whole = _begin(machines, folder / "whole", method, steps)
@@ -91,22 +92,18 @@ def campaign(
         with contextlib.suppress(OSError, ValueError):
             found = _parameters(place)
             row["right"] = all(np.array_equal(found[key], value) for key, value in expected.items())
-        rows.append({"right": False, **row})
-        print(method, rows[-1], flush=True)
+        print(method, row, flush=True)
         if row.get("right"):
             shutil.rmtree(place)
-    # A run that ended before its kill says nothing.
-    rows = [row for row in rows if row["killed_at"] is not None and row["killed_at"] < steps]
-    return {
-        "kills": len(rows),
-        "right": sum(row["right"] for row in rows),
-        "longest_wait": max((row["wait"] for row in rows), default=0.0),
-        "rows": rows,
-    }
+        if row["killed_at"] is None or row["killed_at"] >= steps:
+            continue  # a run that ended before its kill says nothing
+        rows.append({"right": False, **row})
+        waits = [row["wait"] for row in rows]
+        yield {"kills": len(rows), "right": sum(row["right"] for row in rows), "longest_wait": max(waits), "rows": rows}
 
 
 def _begin(machines: Machines, place: Path, method: str, steps: int) -> _Watched:
-    words = ["run", *_PROBLEM, *METHODS[method], "--steps", steps, *_COMMON, "--workers", f"2@{ADDRESS}"]
+    words = ["run", *_PROBLEM, *METHODS[method], "--steps", steps, *_COMMON, "--workers", f"2@{machines.address}"]
     log = place.with_suffix(".log")
     return _Watched(machines.begin("-m", "unrender", *words, "--out", place, log=log), place)
 
@@ -125,18 +122,20 @@ def _kill(machines: Machines, place: Path, method: str, steps: int, kind: str, d
         with contextlib.suppress(ProcessLookupError):
             os.kill(dice.choice(workers), signal.SIGKILL)
     elif kind == "node":
-        machines.kill(1)
+        machines.kill(1 - machines.head)
     else:
         run.end()
-        words = ["resume", place, "--workers", f"2@{ADDRESS}"]
+        if kind == "head":
+            machines.move_head()
+        words = ["resume", place, "--workers", f"2@{machines.address}"]
         run = _Watched(machines.begin("-m", "unrender", *words, log=place.with_suffix(".log")), place)
         run.until(killed_at + 1)
         run.restart_clock()  # a new process takes its time to start
     run.until(steps)
     wait = run.longest
     status = run.process.wait(600)
-    if not machines.is_up(1):
-        machines.start(1)
+    if not machines.is_up(1 - machines.head):
+        machines.start(1 - machines.head)
     return {"wait": wait, "status": status, "killed_at": killed_at}
 
 

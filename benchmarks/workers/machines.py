@@ -17,12 +17,11 @@ from types import TracebackType
 from benchmarks.runner.catalogue import ROOT
 from benchmarks.workers.delay_line import DelayLine
 
-__all__ = ["ADDRESS", "Link", "Machines", "processes_below"]
+__all__ = ["Link", "Machines", "processes_below"]
 
 _NETWORK = "10.77.77"
 _PORT = 6391
 _MTU = 9000
-ADDRESS = f"{_NETWORK}.1:{_PORT}"
 _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_enable_metrics_collection": "0",
@@ -116,10 +115,13 @@ class Machines:
 
     Args:
         link: between them.
+
+    Attributes:
+        head: which is the head node.
     """
 
     def __init__(self, link: Link):
-        self.link, self._token = link, secrets.token_hex(32)
+        self.link, self.head, self._token = link, 0, secrets.token_hex(32)
         self._nodes: dict[int, subprocess.Popen[bytes]] = {}
         self._folder = Path(tempfile.mkdtemp(prefix="unrender-rb-", dir="/tmp"))
 
@@ -139,12 +141,25 @@ class Machines:
             self.kill(n)
         shutil.rmtree(self._folder, ignore_errors=True)
 
+    @property
+    def address(self) -> str:
+        """Of the head node."""
+        return f"{_NETWORK}.{self.head + 1}:{_PORT}"
+
+    def move_head(self) -> None:
+        """Kill both nodes, and start both with the other as head: another address, and nothing of the earlier cluster is left."""
+        for n in list(self._nodes):
+            self.kill(n)
+        self.head = 1 - self.head
+        for n in (self.head, 1 - self.head):
+            self.start(n)
+
     def start(self, n: int) -> None:
-        """Start a node, and wait until it is there; the first is the head."""
+        """Start a node, and wait until it is there; the head has to be the first."""
         ray = Path(sys.executable).with_name("ray")
         own = ["--head", f"--port={_PORT}", "--include-dashboard=false", f"--temp-dir={self._folder}"]
         words = [
-            *(own if n == 0 else [f"--address={ADDRESS}"]),
+            *(own if n == self.head else [f"--address={self.address}"]),
             f"--node-ip-address={_NETWORK}.{n + 1}",
             "--num-cpus=1",
             "--num-gpus=0",
@@ -187,8 +202,8 @@ class Machines:
         return [pid for pid, words in nodes if words.startswith("ray::ViewWorker")]
 
     def begin(self, *words: object, log: Path) -> subprocess.Popen[bytes]:
-        """A command of Python on the first machine."""
-        command = self.link.words(0, sys.executable, *words)
+        """A command of Python on the head node."""
+        command = self.link.words(self.head, sys.executable, *words)
         with log.open("ab") as file:
             return subprocess.Popen(
                 command, stdout=file, stderr=file, env=self.environment, cwd=ROOT, start_new_session=True
@@ -198,12 +213,15 @@ class Machines:
         end, said = time.monotonic() + seconds, ""
         code = (
             "import ray, sys\n"
-            f"ray.init(address={ADDRESS!r}, logging_level='ERROR', log_to_driver=False)\n"
+            f"ray.init(address={self.address!r}, logging_level='ERROR', log_to_driver=False)\n"
             f"sys.exit(not any(x['Alive'] and x['NodeManagerAddress'] == '{_NETWORK}.{n + 1}' for x in ray.nodes()))"
         )
         while time.monotonic() < end:
             done = subprocess.run(
-                self.link.words(0, sys.executable, "-c", code), env=self.environment, capture_output=True, check=False
+                self.link.words(self.head, sys.executable, "-c", code),
+                env=self.environment,
+                capture_output=True,
+                check=False,
             )
             if done.returncode == 0:
                 return

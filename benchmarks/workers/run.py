@@ -9,8 +9,9 @@ Link: two nodes of Ray in two network namespaces, joined by a link of limited ra
 and received, and the share of the step's time that is not the slowest worker's own, with and without compression. Needs
 root.
 
-Kills: two such nodes without a limit. Workers (SIGKILL), a node with all that it runs, and the driver, which is then
-resumed, in turn, each at a random step of a run. Every run must end with the bits of the run without a kill. Needs root.
+Kills: two such nodes without a limit. Workers (SIGKILL), a node with all that it runs, the driver, which is then resumed,
+and the driver with the head node, which is then resumed at another address, in turn, each at a random step of a run. Every run
+must end with the bits of the run without a kill. Needs root.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import numpy as np
 from benchmarks.runner.catalogue import ROOT
 from benchmarks.runner.records import scratch
 from benchmarks.workers import kills
-from benchmarks.workers.machines import ADDRESS, Link, Machines
+from benchmarks.workers.machines import Link, Machines
 
 RENDERS = False
 MERGE = ("same", "efficiency", "link", "kills")
@@ -68,7 +69,7 @@ def run(
         megabits: a second, of the link
         milliseconds: of delay there and back
         method: whose runs are killed
-        number_of_kills: of each method, of workers, nodes and drivers in turn
+        number_of_kills: of each method, of workers, nodes, drivers and heads in turn
         kill_steps: of each of these runs
         seed: of the instants
     """
@@ -102,7 +103,7 @@ def run(
                 "threads": 1,
             }
             for compress in (False, True):
-                order = {**over, "workers": f"2@{ADDRESS}", "compress": compress}
+                order = {**over, "workers": f"2@{machines.address}", "compress": compress}
                 before = link.carried()
                 row = _measured(folder, order, machines)
                 row["carried"] = (link.carried() - before) / link_steps
@@ -114,8 +115,9 @@ def run(
         dice = random.Random(seed)
         with Link() as link, Machines(link) as machines:
             for name in method:
-                found["kills"][name] = kills.campaign(machines, folder / name, name, number_of_kills, kill_steps, dice)
-                yield found
+                for rows in kills.campaign(machines, folder / name, name, number_of_kills, kill_steps, dice):
+                    found["kills"][name] = rows
+                    yield found
 
 
 def _same(folder: Path, base: Mapping[str, Any], workers: tuple[int, ...]) -> dict[str, Any]:
@@ -143,7 +145,7 @@ def _measured(folder: Path, order: Mapping[str, Any], machines: Machines | None 
     words: list[object] = [sys.executable, "-m", "benchmarks.workers.driver", file]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "src")])}
     if machines is not None:
-        words, environment = list[object](machines.link.words(0, *words)), machines.environment
+        words, environment = list[object](machines.link.words(machines.head, *words)), machines.environment
     told = subprocess.run(
         [str(word) for word in words], check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=ROOT
     ).stdout

@@ -23,7 +23,7 @@ from typing import Any
 
 from benchmarks.runner.catalogue import ROOT
 from benchmarks.runner.records import Record, scratch
-from benchmarks.workers.machines import ADDRESS, Link, Machines
+from benchmarks.workers.machines import Link, Machines
 from benchmarks.workers.scale.summary import summary
 
 RENDERS = False
@@ -71,10 +71,11 @@ def run(
         yield found
     if "link" in part:
         for name, (megabits, milliseconds) in LINKS.items():
-            cases = [_case(side, f"{count}@{ADDRESS}", view_seconds) for count in link_workers for side in link_sides]
-            cases.append({**cases[-1], "compress": True})
-            cases.append(_case(link_sides[-2:][0], f"2@{ADDRESS}", None))
             with Link(megabits, milliseconds) as link, Machines(link) as machines:
+                at = f"@{machines.address}"
+                cases = [_case(side, f"{count}{at}", view_seconds) for count in link_workers for side in link_sides]
+                cases.append({**cases[-1], "compress": True})
+                cases.append(_case(link_sides[-2:][0], f"2{at}", None))
                 rows = _measured(order, cases, machines)
             limits = {"rate": None if megabits is None else megabits * 1e6 / 8, "trip": milliseconds / 1e3}
             found["cases"][name] = [{**row, **limits} for row in rows]
@@ -100,7 +101,7 @@ def _measured(
     words: list[object] = [sys.executable, "-m", "benchmarks.workers.scale.driver", file]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "src")])}
     if machines is not None:
-        words, environment = list[object](machines.link.words(0, *words)), machines.environment
+        words, environment = list[object](machines.link.words(machines.head, *words)), machines.environment
     process = subprocess.Popen(
         [str(word) for word in words], stdout=subprocess.PIPE, text=True, env=environment, cwd=ROOT
     )
