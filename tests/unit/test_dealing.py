@@ -61,10 +61,11 @@ class Losing(LocalHosts):
 
     def __init__(self, problem: ur.Problem, shares: Sequence[tuple[int, ...]], lose: Sequence[int]):
         super().__init__(shares_of(problem, shares))
-        self.problem, self.views, self.lose, self.calls = problem, shares, lose, 0
+        self.problem, self.views, self.lose, self.calls, self.pilots = problem, shares, lose, 0, 0
 
     def run(self, calls: Mapping[int, Call]) -> dict[int, Reply]:
         self.calls += 1
+        self.pilots += any(call.pilot is not None for call in calls.values())
         replies = super().run(calls)
         if self.calls in self.lose:
             last = max(calls)
@@ -151,13 +152,30 @@ def test_any_number_of_shares_descends_as_one_process(name: str) -> None:
         )
 
 
-@pytest.mark.parametrize("name", ["plain", "rcv", "coupled", "rcv of mini-batches", "filtered"])
+def test_importance_maps_come_from_the_workers() -> None:
+    problem = analytic.problem(ur.losses.L1(), views=VIEWS)
+    together = dealt(problem, 3)
+    descend(together, "adaptive")
+    hosts = together.gatherer._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert hosts.pilots == 1 + 3  # in the warm-up, and every five of twelve steps
+
+
+def test_auto_chooses_the_same_whoever_has_the_views() -> None:
+    given = analytic.problem(views=VIEWS)
+    positive = [ur.Parameter("colour", bounds=(0, float("inf"))), ur.Parameter("map")]
+    problem = ur.Problem(given.renderer, positive, given.given_views, ur.losses.L1())
+    alone, together = (ur.optimize(one, "auto", steps=6, progress=False) for one in (problem, dealt(problem, 2)))
+    assert "parameterisations={'colour': 'log'}" in alone.settings["optimizer"]
+    assert apart(alone, together) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["plain", "rcv", "coupled", "rcv of mini-batches", "filtered", "adaptive"])
 def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     whole, broken = dealt(problem, 2), dealt(problem, 2, lose=(5, 9, 10, 16))
     assert apart(descend(whole, name), descend(broken, name)) == 0
     assert broken.gatherer.traffic.lost == 4  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-    assert (broken.gatherer.traffic.repeated > 0) == (name != "plain")  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert (broken.gatherer.traffic.repeated > 0) == (name not in ("plain", "adaptive"))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize("name", ["plain", "rcv", "rcv of mini-batches"])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.dealing import capacity
@@ -17,7 +18,7 @@ from unrender.dealing.assignment import total
 from unrender.dealing.batches import split
 from unrender.dealing.hosts import Hosts
 from unrender.dealing.memories import Memories, Memory, Recipe
-from unrender.dealing.messages import Call, ImageState, Pair, Reply, payload_bytes
+from unrender.dealing.messages import Call, ImageState, Pair, Pilot, Reply, payload_bytes
 from unrender.dealing.outbox import Outbox, Sent
 from unrender.estimators.filtered import FilteredGradient
 from unrender.estimators.meta import MetaEstimator
@@ -30,6 +31,7 @@ from unrender.images.recursive_control_variate import (
     RecursiveControlVariateState,
     Snapshot,
 )
+from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.problem.problem import Problem
 from unrender.runs.folder.state import pack, unpack
 
@@ -47,7 +49,7 @@ class Traffic:
 
     Attributes:
         sent, received: bytes of arrays, of all shares together.
-        seconds: from the first call to the last reply.
+        seconds: from the first call to the last reply, of a gradient and of a pilot before it.
         busy: seconds that the slowest share computed.
         lost: shares lost so far.
         repeated: steps repeated for them so far.
@@ -90,6 +92,7 @@ class DealtViews:
         self._present: list[set[int]] = [set() for _ in shares]
         self._recent: list[set[int]] = [set() for _ in shares]
         self._calls = 0
+        self._in_step = False
         self.traffic = Traffic()
 
     # ------------------------------------------------------------------ Gatherer
@@ -112,8 +115,7 @@ class DealtViews:
 
     def gather(self, request: GatherRequest) -> GradientSample:
         """See `Gatherer.gather`."""
-        self.traffic.sent = self.traffic.received = 0
-        self.traffic.seconds = self.traffic.busy = 0.0
+        self._restart_traffic()
         memory = self._memory(request.state)
         sample = None if request.batch is None else request.batch.sample
         call, sent = self._call(request, memory)
@@ -124,12 +126,39 @@ class DealtViews:
         calls = {index: replace(call, batch=part) for index, part in enumerate(parts) if sample is None or part}
         if isinstance(kept, Memory) and kept.recipe.call is not None:
             kept.recipe.call = replace(call, replay=True, pictures=False)
-        started = time.perf_counter()
         replies = self._replies(calls, sent, memory)
-        self.traffic.seconds = time.perf_counter() - started
+        self._in_step = False
         if isinstance(kept, Memory):
             self._bound(kept)
         return self._sample(request, [replies[index] for index in sorted(replies)], kept)
+
+    def pilot(self, request: PilotRequest) -> list[np.ndarray]:
+        """See `Gatherer.pilot`."""
+        self._restart_traffic()
+        known, tangents = self._outbox.numbered(request.parameters), self._outbox.once(request.tangents)
+        sent = {one.number: one for tree in (known, tangents) for one in tree.values()}
+        numbers = self._outbox.values(tangents)
+        references = [arrays.numpy(reference) for reference in request.references]
+        call = Call(self._outbox.values(known), Plain(), None, 1, request.key)
+        parts = split(self._problem, request.sample, self._shares)
+        used = {share: part.positions[part.weights > 0] for share, part in enumerate(parts) if part is not None}
+        calls = {
+            share: replace(call, batch=part, pilot=Pilot(tuple(own[part.positions] for own in references), numbers))
+            for share, part in enumerate(parts)
+            if part is not None
+        }
+        replies = self._replies(calls, sent, None)
+        found = [np.empty((sum(map(len, used.values())), *x.shape[1:]), x.dtype) for x in replies[min(replies)].paths]
+        for share, positions in used.items():
+            for whole, part in zip(found, replies[share].paths, strict=True):
+                whole[positions] = part[: len(positions)]
+        return found
+
+    def _restart_traffic(self) -> None:
+        """Unless a step has begun, count anew."""
+        if not self._in_step:
+            self.traffic = Traffic(lost=self.traffic.lost, repeated=self.traffic.repeated)
+        self._in_step = True
 
     def prepared(self, state: Any) -> Any:
         """See `Gatherer.prepared`."""
@@ -224,6 +253,7 @@ class DealtViews:
     def _replies(self, calls: Mapping[int, Call], sent: Mapping[int, Sent], memory: Memory | None) -> dict[int, Reply]:
         """All replies. A share that is lost is given what it remembered, by repeating its steps, and called again."""
         found: dict[int, Reply] = {}
+        started, busy = time.perf_counter(), 0.0
         for share in self._hosts.movable():
             if memory is not None:
                 self._collect(memory.recipe)
@@ -236,12 +266,14 @@ class DealtViews:
             self.traffic.sent += sum(payload_bytes(call) for call in addressed.values())
             replies = self._hosts.run(addressed)
             self.traffic.received += sum(payload_bytes(reply) for reply in replies.values())
-            self.traffic.busy = max([self.traffic.busy, *(reply.seconds for reply in replies.values())])
+            busy = max([busy, *(reply.seconds for reply in replies.values())])
             found |= replies
             lost = (set(open_) - set(replies)) | self._hosts.emptied()
             self._forget(lost)
             self.traffic.lost += len(lost)
             if len(found) == len(calls):
+                self.traffic.busy += busy
+                self.traffic.seconds += time.perf_counter() - started
                 return found
         views = ", ".join(str(view) for share in sorted(set(calls) - set(found)) for view in self._shares[share])
         raise InputError(f"workers: those of views {views} were lost {_MOST_LOSSES} times in one step")

@@ -10,7 +10,7 @@ import numpy as np
 from unrender.core.random import Key
 from unrender.rendering.renderer import Space
 
-__all__ = ["Batch", "Call", "Difference", "ImageState", "Pair", "Reply", "payload_bytes"]
+__all__ = ["Batch", "Call", "Difference", "ImageState", "Pair", "Pilot", "Reply", "payload_bytes"]
 
 References = dict[str, int]
 """{parameter: number of the array that it is}."""
@@ -79,6 +79,19 @@ class Batch:
 
 
 @dataclass(frozen=True)
+class Pilot:
+    """A `PilotRequest` beside what a `Call` has.
+
+    Attributes:
+        references: (N, 3) each, of the call's pixels.
+        tangents: by number; {} for none.
+    """
+
+    references: tuple[np.ndarray, ...]
+    tangents: References
+
+
+@dataclass(frozen=True)
 class Call:
     """One gradient of a share of the views: a `GatherRequest` in numbers.
 
@@ -94,6 +107,7 @@ class Call:
         single: whether gradients are to be in single precision; else they are in double.
         spp, adjoint_spp, key, pair, tolerance, fresh: of the request.
         batch: the pixels; None for whole views.
+        pilot: whether no gradient is wanted, but what paths through these pixels find.
     """
 
     parameters: References
@@ -104,6 +118,7 @@ class Call:
     adjoint_spp: int | None = None
     pair: Pair | None = None
     batch: Batch | None = None
+    pilot: Pilot | None = None
     tolerance: float = 0.0
     fresh: bool = False
     result: int | None = None
@@ -126,6 +141,7 @@ class Reply:
         images: {view: (H, W, 3)} where they were wanted.
         info: {name: {view: array}} likewise.
         seconds: that it took.
+        paths: what a pilot found of each of the call's pixels.
     """
 
     gradient: dict[str, np.ndarray]
@@ -136,16 +152,19 @@ class Reply:
     images: dict[int, np.ndarray]
     info: dict[str, dict[int, np.ndarray]]
     seconds: float
+    paths: tuple[np.ndarray, ...] = ()
 
 
 def payload_bytes(message: Any) -> int:
     """Bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Difference, Batch)):
+    if isinstance(message, (Difference, Batch, Pilot)):
         return sum(payload_bytes(value) for value in vars(message).values())
     if isinstance(message, (Call, Reply)):
         return sum(payload_bytes(value) for value in vars(message).values())
     if isinstance(message, dict):
         return sum(payload_bytes(value) for value in message.values())
+    if isinstance(message, tuple):
+        return sum(payload_bytes(value) for value in message)
     return 0

@@ -61,6 +61,10 @@ class Outbox:
         """The tree as workers are to have it."""
         return {key: self._sent(key, value) for key, value in tree.items()}
 
+    def once(self, tree: Tree) -> dict[str, Sent]:
+        """A tree that is sent for one call alone, whole."""
+        return {key: Sent(self._next(), arrays.numpy(value)) for key, value in tree.items()}
+
     def values(self, tree: Mapping[str, Sent]) -> References:
         """The tree by number."""
         return {key: sent.number for key, sent in tree.items()}

@@ -11,10 +11,11 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.trees import Tree
 from unrender.dealing.assignment import total
-from unrender.dealing.messages import Batch, Call, Difference, References, Reply
+from unrender.dealing.messages import Batch, Call, Difference, Pilot, References, Reply
 from unrender.estimators.sample_groups import GatherRequest, gather_frame, leave_one_out_groups
 from unrender.images.base import PairRequest
 from unrender.images.recursive_control_variate import RecursiveControlVariateState
+from unrender.pixels.pixel_statistics import PilotRequest, pilot
 from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView
 from unrender.problem.problem import Problem
 from unrender.runs.folder.state import Packed, pack, unpack
@@ -43,6 +44,8 @@ class ViewShare:
         """The gradient of the share's views, and what is remembered after it."""
         started = time.perf_counter()
         self._receive(call)
+        if call.pilot is not None:
+            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, self._pilot(call, call.pilot))
         request = self._request(call)
         if call.replay:
             self._remember(call, self._replayed(call, request))
@@ -136,6 +139,13 @@ class ViewShare:
 
         sample = PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
         return PixelBatch(self.problem, sample)
+
+    def _pilot(self, call: Call, asked: Pilot) -> tuple[np.ndarray, ...]:
+        assert call.batch is not None
+        references = tuple(self.problem.renderer.array(reference) for reference in asked.references)
+        sample, tangents = self._batch(call.batch).sample, self._tree(asked.tangents)
+        request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
+        return tuple(pilot(self.problem, request))
 
     def _replayed(self, call: Call, request: GatherRequest) -> tuple[Any, ...]:
         """What a step of whole views leaves, without its gradient."""

@@ -14,10 +14,18 @@ from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels.tiles import InverseCdfTable, Tiles
-from unrender.problem.batches import PixelBatch
+from unrender.problem.batches import PixelBatch, PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["PixelStatistics", "estimate_statistics", "random_signs", "reference_means", "scales"]
+__all__ = [
+    "PilotRequest",
+    "PixelStatistics",
+    "estimate_statistics",
+    "pilot",
+    "random_signs",
+    "reference_means",
+    "scales",
+]
 
 ROUNDS = 16
 """Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
@@ -42,6 +50,25 @@ class PixelStatistics:
     squares: tuple[np.ndarray, ...]
     second_moment: np.ndarray
     samples: int
+
+
+@dataclass(frozen=True)
+class PilotRequest:
+    """What `pilot` is asked for.
+
+    Attributes:
+        parameters: what to render.
+        sample: the pixels, weights of 1.
+        key: of the random numbers.
+        references: (N, 3) each: what the paths are compared with beside their pixels' own references.
+        tangents: of the parameters; {} for none.
+    """
+
+    parameters: Tree
+    sample: PixelSample
+    key: Key
+    references: tuple[Array, ...]
+    tangents: Tree
 
 
 def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
@@ -109,21 +136,39 @@ def _round(
     references: list[Array],
     scales: Tree,
 ) -> list[np.ndarray]:
-    """Per path (tiles * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents."""
-    batch = PixelBatch(problem, uniform_table.draw_per_tile(spp, key.fold(0)))
-    session = problem.renderer.prepare(list(parameters), None)
-    rendering = session.image(parameters, batch.request(1, key.fold(1).uint32()))
-    image = rendering.images[0]
-    _, factor = batch.targets
-    found = [batch.loss_derivative(image)]
-    for reference in references:
-        own = arrays.gather_rows(reference, arrays.arange(image, batch.pixels) // spp)
-        found.append(problem.loss.derivative(image, own) * factor)
+    """Per path (tiles * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents.
+
+    Where the problem's views are dealt to workers, they trace the paths.
+    """
+    sample = uniform_table.draw_per_tile(spp, key.fold(0))
+    count = arrays.shape(sample.weights)[0]
+    tile = arrays.arange(sample.weights, count) // spp
+    own = tuple(arrays.gather_rows(reference, tile) for reference in references)
+    tangents: Tree = {}
     if scales:
         signs = random_signs(parameters, key.fold(2))
         scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
         tangents = problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
-        found.append(session.tangent_moment(parameters, rendering.paths, tangents))
+    request = PilotRequest(parameters, sample, key.fold(1), own, tangents)
+    return pilot(problem, request) if problem.gatherer is None else problem.gatherer.pilot(request)
+
+
+def pilot(problem: Problem, request: PilotRequest) -> list[np.ndarray]:
+    """Trace one path through each pixel of a sample.
+
+    Returns:
+        (N, 3) each: the loss derivative at the pixels' own references, at each of the request's, and, with tangents, the squared derivative
+        along them.
+    """
+    batch = PixelBatch(problem, request.sample)
+    session = problem.renderer.prepare(list(request.parameters), None)
+    rendering = session.image(request.parameters, batch.request(1, request.key.uint32()))
+    image = rendering.images[0]
+    _, factor = batch.targets
+    found = [batch.loss_derivative(image)]
+    found += [problem.loss.derivative(image, reference) * factor for reference in request.references]
+    if request.tangents:
+        found.append(session.tangent_moment(request.parameters, rendering.paths, request.tangents))
     arrays.evaluate(found)
     return [arrays.numpy(x) for x in found]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import numpy as np
+
 __all__ = ["Gatherer"]
 
 
@@ -22,6 +24,10 @@ class Gatherer(Protocol):
     def gather(self, request: Any) -> Any:
         """What `estimators.sample_groups.gather` returns, of a `GatherRequest`. The image estimator's next state in it is a stand-in for
         what the workers keep."""
+        ...
+
+    def pilot(self, request: Any) -> list[np.ndarray]:
+        """What `pixels.pixel_statistics.pilot` returns, of a `PilotRequest`."""
         ...
 
     def prepared(self, state: Any) -> Any:
