@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from benchmarks.workers.scale.stand_in import stand_ins
 from tests.contract import analytic
 from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
 from unrender.backend import variant
+from unrender.cluster import Workers, connect
 from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.messages import Call
 from unrender.dealing.outbox import Outbox
 from unrender.dealing.ray_hosts import RayHosts
 
@@ -98,3 +101,23 @@ def test_two_workers_descend_as_one_process_and_a_kill_changes_nothing() -> None
     for key, value in alone.items():
         assert np.array_equal(whole[key], broken[key])
         assert np.abs(whole[key] - value).max() < 1e-5 * np.abs(value).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("disk", [True, False])
+def test_a_full_object_store_costs_time_and_a_full_disk_is_one_line(
+    disk: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray")
+    if not disk:
+        monkeypatch.setenv("RAY_local_fs_capacity_threshold", "0.0")  # Ray's: as if nothing were left of it
+    values = np.ones(6_000_000, np.float32)
+    with connect(Workers(2), variant.LLVM, store_bytes=80 << 20) as cluster, stand_ins(0.0):
+        hosts = RayHosts(cluster, ((0,), (1,)), (b"", b""), 1)
+        call = Call({"x": 0}, ur.images.Plain(), None, 1, ur.Key(0), arrays={0: values})  # two replies of 48 MB
+        if not disk:
+            with pytest.raises(ur.InputError, match=r"worker of views \d on .*: OutOfDiskError: Local disk is full$"):
+                hosts.run({0: call, 1: call})
+            return
+        replies = hosts.run({0: call, 1: call})
+        assert [float(replies[share].gradient["x"].sum()) for share in range(2)] == [6e6, 12e6]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -298,3 +299,23 @@ def test_what_does_not_fit_a_worker_is_refused_with_what_would() -> None:
         capacity.check(problem, shares, [("a", room), ("b", room - 1)], remembers=True)
     with pytest.raises(ur.InputError, match=r"parameter map \(2 × 2 × 1\) is .*, but a has .*would fit"):
         capacity.check(problem, shares, [("a", 100), ("b", 100)], remembers=False)
+
+
+def test_a_grid_that_fits_no_worker_is_refused_with_the_grid_that_would() -> None:
+    def problem(*shape: int) -> Any:
+        return SimpleNamespace(
+            shapes=lambda: {"smoke.sigma_t.data": shape, "smoke.albedo.data": (2, 2, 2, 3)},
+            renderer=SimpleNamespace(resolutions=lambda: [(64, 64)]),
+            views=[ur.View(np.zeros((64, 64, 3)))] * 2,
+        )
+
+    room = [("a", 10**9), ("b", 10**9)]
+    with pytest.raises(ur.InputError) as refused:
+        capacity.check(problem(512, 512, 512, 1), ((0,), (1,)), room, remembers=False)
+    assert "parameter smoke.sigma_t.data (512 × 512 × 512 × 1) is 4.29 GB in each worker" in str(refused.value)
+    told = re.search(r"but a has 1 GB for it: \((\d+) × (\d+) × (\d+) × 1\) would fit$", str(refused.value))
+    assert told is not None
+    largest = [int(n) for n in told.groups()]
+    capacity.check(problem(*largest, 1), ((0,), (1,)), room, remembers=False)
+    with pytest.raises(ur.InputError, match="would fit"):
+        capacity.check(problem(*(n + 1 for n in largest), 1), ((0,), (1,)), room, remembers=False)
