@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from unrender import (
         smoothing as smoothed,
     )
+    from unrender.cli.sweep_function import sweep
     from unrender.core.random import Key
     from unrender.core.registry import register
     from unrender.dealing.deal import deal
@@ -111,6 +112,7 @@ _HOMES = {
     "render_pair": "problem.render",
     "resume": "runs.reopen",
     "sensitivity": "runs.sensitivity",
+    "sweep": "cli.sweep_function",
     "turntable": "judging.turntable",
     "write_grid": "io.volumes",
 }
@@ -165,6 +167,7 @@ __all__ = [
     "sensitivity",
     "smoothed",
     "statistics",
+    "sweep",
     "turntable",
     "use",
     "write_grid",

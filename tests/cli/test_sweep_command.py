@@ -14,7 +14,9 @@ from typing import Any
 
 import pytest
 
+import unrender as ur
 from unrender.cli import tasks
+from unrender.sweeps.record import write_sweep
 
 TOY = ["quad", "--method", "plain", "--steps", 20, "--final-spp", 1]
 GRID = [*TOY, "--over", "learning_rate=0.03,0.3"]
@@ -102,6 +104,26 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
     assert sweep_json()["best"] == 1
     assert unrender("sweep", "s").status == 0  # tried once more
     assert [trial["status"] for trial in sweep_json()["trials"]] == ["finished", "finished"]
+
+
+def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.MonkeyPatch) -> None:
+    plans, over = [], {"learning_rate": "0.01:0.1:log", "spp": [1, 4]}
+
+    def go_on(console: Any, session: Any, record: Any, search: Any) -> None:
+        plans.append((record.plan, session.workers, session.threads, search.trials))
+        write_sweep(session.folder, record)
+
+    for home in ("sweep_function", "sweep_driver"):
+        monkeypatch.setattr(f"unrender.cli.{home}.go_on", go_on)
+    found = ur.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
+    words = ["--method", "plain", "--over", "learning_rate=0.01:0.1:log", "--over", "spp=1,4", "--steps", 3]
+    assert unrender("sweep", "quad", *words, "--trials", 5, "-s", "beta_2=0.9", "--threads", 1).status == 0
+    assert plans[0] == plans[1]
+    assert found.plan == plans[0][0]
+    with pytest.raises(ur.InputError, match="nothing to vary"):
+        ur.sweep("quad", "plain")
+    with pytest.raises(ur.InputError, match="holds earlier results"):
+        ur.sweep("quad", "plain", over, out="python")
 
 
 def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant: str) -> None:

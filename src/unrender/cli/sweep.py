@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from unrender.sweeps.record import SweepPlan, SweepRecord
     from unrender.sweeps.search import Search
 
-__all__ = ["sweep"]
+__all__ = ["MARK", "plan_of", "search_of", "sweep"]
 
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
-_MARK = "sweep.json"
+MARK = "sweep.json"
 _FREE = ("what", "workers", "trials", "threads")
 """What may be given anew for a sweep that goes on."""
 
@@ -97,7 +97,7 @@ def sweep(
     if _is_sweep(what):
         _check_alone(context, what)
         record = _extended(read_sweep(Path(what)), trials)
-        go_on(console, Session(Path(what), where, threads), record, _search(record.plan)[1])
+        go_on(console, Session(Path(what), where, threads), record, search_of(record.plan)[1])
         return
     names = {"trials": trials, "prune": prune, "window": window, "seeds": seeds, "seed": seed, "steps": steps}
     names |= {"seconds": seconds, "final_spp": final_spp, "variant": variant, "cached": not no_cache}
@@ -105,8 +105,8 @@ def sweep(
     names |= {"settings": arguments.settings(settings, "--set")}
     names |= {"problem_settings": arguments.settings(problem_settings, "--problem-set")}
     with phases.phase("loading"):
-        plan, found = _search(_plan(names))
-    folder = arguments.folder(out, f"{arguments.short_name(what)}-sweep", overwrite, _MARK)
+        plan, found = search_of(plan_of(names))
+    folder = arguments.folder(out, f"{arguments.short_name(what)}-sweep", overwrite, MARK)
     try:
         record = SweepRecord(command=shlex.join(context.find_root().obj or ["unrender"]), plan=plan)
         go_on(console, Session(folder, where, threads, fresh=True), record, found)
@@ -118,10 +118,10 @@ def _is_sweep(what: str) -> bool:
     """Whether a folder is meant, and no problem of the gallery that has its name."""
     from unrender import gallery
 
-    return Path(what).is_dir() and (Path(what, _MARK).exists() or what not in gallery.names())
+    return Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names())
 
 
-def _plan(names: dict[str, Any]) -> SweepPlan:
+def plan_of(names: dict[str, Any]) -> SweepPlan:
     """The plan of what was typed. Raises `InputError`."""
     from unrender.runs.folder import schema
     from unrender.sweeps.record import SweepPlan
@@ -161,7 +161,7 @@ def _kind(search: str | None, axes: Any) -> Any:
     return search
 
 
-def _search(plan: SweepPlan) -> tuple[SweepPlan, Search]:
+def search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
     """The search of a plan, and the plan with its number of trials. Raises `InputError`."""
     from unrender.sweeps.search import Grid, Random
 
