@@ -8,6 +8,7 @@ import random
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 
 from benchmarks.workers.machines import Machines, processes_below
 
-__all__ = ["KINDS", "METHODS", "campaign"]
+__all__ = ["KINDS", "METHODS", "campaign", "straggler"]
 
 METHODS: dict[str, list[str]] = {
     "plain": ["--method", "plain", "--set", "spp=2"],
@@ -100,6 +101,41 @@ def campaign(
         rows.append({"right": False, **row})
         waits = [row["wait"] for row in rows]
         yield {"kills": len(rows), "right": sum(row["right"] for row in rows), "longest_wait": max(waits), "rows": rows}
+
+
+def straggler(machines: Machines, folder: Path, method: str, steps: int, dice: random.Random) -> dict[str, Any]:
+    """A run one of whose workers has a tenth of its speed from a random step on: it is stopped for nine tenths of the time.
+
+    Needs the undisturbed run of `campaign`.
+    """
+    expected, place = _parameters(folder / "whole"), folder / "slow"
+    shutil.rmtree(place, ignore_errors=True)
+    run = _begin(machines, place, method, steps)
+    step = dice.randrange(5, steps // 2)
+    if not run.until(step):
+        raise RuntimeError(f"{method}: ended at once, with status {run.process.returncode}")
+    run.restart_clock()
+    slow, ended = dice.choice(machines.workers()), threading.Event()
+
+    def slow_down() -> None:
+        with contextlib.suppress(ProcessLookupError):
+            while not ended.is_set():
+                for number, seconds in ((signal.SIGSTOP, 0.09), (signal.SIGCONT, 0.01)):
+                    os.kill(slow, number)
+                    time.sleep(seconds)
+
+    thread = threading.Thread(target=slow_down)
+    thread.start()
+    run.until(steps)
+    wait, status = run.longest, run.process.wait(600)
+    ended.set()
+    thread.join()
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(slow, signal.SIGCONT)
+    found = _parameters(place)
+    right = all(np.array_equal(found[key], value) for key, value in expected.items())
+    moved = place.with_suffix(".log").read_text().count("moved to")
+    return {"right": right, "moved": moved, "wait": wait, "status": status, "slow_from": step}
 
 
 def _begin(machines: Machines, place: Path, method: str, steps: int) -> _Watched:

@@ -11,7 +11,8 @@ root.
 
 Kills: two such nodes without a limit. Workers (SIGKILL), a node with all that it runs, the driver, which is then resumed,
 and the driver with the head node, which is then resumed at another address, in turn, each at a random step of a run. Every run
-must end with the bits of the run without a kill. Needs root.
+must end with the bits of the run without a kill. And of each method a run one of whose workers has a tenth of its speed from some step
+on. Needs root.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from benchmarks.workers import kills
 from benchmarks.workers.machines import Link, Machines
 
 RENDERS = False
-MERGE = ("same", "efficiency", "link", "kills")
+MERGE = ("same", "efficiency", "link", "kills", "stragglers")
 PARTS = ("same", "efficiency", "link", "kills")
 METHODS = tuple(kills.METHODS)
 QUICK = {"part": ("same",), "steps": 4, "workers": (2,), "resolution": 16, "texture": 16}
@@ -76,7 +77,7 @@ def run(
     if os.geteuid() != 0 and {"link", "kills"} & set(part):
         sys.exit("workers: network namespaces need root; --part same efficiency does without")
     folder = scratch("workers")
-    found: dict[str, Any] = {"same": {}, "efficiency": {}, "link": {}, "kills": {}}
+    found: dict[str, Any] = {"same": {}, "efficiency": {}, "link": {}, "kills": {}, "stragglers": {}}
     problem = {"problem": "two-planets", "method": "rcv", "settings": {"spp": 2}, "seed": 0, "compress": False}
     options = {"resolution": resolution, "texture_resolution": texture, "reference_spp": 32, "loss": loss}
     base = {**problem, "options": options, "steps": steps}
@@ -118,6 +119,9 @@ def run(
                 for rows in kills.campaign(machines, folder / name, name, number_of_kills, kill_steps, dice):
                     found["kills"][name] = rows
                     yield found
+                found["stragglers"][name] = kills.straggler(machines, folder / name, name, kill_steps, dice)
+                print(name, found["stragglers"][name], flush=True)
+                yield found
 
 
 def _same(folder: Path, base: Mapping[str, Any], workers: tuple[int, ...]) -> dict[str, Any]:

@@ -41,4 +41,20 @@ def table(record: Record) -> str:
             for name, row in record["kills"].items()
         ]
         parts.append(markdown.table(["method", "kills", "ended with the same bits", "longest wait (s)"], rows))
+        kinds = [row for of in record["kills"].values() for row in of["rows"]]
+        waits = [
+            [kind, str(len(of)), str(sum(row["right"] for row in of)), f"{max(row['wait'] for row in of):.0f}"]
+            for kind in dict.fromkeys(row["kind"] for row in kinds)
+            if (of := [row for row in kinds if row["kind"] == kind])
+        ]
+        parts.append(
+            markdown.table(["what was killed", "times", "ended with the same bits", "longest wait (s)"], waits)
+        )
+    if record.get("stragglers"):
+        rows = [
+            [name, "yes" if row["right"] else "no", str(row["moved"]), f"{row['wait']:.0f}"]
+            for name, row in record["stragglers"].items()
+        ]
+        names = ["method, one worker at a tenth of its speed", "same bits", "times moved", "longest wait (s)"]
+        parts.append(markdown.table(names, rows))
     return "\n\n".join(parts)
