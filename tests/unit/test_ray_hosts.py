@@ -30,6 +30,15 @@ class Full(Exception):
     """What it raises where the object store has no room."""
 
 
+@dataclasses.dataclass(eq=False)
+class Reference:
+    """What a call will return."""
+
+    actor: Actor
+    name: str
+    share: int
+
+
 class Actor:
     """A worker; its methods are remote at once.
 
@@ -48,7 +57,7 @@ class Actor:
             share = arguments[0] if arguments else -1
             if name == "drop":
                 self.dropped.append(share)
-            return SimpleNamespace(actor=self, name=name, share=share)
+            return Reference(self, name, share)
 
         return SimpleNamespace(remote=remote)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import collections
 import contextlib
-import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -220,7 +220,10 @@ class RayHosts:
         lost: list[_Worker] = []
         while open_:
             self._cluster.head.check()
-            done, _ = self._ray.wait(list(open_.values()), num_returns=1, timeout=_POLL)
+            waiting = list(open_.values())
+            done = self._ray.wait(waiting, num_returns=1, timeout=_POLL)[0]
+            if done:  # all that are there by now: one at a time would take time by the square of their number
+                done = set(self._ray.wait(waiting, num_returns=len(waiting), timeout=0)[0])
             for share in [share for share, reference in open_.items() if reference in done]:
                 last = time.monotonic()
                 try:
@@ -356,12 +359,25 @@ class RayHosts:
             lag = self._lags[share]
             lag.steps += 1
             lag.seconds = reply.seconds if lag.steps <= _COMPILING else 0.8 * lag.seconds + 0.2 * reply.seconds
+        ordered, compiled = sorted(lag.seconds for lag in self._lags), min(lag.steps for lag in self._lags) > _COMPILING
         for share, reply in replies.items():
             lag = self._lags[share]
-            others = [other.seconds for n, other in enumerate(self._lags) if self._of[n] is not self._of[share]]
-            far = bool(others) and lag.seconds > max(_LAGGING * statistics.median(others), _LEAST)
-            lag.behind = lag.behind + 1 if far and min(other.steps for other in self._lags) > _COMPILING else 0
+            others = self._median_of_others(self._of[share], ordered)
+            far = others is not None and lag.seconds > max(_LAGGING * others, _LEAST)
+            lag.behind = lag.behind + 1 if far and compiled else 0
             lag.usual = reply.seconds if lag.usual is None else max(reply.seconds, 0.9 * lag.usual)
+
+    def _median_of_others(self, worker: _Worker, ordered: list[float]) -> float | None:
+        """The median seconds a step of shares on other workers; None where there is none.
+
+        Args:
+            worker: whose shares are left out.
+            ordered: of all shares, ascending.
+        """
+        others = list(ordered)
+        for share in worker.shares:
+            del others[bisect.bisect_left(others, self._lags[share].seconds)]
+        return others[(len(others) - 1) // 2] if others else None
 
     def _named(self, share: int) -> str:
         return f"worker of views {', '.join(map(str, self._views[share]))} on {_where(self._of[share])}"
