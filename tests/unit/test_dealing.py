@@ -192,6 +192,21 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
         assert apart(whole, descend(problem.gathered_by(DealtViews(problem, shares, hosts, True)), name)) == 0
 
 
+def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = analytic.problem(views=VIEWS)
+    step = sum(np.asarray(value).nbytes for value in problem.initial().values())
+    monkeypatch.setattr("unrender.dealing.memories._MOST_BYTES", 3 * step)
+    together, collected = dealt(problem, 2), list[int]()
+    hosts: Any = together.gatherer._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    fetch = hosts.fetch
+    monkeypatch.setattr(hosts, "fetch", lambda number: collected.append(number) or fetch(number))
+    descend(together, "rcv", steps=30)
+    size = 11 * 8 * 16 * 3 * VIEWS  # eleven images of a view
+    assert len(collected) == 1  # after three steps; the next one would be after as many steps as the images have bytes
+    assert 2 * 30 * step < size
+    assert hosts.calls > 30
+
+
 def test_exposures_of_all_views_are_sent_to_each_share() -> None:
     given = analytic.problem(views=3)
     bright = [

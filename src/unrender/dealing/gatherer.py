@@ -93,6 +93,7 @@ class DealtViews:
         self._recent: list[set[int]] = [set() for _ in shares]
         self._calls = 0
         self._in_step = False
+        self._collection = 0
         self.traffic = Traffic()
 
     # ------------------------------------------------------------------ Gatherer
@@ -312,7 +313,7 @@ class DealtViews:
 
     def _bound(self, memory: Memory) -> None:
         """Collect what is remembered where it would take many steps to make it again."""
-        if memory.recipe.is_long:
+        if memory.recipe.is_long(self._collection):
             self._collect(memory.recipe)
 
     def _collect(self, recipe: Recipe) -> None:
@@ -327,6 +328,7 @@ class DealtViews:
                 found |= fetched
             if len(found) == len(shares):
                 recipe.store(tuple(found[share] for share in shares))
+                self._collection = sum(payload_bytes(packed.tensors) for packed in found.values())
                 return
         raise InputError(f"workers: some were lost {_MOST_LOSSES} times while what they remember was collected")
 

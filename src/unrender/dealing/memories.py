@@ -15,7 +15,8 @@ __all__ = ["Memories", "Memory", "Recipe"]
 
 _MOST_STEPS = 512
 _MOST_BYTES = 1 << 28
-"""Steps, and bytes of their parameters, that a share that was lost repeats at most."""
+"""Steps, and bytes of their parameters, that a share that was lost repeats at most; as many bytes as a collection has, where these are more:
+then collections send no more than steps do."""
 
 
 @dataclass(eq=False)
@@ -44,10 +45,13 @@ class Recipe:
         self.stored, self.base, self.call, self.sent = packed, None, None, {}
         self.steps = self.bytes = 0
 
-    @property
-    def is_long(self) -> bool:
-        """Whether it is time to collect."""
-        return self.steps >= _MOST_STEPS or self.bytes >= _MOST_BYTES
+    def is_long(self, size: int) -> bool:
+        """Whether it is time to collect.
+
+        Args:
+            size: bytes of the last collection; 0 before there was one.
+        """
+        return self.steps >= _MOST_STEPS or self.bytes >= max(_MOST_BYTES, size)
 
     def chain(self) -> list[Recipe]:
         """The recipes from the last stored one, or the first step, to this."""
