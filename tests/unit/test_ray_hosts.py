@@ -53,7 +53,7 @@ class Actor:
         self.dropped: list[int] = []
 
     def __getattr__(self, name: str) -> Any:
-        def remote(*arguments: Any) -> SimpleNamespace:
+        def remote(*arguments: Any) -> Reference:
             share = arguments[0] if arguments else -1
             if name == "drop":
                 self.dropped.append(share)

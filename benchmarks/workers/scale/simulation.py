@@ -143,7 +143,7 @@ class _Run:
         finished = np.empty(len(there))
         for share in np.argsort(there, kind="stable"):
             holder = int(self.holder[share])
-            free[holder] = max(free.get(holder, 0.0), there[share]) + seconds[share]
+            free[holder] = max(free.get(holder, 0.0), float(there[share])) + float(seconds[share])
             finished[share] = free[holder]
         return finished
 
@@ -187,7 +187,7 @@ class _Run:
         self.now += self.faults.notice + steps * self.job.view_seconds * float(self.views[gone].max())
         for share in gone:
             self._give(int(share))
-            self.next_loss[share] = self.back[share] + self.rng.exponential(self.faults.lost_every)
+            self.next_loss[share] = float(self.back[share]) + self.rng.exponential(self.faults.lost_every)
 
     def _give(self, share: int) -> None:
         """A share to the worker with the fewest."""

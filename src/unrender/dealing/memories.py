@@ -15,8 +15,8 @@ __all__ = ["Memories", "Memory", "Recipe"]
 
 _MOST_STEPS = 512
 _MOST_BYTES = 1 << 28
-"""Steps, and bytes of their parameters, that a share that was lost repeats at most; as many bytes as a collection has, where these are more:
-then collections send no more than steps do."""
+"""Steps, and bytes of their parameters, that a share that was lost repeats at most; or as many bytes as a collection has, where these are
+more: then collections send no more than steps do."""
 
 
 @dataclass(eq=False)
