@@ -147,17 +147,20 @@ class RayHosts:
         return self._collected({share: self._called(share, "fetch", share, number) for share in range(self.count)})
 
     def movable(self) -> list[int]:
-        """See `Hosts.movable`: one share at most, of a worker that lags, else of one that has two more than another."""
+        """See `Hosts.movable`: one share of a worker that lags; else those of workers that have two more than another, until none has."""
         for worker in [worker for worker in self._starting if self._is_done(worker)]:
             self._starting.remove(worker)
             if worker.place is not None:
                 self._workers.append(worker)
         if len(self._workers) < 2:
             return []
-        behind = [share for share in range(self.count) if self._lags[share].behind >= _IN_A_ROW]
-        most, least = (of(len(worker.shares) for worker in self._workers) for of in (max, min))
-        crowded = [share for share, worker in enumerate(self._of) if len(worker.shares) == most]
-        return behind[:1] or (crowded[-1:] if most > least + 1 else [])
+        if behind := [share for share in range(self.count) if self._lags[share].behind >= _IN_A_ROW]:
+            return behind[:1]
+        loads, found = [sorted(worker.shares) for worker in self._workers], list[int]()
+        while len(most := max(loads, key=len)) > len(least := min(loads, key=len)) + 1:
+            least.insert(0, most.pop())
+            found.append(least[0])
+        return found
 
     def move(self, share: int) -> None:
         """See `Hosts.move`. Nothing where the share has moved meanwhile, or there is nowhere else."""
