@@ -9,6 +9,7 @@ from benchmarks.workers.scale.cost import Costs, compute
 from benchmarks.workers.scale.summary import JOBS, NETWORKS, network
 
 _COLOURS = {"fitted": "#1f6fb4", "held out": "#d1782a", "rendering": "#2a8f5b"}
+_OF_JOBS = ("#8a5fb0", "#1f6fb4", "#d1782a", "#2a8f5b")
 
 
 def plot(record: Record) -> Figure:
@@ -27,9 +28,9 @@ def plot(record: Record) -> Figure:
         return figure
     costs, counts = Costs(**record["costs"]), 2 ** np.arange(10)
     for axis, (where, limits) in zip(axes[1:], NETWORKS.items(), strict=True):
-        for (name, job), colour in zip(JOBS.items(), _COLOURS.values(), strict=True):
+        for (name, job), colour in zip(JOBS.items(), _OF_JOBS, strict=True):
             times = [costs.step(job, network(int(n), *limits)) for n in counts]
-            axis.loglog(counts, times, "o-", ms=3, color=colour, label=f"{name}, {job.parameters / 1e6:.3g} million")
+            axis.loglog(counts, times, "o-", ms=3, color=colour, label=f"{name}, {job.parameters:,} numbers")
         axis.loglog(
             counts,
             [compute(job, network(int(n), *limits)) for n in counts],

@@ -16,11 +16,12 @@ COUNTS = (8, 64, 512)
 STORE = 30e9
 """Bytes of the driver's object store: Ray's default on a machine with 100 GB."""
 JOBS = {
+    "materials": Job(10_000, 512, 0.05, 0.1),
     "texture": Job(6_291_456, 512, 0.05, 0.1),
     "volume": Job(16_777_216, 512, 0.05, 0.1),
     "large": Job(100_000_000, 512, 0.05, 0.1),
 }
-"""Two textures of 1024² texels, a grid of 256³, a hundred million numbers; 512 views, 50 ms each, 10 % of spread."""
+"""Ten thousand numbers, two textures of 1024² texels, a grid of 256³, a hundred million numbers; 512 views, 50 ms each, 10 % of spread."""
 NETWORKS = {"one hall": (25e9 / 8, 1e-4), "the internet": (1e9 / 8, 0.05)}
 """Bytes a second into the driver's machine, seconds there and back. Eight workers a machine, those of the first on the driver's."""
 PER_MACHINE = 8
@@ -28,7 +29,7 @@ HOUR = 3600.0
 LOST_EVERY, SLOW_EVERY = 1000 * HOUR, 100 * HOUR
 """A worker is lost once in 1000 hours, and turns ten times slower once in 100."""
 FAULTS = Faults(slowness=10.0, notice=5.0, restart=30.0, collected_every=100)
-STEPS, BETWEEN = {8: 6000, 64: 1500, 512: 600}, 25
+STEPS, BETWEEN = {8: 30000, 64: 3000, 512: 600}, 25
 """Of a simulation of faults: how many, and from one fault to the next, which is far more often than they come: what one costs counts."""
 
 

@@ -50,7 +50,7 @@ def predictions(record: Record, where: str) -> str:
                     str(count),
                     *(_seconds(x) for x in (of["compute"], wire, parts["worker"] + parts["gradient"], of["step"])),
                     _seconds(of["simulated"]),
-                    f"{of['efficiency']:.1%}",
+                    f"{100 * of['efficiency']:.2g}%",
                     _seconds(of["compressed"]),
                     _seconds(of["summed_by_machine"]),
                 ]
@@ -66,11 +66,15 @@ def faults(record: Record) -> str:
         of = record["faults"][str(count)]
         row = [str(count)]
         for name in ("lost", "slow"):
-            row += [_seconds(of[f"{name}_seconds"]), _seconds(of[f"{name}_closed"]), f"{of[f'{name}_share']:.2%}"]
+            row += [
+                _seconds(of[f"{name}_seconds"]),
+                _seconds(of[f"{name}_closed"]),
+                f"{max(of[f'{name}_share'], 0.0):.2%}",
+            ]
         rows.append(row)
     names = ["GPUs", "a loss costs (s), simulated", "closed form", "share of the time"]
     return markdown.table([*names, "a straggler costs (s), simulated", "closed form", "share of the time"], rows)
 
 
 def _seconds(x: float) -> str:
-    return f"{x:.3g}" if x >= 0.01 else f"{x:.2f}"
+    return f"{x:.3g}" if x >= 0.005 else "0"
