@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.random import Key
+from unrender.pixels.base import DrawStatistics
 from unrender.rendering.renderer import Space
 
 __all__ = ["Batch", "Call", "Difference", "ImageState", "Pair", "Reply", "payload_bytes"]
@@ -94,6 +95,7 @@ class Call:
         single: whether gradients are to be in single precision; else they are in double.
         spp, adjoint_spp, key, pair, tolerance, fresh: of the request.
         batch: the pixels; None for whole views.
+        tangents: along which the squared derivatives of the drawn pixels are wanted; None where they are not.
     """
 
     parameters: References
@@ -104,6 +106,7 @@ class Call:
     adjoint_spp: int | None = None
     pair: Pair | None = None
     batch: Batch | None = None
+    tangents: dict[str, np.ndarray] | None = None
     tolerance: float = 0.0
     fresh: bool = False
     result: int | None = None
@@ -126,6 +129,7 @@ class Reply:
         images: {view: (H, W, 3)} where they were wanted.
         info: {name: {view: array}} likewise.
         seconds: that it took.
+        draws: what the samples of a mini-batch's pixels tell, in the batch's order; None where it was not wanted.
     """
 
     gradient: dict[str, np.ndarray]
@@ -136,13 +140,14 @@ class Reply:
     images: dict[int, np.ndarray]
     info: dict[str, dict[int, np.ndarray]]
     seconds: float
+    draws: DrawStatistics | None = None
 
 
 def payload_bytes(message: Any) -> int:
     """Bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Difference, Batch)):
+    if isinstance(message, (Difference, Batch, DrawStatistics)):
         return sum(payload_bytes(value) for value in vars(message).values())
     if isinstance(message, (Call, Reply)):
         return sum(payload_bytes(value) for value in vars(message).values())

@@ -17,7 +17,7 @@ from unrender.pixels.tiles import InverseCdfTable, Tiles
 from unrender.problem.batches import PixelBatch
 from unrender.problem.problem import Problem
 
-__all__ = ["PixelStatistics", "estimate_statistics", "random_signs", "reference_means", "scales"]
+__all__ = ["PixelStatistics", "estimate_statistics", "random_signs", "random_tangents", "reference_means", "scales"]
 
 ROUNDS = 16
 """Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
@@ -120,12 +120,17 @@ def _round(
         own = arrays.gather_rows(reference, arrays.arange(image, batch.pixels) // spp)
         found.append(problem.loss.derivative(image, own) * factor)
     if scales:
-        signs = random_signs(parameters, key.fold(2))
-        scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
-        tangents = problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
+        tangents = random_tangents(problem, parameters, scales, key.fold(2))
         found.append(session.tangent_moment(parameters, rendering.paths, tangents))
     arrays.evaluate(found)
     return [arrays.numpy(x) for x in found]
+
+
+def random_tangents(problem: Problem, parameters: Tree, scales: Tree, key: Key) -> Tree:
+    """Tangents of the parameters: scales times random signs, in the coordinates of the descent."""
+    signs = random_signs(parameters, key)
+    scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
+    return problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
 
 
 def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:

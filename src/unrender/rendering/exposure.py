@@ -171,7 +171,8 @@ class ExposedSession:
 
     def tangent_moment(self, parameters: Tree, paths: ExposedPaths, tangents: Tree) -> Array:
         """See `RenderSession.tangent_moment`, and `ExposedRenderer` for what is left out."""
-        along = self._of_rows(tangents[EXPOSURE] - _mean(tangents[EXPOSURE]), paths.rows) * (_LN2 * paths.images[0])
+        images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
+        along = self._of_rows(tangents[EXPOSURE] - _mean(tangents[EXPOSURE]), paths.rows) * (_LN2 * images)
         moment = along * along
         if scene := _scene(parameters):
             moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents))

@@ -222,10 +222,14 @@ class MitsubaSession:
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
         """Path replay in forward mode: the squared derivative of each path along the tangents. See `RenderSession.tangent_moment`."""
         self._check_keys(parameters)
+        if self._pair.volumetric and paths.previous is not None and paths.space == "path":
+            # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
+            paths = self.image(parameters, paths.request).paths
         self._pair.loaded().set_tangents(parameters, tangents)
         squares = self._run(TangentPass(), paths.request, paths.radiance)
         dr.eval(squares)
-        return self._develop(squares, paths.request)[0]
+        moments = self._develop(squares, paths.request)
+        return moments if paths.request.groups > 1 else moments[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
