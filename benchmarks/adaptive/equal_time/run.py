@@ -45,7 +45,9 @@ def entrants(task: str, count: int) -> list[Entrant]:
 
     found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        found.append(entrant("adaptive, as the paper", "adaptive", relative=False, levels=4))
+        found.append(
+            entrant("adaptive, as the paper", "adaptive", relative=False, levels=4, uniform=0.1, learn_from_draws=False)
+        )
     if task == "plain-and-textured":
         found.append(entrant("adaptive, five levels", "adaptive", levels=4))
     if task == "two-planets, memories":

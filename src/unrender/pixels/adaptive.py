@@ -29,9 +29,10 @@ class Adaptive:
     paths, mixed with uniform sampling u.
 
     Both factors are estimated from a few paths per tile of pixels, denoised; the second by one pass in forward mode with random ±1
-    tangents (`Renderer.tangent_moment`). The samples of the first steps and of each fifth add to both (`LearningSampler`), where the
-    estimator can tell what they saw. Parameters with a preconditioner count as u, where x = S u, the coordinates of the descent. The
-    gradient is unbiased for any positive probabilities, so errors of these estimates change its variance only.
+    tangents (`Renderer.tangent_moment`). The samples of the first steps, and of one between two updates, add to both
+    (`LearningSampler`), where the estimator can tell what they saw. Parameters with a preconditioner count as u, where x = S u, the
+    coordinates of the descent. The gradient is unbiased for any positive probabilities, so errors of these estimates change its
+    variance only.
 
     Few paths know nothing of rare bright ones, and a map that has missed them can make the variance many times that of uniform
     sampling. Since p_j >= λ u_j, the second moment of the gradient is at most 1 / λ times uniform sampling's. λ is 0.8 at first, so at
@@ -42,15 +43,15 @@ class Adaptive:
     averaged over blocks of 2^d × 2^d tiles, which draws more pixels where the reference varies within a block. (The paper's blocks are
     of pixels; the two are the same where there are as many tiles as pixels.) The paper has D = 4, because in a sum of plain variances
     uniform regions can outweigh textured ones; relative variances need it less, and without levels the variance is smaller:
-    `Adaptive(count, levels=4, relative=False, uniform=0.1)` is the paper's, but for the samples that it learns from.
+    `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False)` is the paper's.
 
     Args:
         count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
         levels: D, >= 0.
         refresh: steps between importance-map updates, >= 1.
         samples: paths of an update, >= 1, which also sets how fine the tiles are: one path in each, or several where tiles are
-            pixels. None for a third of `count`, but 4096 at least (or twice `count`), for each 20 steps between updates: a few
-            hundredths of the cost of the steps.
+            pixels. None for a third of `count`, but 4096 at least (or twice `count`, of the first eight times), for each 20 steps
+            between updates: a few hundredths of the cost of the steps.
         uniform: λ, fraction of the draws that is uniform over all pixels, in (0, 1]. None for 0.8 at first, and then between 0.1 and 0.8
             by what the samples tell.
         stratified: stratify the draws over the distribution (`tiles.InverseCdfTable.draw`); otherwise they are independent, as in the
@@ -60,6 +61,7 @@ class Adaptive:
             is dominated by the parameters with the largest gradients.
         denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "pooling" with the tiles around
             (`pooling.pool`), "none", or "auto": optix on a GPU, oidn where it is installed, else pooling.
+        learn_from_draws: learn from the samples of the steps, too; otherwise from the updates alone, as in the paper.
     """
 
     count: int
@@ -70,13 +72,14 @@ class Adaptive:
     stratified: bool = True
     relative: bool = True
     denoiser: MapDenoiser = "auto"
+    learn_from_draws: bool = True
 
     def __post_init__(self):
         self._sampler.check()
 
     @property
     def _sampler(self) -> GuidedSampler:
-        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels))
+        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels, self.learn_from_draws))
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
@@ -109,6 +112,7 @@ class _GradientVariance:
     """The importance of Eq. 12, averaged over levels by Eq. 18."""
 
     levels: int
+    learns: bool
     needs_second_moment: bool = True
 
     def maps(self, statistics: PixelStatistics) -> Maps:

@@ -23,8 +23,9 @@ from unrender.problem.upsampling import SQUARES, Upsampler
 
 __all__ = ["GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
 
-_FEWEST_PATHS = 4096
-"""The default of `samples` at least: fewer do not resolve where in the images the importance is."""
+_FEWEST_PATHS, _FIRST_PATHS = 4096, 8
+"""The default of `samples` at least: fewer do not resolve where in the images the importance is; and of the first update at most for each
+pixel of a mini-batch, where later ones have fewer."""
 
 _OBSERVED, _DECAY = 4, 0.9
 """Steps between updates of the gradient's second moment, and the decay of its running mean."""
@@ -32,8 +33,9 @@ _OBSERVED, _DECAY = 4, 0.9
 _MEMORY = 0.8 ** (1 / 20)
 """Weight, after each further step, of what was learnt before. The scene changes little from step to step, so averaging reduces noise."""
 
-_LEARNT_FIRST, _LEARNT = 4, 5
-"""The samples of the first steps are learnt from, and those of each fifth step: telling costs a pass over their paths."""
+_FIRST = 4
+"""Steps at the beginning whose samples change the probabilities of the next step. Later the samples of one step between two updates are
+learnt from, and the next update is by them, too: to tell costs a pass over their paths, to change the probabilities a denoising."""
 
 _FACTORS = 2
 """The maps of which the samples of a step tell: second moments of the parameter derivatives, and of the loss derivative."""
@@ -115,6 +117,11 @@ class ImportanceRule(Protocol):
         ...
 
     @property
+    def learns(self) -> bool:
+        """Whether the samples of the steps are learnt from."""
+        ...
+
+    @property
     def needs_second_moment(self) -> bool:
         """Whether the second moment of the pixels' parameter derivatives is estimated, at the cost of as many paths again."""
         ...
@@ -175,8 +182,8 @@ class GuidedSampler:
         traced, tangents = 0, None
         if not state.maps or state.age >= self.options.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
-        first = state.refreshes == 1 and state.age < _LEARNT_FIRST
-        if self.rule.needs_second_moment and (first or state.age % _LEARNT == 0):
+        early = state.refreshes == 1 and state.age < _FIRST
+        if self.rule.learns and (early or state.age == self.options.refresh // 2):
             scales = pixel_statistics.scales(parameters, state.second_moment)
             tangents = pixel_statistics.random_tangents(problem, parameters, scales, key.fold(2))
         batch = replace(self.redraw(problem, state, key), samples=traced, tangents=tangents)
@@ -205,11 +212,19 @@ class GuidedSampler:
         )
 
     def _tiles(self, problem: Problem) -> Tiles:
-        return cut(problem, max(self._paths(), len(problem.views)))
+        most = self._paths()
+        if self.options.samples is None and self._is_sparse:
+            most = max(most, min(_FEWEST_PATHS, _FIRST_PATHS * self.options.count))
+        return cut(problem, max(most, len(problem.views)))
+
+    @property
+    def _is_sparse(self) -> bool:
+        """Whether updates may leave out tiles: those after the first add to what is known."""
+        return self.rule.learns and self.rule.levels == 0
 
     def _paths(self) -> int:
         """Paths of an importance-map update: `samples`, or a third of a mini-batch's pixels for each twenty steps between updates,
-        but 4096 at least, or for small mini-batches twice their pixels."""
+        but 4096 at least, or for small mini-batches twice their pixels; the first has one for each tile at least."""
         options = self.options
         if options.samples is not None:
             return options.samples
@@ -220,8 +235,15 @@ class GuidedSampler:
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[GuidedSamplerState, int]:
         """The state with an importance map at these parameters, and how many paths were traced for it."""
-        tiles = self._tiles(problem)
-        spp = max(1, self._paths() // len(tiles.views))
+        tiles, paths = self._tiles(problem), self._paths()
+        if state.maps and paths < len(tiles.views) and self._is_sparse:
+            sample = state.uniform_table.draw(paths, key, stratified=True)
+            scales = pixel_statistics.scales(parameters, state.second_moment)
+            draws = pixel_statistics.draw_statistics(problem, parameters, sample, key, scales)
+            updated = self._added(state, tiles, self._samples(tiles, sample, draws))
+            updated = self._mapped(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
+            return updated, 2 * paths
+        spp = max(1, paths // len(tiles.views))
         references = [
             problem.renderer.array(tiles.coarsen(state.references, level)) for level in range(1, self.rule.levels + 1)
         ]
@@ -240,9 +262,17 @@ class GuidedSampler:
     ) -> GuidedSamplerState:
         """See `LearningSampler.learn`."""
         tiles = self._tiles(problem)
+        learnt = self._added(state, tiles, self._samples(tiles, sample, draws, state.shares))
+        early = state.refreshes == 1 and state.age <= _FIRST
+        return self._mapped(problem, tiles, learnt) if early else learnt
+
+    def _samples(
+        self, tiles: Tiles, sample: PixelSample, draws: DrawStatistics, shares: np.ndarray | None = None
+    ) -> _Samples:
+        """Of pixels drawn with these probabilities, None for uniform ones."""
         tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
-        found = _finite(draws.moments), _finite(draws.squares)
-        return self._mapped(problem, tiles, self._added(state, tiles, _Samples(tile, found, 1 / state.shares[tile])))
+        weights = np.ones(len(tile)) if shares is None else 1 / shares[tile]
+        return _Samples(tile, (_finite(draws.moments), _finite(draws.squares)), weights)
 
     def _added(self, state: GuidedSamplerState, tiles: Tiles, samples: _Samples) -> GuidedSamplerState:
         """The state with what samples tell of its maps and, where there were some before, of the share of uniform draws."""

@@ -68,6 +68,7 @@ class _LossDerivative:
     """The importance of Eq. 5."""
 
     levels: int = 0
+    learns: bool = False
     needs_second_moment: bool = False
 
     def maps(self, statistics: PixelStatistics) -> Maps:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,11 +13,20 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.pixels.base import DrawStatistics
 from unrender.pixels.tiles import InverseCdfTable, Tiles
-from unrender.problem.batches import PixelBatch
+from unrender.problem.batches import PixelBatch, PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["PixelStatistics", "estimate_statistics", "random_signs", "random_tangents", "reference_means", "scales"]
+__all__ = [
+    "PixelStatistics",
+    "draw_statistics",
+    "estimate_statistics",
+    "random_signs",
+    "random_tangents",
+    "reference_means",
+    "scales",
+]
 
 ROUNDS = 16
 """Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
@@ -98,6 +107,26 @@ def estimate_statistics(
         means(-1, np.asarray) if scales else np.empty((0, 3)),
         len(tiles.views) * spp * (2 if scales else 1),
     )
+
+
+def draw_statistics(problem: Problem, parameters: Tree, sample: PixelSample, key: Key, scales: Tree) -> DrawStatistics:
+    """What one path through each of some pixels tells.
+
+    Args:
+        problem, parameters: what to render.
+        sample: the pixels; their weights are of no account.
+        key: of the random numbers.
+        scales: of the tangents, in the coordinates of the descent.
+    """
+    batch = PixelBatch(problem, replace(sample, weights=sample.weights * 0 + 1))
+    session = problem.renderer.prepare(list(parameters), None)
+    rendering = session.image(parameters, batch.request(1, key.fold(1).uint32()))
+    derivative = batch.loss_derivative(rendering.images[0])
+    tangents = random_tangents(problem, parameters, scales, key.fold(2))
+    moments = session.tangent_moment(parameters, rendering.paths, tangents)
+    arrays.evaluate(derivative, moments)
+    squares, moments = (arrays.numpy(x).astype(np.float64) for x in (derivative * derivative, moments))
+    return DrawStatistics(squares, moments)
 
 
 def _round(
