@@ -235,8 +235,7 @@ def gather_frame(
 def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:
     """From the weights of the adjoint (groups, N, 3) and the squared derivatives of its paths, of the same shape or of one group (N, 3).
 
-    Each group's weights come from samples of the others, so the products of the two means tell the second moment of the gradient but for
-    the covariance of the groups.
+    Each is unbiased; their product is not, since the weights of one group come from the paths of another.
     """
     arrays.evaluate(weights, moments)
     derivative, of_draw = arrays.numpy(weights).astype(np.float64), arrays.numpy(frame.sample.weights)
