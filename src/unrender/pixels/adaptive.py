@@ -62,6 +62,9 @@ class Adaptive:
         denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "pooling" with the tiles around
             (`pooling.pool`), "none", or "auto": optix on a GPU, oidn where it is installed, else pooling.
         learn_from_draws: learn from the samples of the steps, too; otherwise from the updates alone, as in the paper.
+        by_cost: let q_j be ∝ sqrt(... / c_j), with c_j what a path through the pixel costs: one, and two more for each vertex. Of all
+            probabilities these have the least variance times cost of a step; a path into the sky costs next to nothing. At as many
+            paths, the variance is larger.
     """
 
     count: int
@@ -73,13 +76,14 @@ class Adaptive:
     relative: bool = True
     denoiser: MapDenoiser = "auto"
     learn_from_draws: bool = True
+    by_cost: bool = False
 
     def __post_init__(self):
         self._sampler.check()
 
     @property
     def _sampler(self) -> GuidedSampler:
-        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels, self.learn_from_draws))
+        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels, self.learn_from_draws, self.by_cost))
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
@@ -113,6 +117,7 @@ class _GradientVariance:
 
     levels: int
     learns: bool
+    by_cost: bool
     needs_second_moment: bool = True
 
     def maps(self, statistics: PixelStatistics) -> Maps:

@@ -37,6 +37,9 @@ _FIRST = 4
 """Steps at the beginning whose samples change the probabilities of the next step. Later the samples of one step between two updates are
 learnt from, and the next update is by them, too: to tell costs a pass over their paths, to change the probabilities a denoising."""
 
+_COUNTED = 8
+"""Updates after which the vertices of paths are counted again."""
+
 _FACTORS = 2
 """The maps of which the samples of a step tell: second moments of the parameter derivatives, and of the loss derivative."""
 
@@ -64,6 +67,7 @@ class GuidedSamplerState:
         uniform: fraction of the draws that is uniform.
         evidence: for that fraction.
         since: steps since the maps were last changed.
+        costs: what a path through each tile costs, relative to one that meets nothing, (tiles,); ones where it is not counted.
     """
 
     age: int
@@ -80,6 +84,7 @@ class GuidedSamplerState:
     uniform: float = 1.0
     evidence: ShareEvidence = field(default_factory=ShareEvidence)
     since: int = 0
+    costs: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     def upsampled(self, upsampler: Upsampler) -> GuidedSamplerState:
         """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
@@ -119,6 +124,11 @@ class ImportanceRule(Protocol):
     @property
     def learns(self) -> bool:
         """Whether the samples of the steps are learnt from."""
+        ...
+
+    @property
+    def by_cost(self) -> bool:
+        """Whether pixels count less the more a path through them costs."""
         ...
 
     @property
@@ -172,7 +182,14 @@ class GuidedSampler:
         uniform_table = InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array)
         ones = np.ones(len(tiles.views))
         return GuidedSamplerState(
-            0, (), uniform_table, uniform_table, ones, pixel_statistics.reference_means(problem, tiles), density=ones
+            0,
+            (),
+            uniform_table,
+            uniform_table,
+            ones,
+            pixel_statistics.reference_means(problem, tiles),
+            density=ones,
+            costs=ones,
         )
 
     def draw(
@@ -236,6 +253,10 @@ class GuidedSampler:
     ) -> tuple[GuidedSamplerState, int]:
         """The state with an importance map at these parameters, and how many paths were traced for it."""
         tiles, paths = self._tiles(problem), self._paths()
+        if self.rule.by_cost and state.refreshes % _COUNTED == 0:
+            state = replace(
+                state, costs=pixel_statistics.costs(problem, parameters, tiles, state.uniform_table, key.fold(3))
+            )
         if state.maps and paths < len(tiles.views) and self._is_sparse:
             sample = state.uniform_table.draw(paths, key, stratified=True)
             scales = pixel_statistics.scales(parameters, state.second_moment)
@@ -296,15 +317,16 @@ class GuidedSampler:
             np.maximum(denoise_map(tiles, values, self.options.denoiser, counts), 0.0)
             for values, counts in zip(state.maps[:_FACTORS], state.counts[:_FACTORS], strict=True)
         )
-        uniform = self.options.uniform
-        if uniform is None:
-            uniform = uniform_share.choose(state.evidence)
-        density = self.rule.density(tiles, state.maps, denoised)
+        density = self.rule.density(tiles, state.maps, denoised) / np.sqrt(state.costs)
         total = float((density * tiles.sizes).sum())
         if total > 0 and math.isfinite(total):
             density = density * (float(tiles.sizes.sum()) / total)
         else:  # no importance was found
             density = np.ones(len(density))
+        uniform = self.options.uniform
+        if uniform is None:
+            cost = float(np.average(density, weights=tiles.sizes * state.costs))
+            uniform = uniform_share.choose(state.evidence, cost)
         shares = (1 - uniform) * density + uniform
         table = InverseCdfTable.of(tiles, shares * tiles.sizes, problem.renderer.array)
         return replace(state, table=table, shares=shares, denoised=denoised, density=density, uniform=uniform)

@@ -69,6 +69,7 @@ class _LossDerivative:
 
     levels: int = 0
     learns: bool = False
+    by_cost: bool = False
     needs_second_moment: bool = False
 
     def maps(self, statistics: PixelStatistics) -> Maps:

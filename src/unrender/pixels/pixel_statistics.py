@@ -14,9 +14,11 @@ from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels.base import DrawStatistics
+from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import InverseCdfTable, Tiles
 from unrender.problem.batches import PixelBatch, PixelSample
 from unrender.problem.problem import Problem
+from unrender.rendering.renderer import CountingSession
 
 __all__ = [
     "PixelStatistics",
@@ -34,6 +36,10 @@ ROUNDS = 16
 
 _FLOOR, _LEAST = 0.1, 1e-30
 """Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
+
+
+_COST_PRIOR = 4.0
+"""Paths that a tile's own cost needs to count as much as its surroundings: how many vertices paths have varies little."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,25 @@ def estimate_statistics(
         means(-1, np.asarray) if scales else np.empty((0, 3)),
         len(tiles.views) * spp * (2 if scales else 1),
     )
+
+
+def costs(problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key) -> np.ndarray:
+    """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1: each vertex adds a segment and a
+    connection to an emitter. From one path in each tile, pooled; ones where the renderer does not count.
+
+    Args:
+        problem, parameters: what to render.
+        tiles: of all views.
+        uniform_table: of these tiles, every pixel equally likely.
+        key: of the random numbers.
+    """
+    session = problem.renderer.prepare(list(parameters), None)
+    if not isinstance(session, CountingSession):
+        return np.ones(len(tiles.views))
+    batch = PixelBatch(problem, uniform_table.draw_per_tile(1, key.fold(0)))
+    vertices = arrays.numpy(session.vertices(parameters, batch.request(1, key.fold(1).uint32())))
+    means = pool(tiles, vertices[:, :1].astype(np.float64), np.ones(len(tiles.views)), _COST_PRIOR)
+    return 1 + 2 * means[:, 0]
 
 
 def draw_statistics(problem: Problem, parameters: Tree, sample: PixelSample, key: Key, scales: Tree) -> DrawStatistics:

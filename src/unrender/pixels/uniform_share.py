@@ -45,7 +45,7 @@ def observed(evidence: ShareEvidence, samples: np.ndarray, density: np.ndarray, 
     return ShareEvidence(evidence.moments * decay + moments, evidence.squares * decay + np.square(samples).sum(axis=1))
 
 
-def choose(evidence: ShareEvidence) -> float:
+def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
     """The share λ of uniform draws in p = λ + (1 - λ) q that minimises a pessimistic estimate of the gradient's second moment over that of
     uniform sampling:
 
@@ -54,6 +54,10 @@ def choose(evidence: ShareEvidence) -> float:
     n is the effective number of samples, and ε what they leave unknown of the second moment: as much as one more sample like them
     (Laplace's rule of succession). The map may be zero there, which costs 1 / λ. J is the larger of that of the two factors. Without
     evidence it is `MOST`; heavy tails, of which few samples are all, keep it large.
+
+    Args:
+        evidence: of samples.
+        cost: of a path drawn by the map, over that of one drawn uniformly: J is multiplied by λ + (1 - λ) times it.
     """
     worst = np.zeros(len(SHARES))
     for moments, square in zip(evidence.moments, evidence.squares, strict=True):
@@ -62,4 +66,4 @@ def choose(evidence: ShareEvidence) -> float:
             return MOST
         unknown = 1 / (1 + uniform**2 / float(square))
         worst = np.maximum(worst, (1 - unknown) * moments[:-1] / uniform + unknown / SHARES)
-    return float(SHARES[np.argmin(worst)])
+    return float(SHARES[np.argmin(worst * (SHARES + (1 - SHARES) * cost))])

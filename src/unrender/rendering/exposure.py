@@ -13,7 +13,15 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, RenderSession, SampleRequest, Space
+from unrender.rendering.renderer import (
+    CountingSession,
+    ParameterInfo,
+    Renderer,
+    Rendering,
+    RenderSession,
+    SampleRequest,
+    Space,
+)
 
 __all__ = ["EXPOSURE", "ExposedPaths", "ExposedRenderer", "ExposedSession", "gains", "without_exposure"]
 
@@ -178,6 +186,12 @@ class ExposedSession:
             moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents))
         factors = self._gains(parameters, paths.rows)
         return moment * (factors * factors)
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `CountingSession.vertices`: ones where the inner session does not count."""
+        if isinstance(self._inner, CountingSession):
+            return self._inner.vertices(_scene(parameters), request)
+        return self._inner.image(_scene(parameters), replace(request, groups=1)).images[0] * 0.0 + 1.0
 
     def _gains(self, parameters: Tree, rows: Array) -> Array:
         """(1, 3), or (N, 3)."""

@@ -16,6 +16,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
 __all__ = [
+    "CountingSession",
     "LossWeights",
     "ParameterInfo",
     "RenderSession",
@@ -151,6 +152,16 @@ class RenderSession(Protocol):
         Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
         derivatives of a path.
         """
+        ...
+
+
+@runtime_checkable
+class CountingSession(Protocol):
+    """A session that can count what its paths cost."""
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """The mean number of vertices of a pixel's paths, the camera's not counted, from samples of the request: of the shape of one of its
+        images, all channels alike. A path that meets nothing has none."""
         ...
 
 

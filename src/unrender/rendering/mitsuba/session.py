@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,7 @@ from unrender.rendering.mitsuba.passes import (
     Pass,
     PosesPass,
     TangentPass,
+    VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -230,6 +231,13 @@ class MitsubaSession:
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
         return moments if paths.request.groups > 1 else moments[0]
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
+        """See `CountingSession.vertices`."""
+        self._set_parameters(parameters)
+        found = self._run(VerticesPass(), replace(request, groups=1))
+        dr.eval(found)
+        return self._develop(found, replace(request, groups=1))[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
