@@ -52,7 +52,15 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
     found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
         found.append(
-            entrant("adaptive, as the paper", "adaptive", relative=False, levels=4, uniform=0.1, learn_from_draws=False)
+            entrant(
+                "adaptive, as the paper",
+                "adaptive",
+                relative=False,
+                levels=4,
+                uniform=0.1,
+                learn_from_draws=False,
+                by_cost=False,
+            )
         )
     if task == "plain-and-textured":
         found.append(entrant("adaptive, five levels", "adaptive", levels=4))

@@ -31,7 +31,7 @@ def probabilities(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     paths = spp * pixel_count(problem)
     return pixel_probability(
         problem,
-        ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01, learn_from_draws=False),
+        ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01, learn_from_draws=False, by_cost=False),
         Key(seed),
     )
 
@@ -44,7 +44,7 @@ def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[s
 
     def adaptive(spp: int, denoiser: Any) -> PixelSampler:
         paths = spp * pixel_count(problem)
-        fixed: Any = {"uniform": 0.1, "learn_from_draws": False, "relative": False}
+        fixed: Any = {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "relative": False}
         return ur.pixels.Adaptive(COUNT, samples=paths, refresh=10 * runs, denoiser=denoiser, **fixed)
 
     uniform = float(np.mean([summed(ur.pixels.Uniform(COUNT), seed) for seed in range(repeats)]))

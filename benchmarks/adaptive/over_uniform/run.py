@@ -53,7 +53,7 @@ FOREIGN = ("plates, L2", "painting, L2", "tray, L2", "numbers, L2")
 SAMPLERS: dict[str, dict[str, Any]] = {
     "adaptive": {},
     "adaptive, pooling": {"denoiser": "pooling"},
-    "before": {"uniform": 0.1, "learn_from_draws": False, "denoiser": "none"},
+    "before": {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "denoiser": "none"},
 }
 STEPS = (0, 1, 3, 10, 30, 100)
 """At which the variance is measured: those done before."""

@@ -17,7 +17,10 @@ def table(record: Record) -> str:
         found = {name: entry[label] for name, entry in record["problems"].items() if label in entry}
         steps = [str(point["step"]) for point in next(iter(found.values()))]
         rows = [[name, *(_cell(point) for point in points)] for name, points in found.items()]
-        parts += [f"**{label}**, variance over uniform's after so many steps", markdown.table(["problem", *steps], rows)]
+        parts += [
+            f"**{label}**, variance over uniform's after so many steps",
+            markdown.table(["problem", *steps], rows),
+        ]
     direct = {
         name: [point for point in entry["adaptive"] if point["gradients"]]
         for name, entry in record["problems"].items()

@@ -24,9 +24,9 @@ __all__ = ["Adaptive"]
 @register
 @dataclass(frozen=True)
 class Adaptive:
-    """p_j = λ u_j + (1 - λ) q_j with q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²]), Eq. 12, summed over colours: of all
+    """p_j = λ u_j + (1 - λ) q_j with q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²] / c_j), Eq. 12, summed over colours: of all
     probabilities, those whose gradient has the least variance, summed over the parameters, when the two factors come from independent
-    paths, mixed with uniform sampling u.
+    paths; per cost c_j of a path, and mixed with uniform sampling u.
 
     Both factors are estimated from a few paths per tile of pixels, denoised; the second by one pass in forward mode with random ±1
     tangents (`Renderer.tangent_moment`). The samples of the first steps, and of one between two updates, add to both
@@ -43,7 +43,8 @@ class Adaptive:
     averaged over blocks of 2^d × 2^d tiles, which draws more pixels where the reference varies within a block. (The paper's blocks are
     of pixels; the two are the same where there are as many tiles as pixels.) The paper has D = 4, because in a sum of plain variances
     uniform regions can outweigh textured ones; relative variances need it less, and without levels the variance is smaller:
-    `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False)` is the paper's.
+    the paper's is
+    `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False, by_cost=False)`.
 
     Args:
         count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
@@ -62,9 +63,8 @@ class Adaptive:
         denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "pooling" with the tiles around
             (`pooling.pool`), "none", or "auto": optix on a GPU, oidn where it is installed, else pooling.
         learn_from_draws: learn from the samples of the steps, too; otherwise from the updates alone, as in the paper.
-        by_cost: let q_j be ∝ sqrt(... / c_j), with c_j what a path through the pixel costs: one, and two more for each vertex. Of all
-            probabilities these have the least variance times cost of a step; a path into the sky costs next to nothing. At as many
-            paths, the variance is larger.
+        by_cost: c_j = 1 + v / 2 for the mean number v of vertices of a path through the pixel, counted: the probabilities with the least
+            variance times cost of a step, since a path into the sky costs little. λ follows the cost, too. Otherwise c_j = 1.
     """
 
     count: int
@@ -76,7 +76,7 @@ class Adaptive:
     relative: bool = True
     denoiser: MapDenoiser = "auto"
     learn_from_draws: bool = True
-    by_cost: bool = False
+    by_cost: bool = True
 
     def __post_init__(self):
         self._sampler.check()

@@ -24,8 +24,8 @@ from unrender.problem.upsampling import SQUARES, Upsampler
 __all__ = ["GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
 
 _FEWEST_PATHS, _FIRST_PATHS = 4096, 8
-"""The default of `samples` at least: fewer do not resolve where in the images the importance is; and of the first update at most for each
-pixel of a mini-batch, where later ones have fewer."""
+"""The default of `samples` at least: fewer do not resolve where in the images the importance is. Of small mini-batches, for each pixel of
+one: updates are then the rarer."""
 
 _OBSERVED, _DECAY = 4, 0.9
 """Steps between updates of the gradient's second moment, and the decay of its running mean."""
@@ -230,18 +230,13 @@ class GuidedSampler:
 
     def _tiles(self, problem: Problem) -> Tiles:
         most = self._paths()
-        if self.options.samples is None and self._is_sparse:
+        if self.options.samples is None and self.rule.learns:
             most = max(most, min(_FEWEST_PATHS, _FIRST_PATHS * self.options.count))
         return cut(problem, max(most, len(problem.views)))
 
-    @property
-    def _is_sparse(self) -> bool:
-        """Whether updates may leave out tiles: those after the first add to what is known."""
-        return self.rule.learns and self.rule.levels == 0
-
     def _paths(self) -> int:
         """Paths of an importance-map update: `samples`, or a third of a mini-batch's pixels for each twenty steps between updates,
-        but 4096 at least, or for small mini-batches twice their pixels; the first has one for each tile at least."""
+        but 4096 at least, or for small mini-batches twice their pixels: on the average over updates, where there are more tiles."""
         options = self.options
         if options.samples is not None:
             return options.samples
@@ -252,18 +247,14 @@ class GuidedSampler:
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[GuidedSamplerState, int]:
         """The state with an importance map at these parameters, and how many paths were traced for it."""
-        tiles, paths = self._tiles(problem), self._paths()
+        tiles, paths, counted = self._tiles(problem), self._paths(), 0
         if self.rule.by_cost and state.refreshes % _COUNTED == 0:
-            state = replace(
-                state, costs=pixel_statistics.costs(problem, parameters, tiles, state.uniform_table, key.fold(3))
-            )
-        if state.maps and paths < len(tiles.views) and self._is_sparse:
-            sample = state.uniform_table.draw(paths, key, stratified=True)
-            scales = pixel_statistics.scales(parameters, state.second_moment)
-            draws = pixel_statistics.draw_statistics(problem, parameters, sample, key, scales)
-            updated = self._added(state, tiles, self._samples(tiles, sample, draws))
-            updated = self._mapped(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
-            return updated, 2 * paths
+            table = state.uniform_table
+            costs, counted = pixel_statistics.costs(problem, parameters, tiles, table, key.fold(3))
+            state = replace(state, costs=costs)
+        if state.maps and state.refreshes % math.ceil(len(tiles.views) / paths):
+            # Each tile has a path in an update, of which there are fewer: in between, what was learnt from the steps.
+            return self._mapped(problem, tiles, replace(state, age=0, refreshes=state.refreshes + 1)), counted
         spp = max(1, paths // len(tiles.views))
         references = [
             problem.renderer.array(tiles.coarsen(state.references, level)) for level in range(1, self.rule.levels + 1)
@@ -276,24 +267,18 @@ class GuidedSampler:
         every = np.arange(len(tiles.views))
         updated = self._added(state, tiles, _Samples(every, found, tiles.sizes.astype(np.float64), float(spp)))
         updated = self._mapped(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
-        return updated, statistics.samples
+        return updated, statistics.samples + counted
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
         """See `LearningSampler.learn`."""
         tiles = self._tiles(problem)
-        learnt = self._added(state, tiles, self._samples(tiles, sample, draws, state.shares))
+        tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
+        found = _finite(draws.moments), _finite(draws.squares)
+        learnt = self._added(state, tiles, _Samples(tile, found, 1 / state.shares[tile]))
         early = state.refreshes == 1 and state.age <= _FIRST
         return self._mapped(problem, tiles, learnt) if early else learnt
-
-    def _samples(
-        self, tiles: Tiles, sample: PixelSample, draws: DrawStatistics, shares: np.ndarray | None = None
-    ) -> _Samples:
-        """Of pixels drawn with these probabilities, None for uniform ones."""
-        tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
-        weights = np.ones(len(tile)) if shares is None else 1 / shares[tile]
-        return _Samples(tile, (_finite(draws.moments), _finite(draws.squares)), weights)
 
     def _added(self, state: GuidedSamplerState, tiles: Tiles, samples: _Samples) -> GuidedSamplerState:
         """The state with what samples tell of its maps and, where there were some before, of the share of uniform draws."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,16 +13,14 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.pixels.base import DrawStatistics
 from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import InverseCdfTable, Tiles
-from unrender.problem.batches import PixelBatch, PixelSample
+from unrender.problem.batches import PixelBatch
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import CountingSession
 
 __all__ = [
     "PixelStatistics",
-    "draw_statistics",
     "estimate_statistics",
     "random_signs",
     "random_tangents",
@@ -115,9 +113,14 @@ def estimate_statistics(
     )
 
 
-def costs(problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key) -> np.ndarray:
-    """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1: each vertex adds a segment and a
-    connection to an emitter. From one path in each tile, pooled; ones where the renderer does not count.
+def costs(
+    problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key
+) -> tuple[np.ndarray, int]:
+    """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1; and how many paths that took.
+
+    1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor a mini-batch of 16384 paths
+    into the sky takes as long as one of paths of a vertex or less; of 2048, where a launch has its own cost, as one of several.) From
+    one path in each tile, pooled; ones where the renderer does not count.
 
     Args:
         problem, parameters: what to render.
@@ -127,31 +130,11 @@ def costs(problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: Inver
     """
     session = problem.renderer.prepare(list(parameters), None)
     if not isinstance(session, CountingSession):
-        return np.ones(len(tiles.views))
+        return np.ones(len(tiles.views)), 0
     batch = PixelBatch(problem, uniform_table.draw_per_tile(1, key.fold(0)))
     vertices = arrays.numpy(session.vertices(parameters, batch.request(1, key.fold(1).uint32())))
     means = pool(tiles, vertices[:, :1].astype(np.float64), np.ones(len(tiles.views)), _COST_PRIOR)
-    return 1 + 2 * means[:, 0]
-
-
-def draw_statistics(problem: Problem, parameters: Tree, sample: PixelSample, key: Key, scales: Tree) -> DrawStatistics:
-    """What one path through each of some pixels tells.
-
-    Args:
-        problem, parameters: what to render.
-        sample: the pixels; their weights are of no account.
-        key: of the random numbers.
-        scales: of the tangents, in the coordinates of the descent.
-    """
-    batch = PixelBatch(problem, replace(sample, weights=sample.weights * 0 + 1))
-    session = problem.renderer.prepare(list(parameters), None)
-    rendering = session.image(parameters, batch.request(1, key.fold(1).uint32()))
-    derivative = batch.loss_derivative(rendering.images[0])
-    tangents = random_tangents(problem, parameters, scales, key.fold(2))
-    moments = session.tangent_moment(parameters, rendering.paths, tangents)
-    arrays.evaluate(derivative, moments)
-    squares, moments = (arrays.numpy(x).astype(np.float64) for x in (derivative * derivative, moments))
-    return DrawStatistics(squares, moments)
+    return 1 + means[:, 0] / 2, len(tiles.views)
 
 
 def _round(
