@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -188,13 +188,15 @@ def pixel_shares(problem: ur.Problem, sampler: Any, state: Any) -> np.ndarray:
     return np.concatenate(found)
 
 
-def second_moments(problem: ur.Problem, at: Tree, scales: np.ndarray, paths: int, parts: int, key: Key) -> np.ndarray:
-    """Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²] of each pixel of all views, (parts, pixels), independent: from about `paths` paths in all, the two
-    factors from different ones, by single paths.
+def second_moments(
+    problem: ur.Problem, at: Tree, scales: Sequence[np.ndarray], paths: int, parts: int, key: Key
+) -> np.ndarray:
+    """Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²] of each pixel of all views, (len(scales), parts, pixels), parts independent: from about `paths` paths
+    in all, the two factors from different ones, by single paths.
 
     Args:
         problem, at: what is rendered.
-        scales: factors of the elements' derivatives in the coordinates of the descent, (n,).
+        scales: factors of the elements' derivatives in the coordinates of the descent, (n,) each.
         paths: how many; 8 a pixel and part at least.
         parts: independent estimates.
         key: of the random numbers.
@@ -202,35 +204,27 @@ def second_moments(problem: ur.Problem, at: Tree, scales: np.ndarray, paths: int
     from unrender.pixels.pixel_statistics import random_tangents
 
     each = 8
-    pixels = sum(int(np.prod(np.shape(view.reference)[:2])) for view in problem.views)
-    rounds = max(1, round(paths / (pixels * parts * each)))
+    rounds = max(1, round(paths / (problem.pixels * parts * each)))
     session = prepare(problem, at)
-    factors = {name: problem.renderer.array(value) for name, value in _split(at, scales).items()}
-    found = []
+    factors = [{name: problem.renderer.array(value) for name, value in _split(at, one).items()} for one in scales]
+    found = np.zeros((len(scales), parts, problem.pixels))
     for part in range(parts):
-        views = []
+        first = 0
         for index, view in enumerate(problem.views):
             squares, moments = [], []
             for turn in range(rounds):
                 of_turn = key.fold(part).fold(index).fold(turn)
                 rendering = session.image(at, SampleRequest(view.sensor, each, of_turn.uint32(), each))
-                tangents = random_tangents(problem, at, factors, of_turn.fold(1))
                 derivative = arrays.numpy(problem.loss_derivative(index, rendering.images)).astype(np.float64)
                 squares.append(np.square(derivative).reshape(2, each // 2, -1, 3).mean(axis=1))
-                moment = arrays.numpy(session.tangent_moment(at, rendering.paths, tangents)).astype(np.float64)
-                moments.append(moment.reshape(2, each // 2, -1, 3).mean(axis=1))
+                along = [random_tangents(problem, at, one, of_turn.fold(1)) for one in factors]
+                told = [arrays.numpy(session.tangent_moment(at, rendering.paths, one)) for one in along]
+                moments.append(np.reshape(told, (len(scales), 2, each // 2, -1, 3)).mean(axis=2, dtype=np.float64))
             a, b = np.mean(squares, axis=0), np.mean(moments, axis=0)
-            views.append((a * b[::-1]).sum(axis=(0, 2)))
-        found.append(np.concatenate(views))
-    return np.array(found)
-
-
-def gradient_of(problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2) -> list[np.ndarray]:
-    """The gradient from a pixel mini-batch, in the coordinates of the descent."""
-    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch)
-    coordinates = problem.coordinates
-    moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
-    return [arrays.numpy(value) for value in moved.values()]
+            last = first + a.shape[1]
+            found[:, part, first:last] = (a[::-1] * b).sum(axis=(1, 3))
+            first = last
+    return found
 
 
 def method_parts(name: str, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:

@@ -158,7 +158,7 @@ def run(
         if "race" in part:
             chosen = [e for e in everyone if not only or e.name in only]
             conditions = {"options": options, "count": pixel_count, "seconds": seconds, "seeds": seeds}
-            budget = {"steps": steps} if steps else {"seconds": seconds}
+            budget: dict[str, Any] = {"steps": steps} if steps else {"seconds": seconds}
             conditions |= budget
             found["entries"] = {task: {**conditions, "methods": race(made, chosen, seeds, **budget)}}
         yield {**found, "seconds_per_path": {task: costs(made, everyone, RATES[0], rounds)}}

@@ -161,8 +161,10 @@ def point(
     scales = element_scales(at, np.square(np.concatenate([ours, theirs])).mean(axis=0, dtype=np.float64))
     shares = pixel_shares(problem, adaptive, state)
     found: dict[str, Any] = {"step": step, "uniform": state.uniform, "ratio": [], "error": [], "gradients": []}
-    for factors in (np.ones(theirs.shape[1]), scales):
-        ratio, error = by_paths(second_moments(problem, at, factors, settings["paths"], PARTS, Key(step, 7)), shares)
+    both = [np.ones(theirs.shape[1]), scales]
+    moments = second_moments(problem, at, both, settings["paths"], PARTS, Key(step, 7))
+    for factors, of_factors in zip(both, moments, strict=True):
+        ratio, error = by_paths(of_factors, shares)
         found["ratio"].append(ratio)
         found["error"].append(error)
         if direct:
@@ -202,7 +204,7 @@ def run(
     sampler: tuple[str, ...] = tuple(SAMPLERS),
     count: int = 1000,
     runs: int = 128,
-    paths: int = 1 << 18,
+    paths: int = 1 << 17,
     seed: int = 0,
     gallery_reference_spp: int | None = None,
 ) -> Iterator[dict[str, Any]]:

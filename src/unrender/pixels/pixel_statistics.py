@@ -118,9 +118,9 @@ def costs(
 ) -> tuple[np.ndarray, int]:
     """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1; and how many paths that took.
 
-    1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor a mini-batch of 16384 paths
-    into the sky takes as long as one of paths of a vertex or less; of 2048, where a launch has its own cost, as one of several.) From
-    one path in each tile, pooled; ones where the renderer does not count.
+    1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor a path into the sky costs as
+    much as half a vertex in mini-batches of 16384 pixels, as four in ones of 2048, where launches themselves cost.) From one path in
+    each tile, pooled; ones where the renderer does not count.
 
     Args:
         problem, parameters: what to render.
