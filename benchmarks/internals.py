@@ -191,8 +191,8 @@ def pixel_shares(problem: ur.Problem, sampler: Any, state: Any) -> np.ndarray:
 def second_moments(
     problem: ur.Problem, at: Tree, scales: Sequence[np.ndarray], paths: int, parts: int, key: Key
 ) -> np.ndarray:
-    """Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²] of each pixel of all views, (len(scales), parts, pixels), parts independent: from about `paths` paths
-    in all, the two factors from different ones, by single paths.
+    """Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²] of each pixel of all views by single paths, (len(scales), parts, pixels), parts independent: from
+    about `paths` paths in all, the two factors from different ones.
 
     Args:
         problem, at: what is rendered.
@@ -225,6 +225,14 @@ def second_moments(
             found[:, part, first:last] = (a[::-1] * b).sum(axis=(1, 3))
             first = last
     return found
+
+
+def gradient_of(problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2) -> list[np.ndarray]:
+    """The gradient from a pixel mini-batch, in the coordinates of the descent."""
+    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch)
+    coordinates = problem.coordinates
+    moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
+    return [arrays.numpy(value) for value in moved.values()]
 
 
 def method_parts(name: str, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
