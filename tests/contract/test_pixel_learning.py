@@ -14,6 +14,8 @@ from unrender.core.random import Key
 from unrender.estimators.sample_groups import gather
 from unrender.images.plain import PlainState
 from unrender.pixels import pixel_statistics
+from unrender.pixels.pooling import pool
+from unrender.pixels.tiles import cut
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
 
@@ -110,6 +112,32 @@ def test_maps_count_the_samples_of_the_first_steps_and_of_one_between_updates() 
         assert [count > 4 for count in learnt] == (
             [True] * 4 + [False, False, True, False] if learns else [True] + [False] * 5 + [True, False]
         )
+
+
+def test_probabilities_go_with_one_over_the_root_of_the_cost() -> None:
+    """Where the renderer counts the vertices of paths: here six in the second view, none in the first."""
+
+    class Counting(AnalyticRenderer):
+        def vertices(self, parameters: Any, request: Any) -> np.ndarray:
+            del parameters
+            return np.repeat(np.where(np.asarray(request.sensors) == 1, 6.0, 0.0)[:, None], 3, axis=1)
+
+    base = few_pixels(1.0, views=2)
+    inner = base.renderer
+    assert isinstance(inner, AnalyticRenderer)
+    counting = Counting({"x": np.full(4, 0.6)}, inner.matrix, 0.1, 0.5, shape=(8, 8), sensors=2)
+    asked = ur.Problem(counting, base.parameters, base.views)
+    shares = []
+    for by_cost in (False, True):
+        sampler = ur.pixels.Adaptive(128, samples=128, uniform=1e-9, denoiser="none", by_cost=by_cost)
+        batch, state = sampler.draw(asked, asked.initial(), sampler.init(asked, asked.initial()), Key(0))
+        shares.append(state.shares)
+        assert batch.samples == 2 * 128 + 128 * by_cost
+    tiles = cut(asked, 128)
+    known = pool(tiles, np.repeat([0.0, 6.0], 64)[:, None], np.ones(128), 4.0)[:, 0]
+    ratio = shares[1] / shares[0] * np.sqrt(1 + known / 2)
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+    assert known[64:].min() > 3 > known[:64].max()
 
 
 def test_a_run_goes_on_from_a_packed_state_to_the_bit() -> None:

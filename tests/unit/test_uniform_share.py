@@ -90,6 +90,14 @@ def test_few_samples_or_heavy_tails_keep_it_large() -> None:
     assert uniform_share.choose(both) >= 0.5
 
 
+def test_where_the_map_draws_what_is_dear_more_stays_uniform() -> None:
+    density = np.tile([0.5, 1.5], 500)
+    found = evidence(density, density)
+    shares = [uniform_share.choose(found, cost) for cost in (0.5, 1.0, 1.5, 10.0)]
+    assert shares == sorted(shares)
+    assert shares[0] < shares[-1] == MOST
+
+
 def test_samples_tell_the_second_moment_under_other_probabilities() -> None:
     """Drawn with any probabilities p, over p: Σ s / p(λ). A sample that is not divided by its own is seen."""
     rng = np.random.default_rng(2)

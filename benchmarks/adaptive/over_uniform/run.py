@@ -193,7 +193,7 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
             last = np.array([points[-1]["ratio"] for points in entries])
             every = [(at["ratio"], at["error"]) for points in entries for at in points]
             worst = [max((ratio[n], error[n]) for ratio, error in every) for n in range(2)]
-            found[name] = {"mean": np.exp(np.log(last).mean(axis=0)).tolist(), "worst": worst}
+            found[name] = {"problems": len(entries), "mean": np.exp(np.log(last).mean(axis=0)).tolist(), "worst": worst}
     return {"summary": found}
 
 

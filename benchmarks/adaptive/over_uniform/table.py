@@ -35,8 +35,8 @@ def table(record: Record) -> str:
     rows = []
     for label, summary in record["summary"].items():
         worst = [f"{ratio:.2f} ± {error:.1g}" for ratio, error in summary["worst"]]
-        rows.append([label, *(f"{mean:.2f}" for mean in summary["mean"]), *worst])
-    head = ["sampler", "geometric mean at the end, plain", "relative", "worst of all steps, plain", "relative"]
+        rows.append([label, summary["problems"], *(f"{mean:.2f}" for mean in summary["mean"]), *worst])
+    head = ["sampler", "problems", "geometric mean at the end, plain", "relative", "worst of all steps, plain", "relative"]
     return markdown.blocks(*parts, markdown.table(head, rows))
 
 
