@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,9 @@ __all__ = [
     "black_box",
     "coupled_gradients",
     "dr",
+    "element_scales",
     "from_tensor",
+    "gradient_of",
     "hardly_seen",
     "hardware",
     "image_step",
@@ -63,9 +65,11 @@ __all__ = [
     "mi",
     "mitsuba_renderer",
     "pixel_probability",
+    "pixel_shares",
     "prepare",
     "project",
     "scene_description",
+    "second_moments",
     "stock_scene",
     "time_run_folder",
     "trees",
@@ -157,6 +161,78 @@ def pixel_probability(problem: ur.Problem, sampler: PixelSampler, key: Key) -> n
     at = problem.initial()
     batch, _ = sampler.draw(problem, at, sampler.init(problem, at), key)
     return batch.probability[0]
+
+
+def element_scales(like: Tree, squares: np.ndarray) -> np.ndarray:
+    """What adaptive pixels multiply the derivative of each element by, for mean squared gradients (n,) in the order of `like`."""
+    from unrender.pixels.pixel_statistics import scales
+
+    tree = _split(like, squares)
+    return np.concatenate([np.ravel(x) for x in scales(tree, tree).values()])
+
+
+def _split(like: Tree, values: np.ndarray) -> dict[str, np.ndarray]:
+    shapes = trees.shapes(like)
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
+    parts = np.split(values, ends[:-1])
+    return {key: part.reshape(shape) for (key, shape), part in zip(shapes.items(), parts, strict=True)}
+
+
+def pixel_shares(problem: ur.Problem, sampler: Any, state: Any) -> np.ndarray:
+    """Probabilities of the pixels of all views, relative to uniform ones, by an adaptive sampler's state."""
+    tiles = sampler._sampler._tiles(problem)
+    found = []
+    for part, grid, view in zip(tiles.split(state.shares), tiles.grids, problem.views, strict=True):
+        height, width = problem.renderer.resolutions()[view.sensor]
+        found.append(part.repeat(grid.side, axis=0)[:height].repeat(grid.side, axis=1)[:, :width].ravel())
+    return np.concatenate(found)
+
+
+def second_moments(
+    problem: ur.Problem, at: Tree, scales: Sequence[np.ndarray], paths: int, parts: int, key: Key
+) -> np.ndarray:
+    """Σ_c E[(∂L/∂I)²] Σ_k E[(∂I/∂θ_k)²] of each pixel of all views by single paths, (len(scales), parts, pixels), parts independent: from
+    about `paths` paths in all, the two factors from different ones.
+
+    Args:
+        problem, at: what is rendered.
+        scales: factors of the elements' derivatives in the coordinates of the descent, (n,) each.
+        paths: how many; 8 a pixel and part at least.
+        parts: independent estimates.
+        key: of the random numbers.
+    """
+    from unrender.pixels.pixel_statistics import random_tangents
+
+    each = 8
+    rounds = max(1, round(paths / (problem.pixels * parts * each)))
+    session = prepare(problem, at)
+    factors = [{name: problem.renderer.array(value) for name, value in _split(at, one).items()} for one in scales]
+    found = np.zeros((len(scales), parts, problem.pixels))
+    for part in range(parts):
+        first = 0
+        for index, view in enumerate(problem.views):
+            squares, moments = [], []
+            for turn in range(rounds):
+                of_turn = key.fold(part).fold(index).fold(turn)
+                rendering = session.image(at, SampleRequest(view.sensor, each, of_turn.uint32(), each))
+                derivative = arrays.numpy(problem.loss_derivative(index, rendering.images)).astype(np.float64)
+                squares.append(np.square(derivative).reshape(2, each // 2, -1, 3).mean(axis=1))
+                along = [random_tangents(problem, at, one, of_turn.fold(1)) for one in factors]
+                told = [arrays.numpy(session.tangent_moment(at, rendering.paths, one)) for one in along]
+                moments.append(np.reshape(told, (len(scales), 2, each // 2, -1, 3)).mean(axis=2, dtype=np.float64))
+            a, b = np.mean(squares, axis=0), np.mean(moments, axis=0)
+            last = first + a.shape[1]
+            found[:, part, first:last] = (a[::-1] * b).sum(axis=(1, 3))
+            first = last
+    return found
+
+
+def gradient_of(problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2) -> list[np.ndarray]:
+    """The gradient from a pixel mini-batch, in the coordinates of the descent."""
+    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch)
+    coordinates = problem.coordinates
+    moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
+    return [arrays.numpy(value) for value in moved.values()]
 
 
 def method_parts(name: str, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:

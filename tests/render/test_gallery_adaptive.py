@@ -11,7 +11,7 @@ import unrender as ur
 from tiers import quick
 from unrender.gallery import skies, two_planets
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.renderer import CountingSession, SampleRequest
 
 SPP = 1024
 SMALL = {
@@ -269,6 +269,18 @@ def test_only_paths_of_six_segments_reach_the_enclosed_planet_and_they_are_noisy
     assert at_depth(problem, 2)[free].mean() > 0.05
     spread = renders(problem, problem.truth, 0).std(axis=0).mean(axis=-1)
     assert np.median(spread[inner]) > 2 * np.median(spread[free])
+
+
+@pytest.mark.slow
+def test_paths_into_the_sky_have_no_vertices_and_those_through_glass_the_most():
+    problem = ur.gallery.problem("two-planets", **SMALL["two-planets"], reference_spp=1)
+    start = problem.initial()
+    session = problem.renderer.prepare(list(start), None)
+    assert isinstance(session, CountingSession)
+    count = np.array(session.vertices(start, SampleRequest(0, 64, 1)))[..., 0]
+    names = seen(problem)
+    assert np.median(count[names == ""]) == 0
+    assert 1 <= np.median(count[names == "free"]) < np.median(count[names == "glass"]) <= 6
 
 
 @pytest.mark.parametrize("planet", [two_planets.blue, two_planets.red])

@@ -24,7 +24,7 @@ SCHEMES: dict[str, Any] = {
     "loss": lambda: ur.PathGradient(pixels=ur.pixels.LossProportional(COUNT), spp=2),
     "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(COUNT), spp=2),
     "adaptive, as in the paper": lambda: ur.PathGradient(
-        pixels=ur.pixels.Adaptive(COUNT, stratified=False, levels=0), spp=1
+        pixels=ur.pixels.Adaptive(COUNT, stratified=False, uniform=0.1, learn_from_draws=False, by_cost=False), spp=1
     ),
 }
 

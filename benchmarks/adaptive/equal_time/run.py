@@ -7,6 +7,10 @@ memories` adds, on small images, a control variate and coupled meta-estimation, 
 Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios are to uniform mini-batches,
 at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may change between
 runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
+
+`--steps 5000` races by steps, with rates that fall along half a cosine; `time` is then that in which each method first
+reaches the least error that all reach, over that of uniform mini-batches. Large pictures: `--resolution 1024`; many
+views: `--views 16`.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.pixel_schemes import pixels
-from benchmarks.races import Entrant, Runs, over, race, tenths
+from benchmarks.races import Entrant, Runs, over, race, reached, tenths
 
 FINE = {"resolution": 192, "texture_resolution": 192}
 TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
@@ -36,16 +40,28 @@ MERGE = ("entries.*.methods", "seconds_per_path.*")
 QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 
 
-def entrants(task: str, count: int) -> list[Entrant]:
-    """Who races."""
-    adam = ur.optimizers.Adam
+def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
+    """Who races; rates fall over so many steps, or are constant."""
+
+    def adam(rate: float) -> ur.optimizers.Adam:
+        return ur.optimizers.Adam(rate, schedule=ur.schedules.Cosine(steps)) if steps else ur.optimizers.Adam(rate)
 
     def entrant(label: str, scheme: str, **options: Any) -> Entrant:
         return Entrant(label, label, ur.PathGradient(pixels=pixels(scheme, count, **options), spp=2), adam, RATES)
 
     found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        found.append(entrant("adaptive, as the paper", "adaptive", relative=False, levels=4))
+        found.append(
+            entrant(
+                "adaptive, as the paper",
+                "adaptive",
+                relative=False,
+                levels=4,
+                uniform=0.1,
+                learn_from_draws=False,
+                by_cost=False,
+            )
+        )
     if task == "plain-and-textured":
         found.append(entrant("adaptive, five levels", "adaptive", levels=4))
     if task == "two-planets, memories":
@@ -93,7 +109,17 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
     for task, entry in record["entries"].items():
         runs = timed(entry["methods"], record["seconds_per_path"][task])
         entries[task] = {**entry, "errors": tenths(runs, 0), "over uniform": over(runs, "uniform")}
+        if entry.get("steps"):
+            entries[task]["time"] = times(runs)
     return {"entries": entries}
+
+
+def times(runs: Runs) -> dict[str, float | None]:
+    """When each method first has the least error that all have in the end, over when uniform mini-batches do."""
+    level = max(float(np.median([run[-1][2] for run in found])) for found in runs.values())
+    first = {name: reached(found, level, 0) for name, found in runs.items()}
+    uniform = first["uniform"]
+    return {name: second / uniform if second and uniform else None for name, second in first.items()}
 
 
 def run(
@@ -102,6 +128,8 @@ def run(
     seeds: int = 5,
     resolution: int | None = None,
     count: int | None = None,
+    steps: int | None = None,
+    views: int | None = None,
     only: tuple[str, ...] = (),
     part: tuple[str, ...] = ("race", "cost"),
     rounds: int = 5,
@@ -112,17 +140,25 @@ def run(
         seconds: budget of every run
         resolution: film size, for GPUs
         count: pixels a step
+        steps: of every run, in place of its seconds, with falling rates
+        views: how many, where the problem takes them
         only: methods to run; the others' figures stay
         part: measured; the other's figures stay
         rounds: of turns of the cost
     """
     for task in problem:
         name, options, usual = TASKS[task]
-        options = {**options, **({"resolution": resolution} if resolution else {})}
+        options = {
+            **options,
+            **({"resolution": resolution} if resolution else {}),
+            **({"views": views} if views else {}),
+        }
         made, pixel_count, found = ur.gallery.problem(name, **options), count or usual, {}
-        everyone = entrants(task, pixel_count)
+        everyone = entrants(task, pixel_count, steps)
         if "race" in part:
             chosen = [e for e in everyone if not only or e.name in only]
             conditions = {"options": options, "count": pixel_count, "seconds": seconds, "seeds": seeds}
-            found["entries"] = {task: {**conditions, "methods": race(made, chosen, seeds, seconds=seconds)}}
+            budget: dict[str, Any] = {"steps": steps} if steps else {"seconds": seconds}
+            conditions |= budget
+            found["entries"] = {task: {**conditions, "methods": race(made, chosen, seeds, **budget)}}
         yield {**found, "seconds_per_path": {task: costs(made, everyone, RATES[0], rounds)}}

@@ -20,6 +20,11 @@ def table(record: Record) -> str:
             *(f"over uniform, at tenths of the {by}" for by in entry["over uniform"]),
         ]
         sizes = ", ".join(f"{key}={value}" for key, value in entry["options"].items())
-        summary = f"{entry['count']} pixels a step, {entry['seconds']:g} s, {entry['seeds']} seeds"
-        parts.append(f"**{name}**{f' ({sizes})' if sizes else ''}, {summary}.\n\n{markdown.table(head, rows)}")
+        budget = f"{entry['steps']} steps, falling rates" if entry.get("steps") else f"{entry['seconds']:g} s"
+        summary = f"{entry['count']} pixels a step, {budget}, {entry['seeds']} seeds"
+        text = f"**{name}**{f' ({sizes})' if sizes else ''}, {summary}.\n\n{markdown.table(head, rows)}"
+        if "time" in entry:
+            found = (f"{method} {'never' if x is None else f'{x:.2f}'}" for method, x in entry["time"].items())
+            text += f"\n\nTime to the least error that all reach, over that of uniform pixels: {', '.join(found)}."
+        parts.append(text)
     return "\n\n".join(parts)

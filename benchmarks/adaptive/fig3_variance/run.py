@@ -55,7 +55,8 @@ def run(runs: int = 1024, count: int = 512, samples: int = 1 << 15, resolution: 
     for spp, stratified in ((1, False), (2, False), (1, True), (2, True)):
         for label, levels in (*((scheme, {}) for scheme in SCHEMES), (FIVE_LEVELS, {"levels": 4})):
             scheme = "adaptive" if label == FIVE_LEVELS else label
-            options: dict[str, Any] = {"stratified": stratified, "samples": samples, "refresh": 10 * runs}
+            fixed = {"uniform": 0.1, "learn_from_draws": False, "by_cost": False}
+            options: dict[str, Any] = {"stratified": stratified, "samples": samples, "refresh": 10 * runs, **fixed}
             sampler = pixels(scheme, count, **options, **levels)
             rows, paths, probability = gradients(problem, ur.PathGradient(pixels=sampler, spp=spp), runs)
             if paths != budget:

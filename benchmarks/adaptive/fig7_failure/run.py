@@ -29,7 +29,11 @@ def pixel_count(problem: ur.Problem) -> int:
 def probabilities(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     """Raw probabilities over uniform ones, one per pixel of view 0."""
     paths = spp * pixel_count(problem)
-    return pixel_probability(problem, ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01), Key(seed))
+    return pixel_probability(
+        problem,
+        ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01, learn_from_draws=False, by_cost=False),
+        Key(seed),
+    )
 
 
 def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[str, Any]:
@@ -40,7 +44,8 @@ def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[s
 
     def adaptive(spp: int, denoiser: Any) -> PixelSampler:
         paths = spp * pixel_count(problem)
-        return ur.pixels.Adaptive(COUNT, samples=paths, refresh=10 * runs, denoiser=denoiser, relative=False)
+        fixed: Any = {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "relative": False}
+        return ur.pixels.Adaptive(COUNT, samples=paths, refresh=10 * runs, denoiser=denoiser, **fixed)
 
     uniform = float(np.mean([summed(ur.pixels.Uniform(COUNT), seed) for seed in range(repeats)]))
     samplers = {"few": adaptive(FEW, "none"), "few, denoised": adaptive(FEW, "auto"), "many": adaptive(many, "none")}

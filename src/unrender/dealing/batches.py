@@ -8,10 +8,11 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.dealing.messages import Batch
+from unrender.pixels.base import DrawStatistics
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["split"]
+__all__ = ["joined", "split"]
 
 _SIZES = 16
 """A share's part of a mini-batch is filled up to one of so many sizes, since each is a kernel of its own."""
@@ -53,3 +54,15 @@ def split(problem: Problem, sample: PixelSample, shares: Sequence[Sequence[int]]
             )
         )
     return found
+
+
+def joined(parts: Sequence[tuple[Batch, DrawStatistics]]) -> DrawStatistics | None:
+    """What the samples of all shares tell, in the mini-batch's order; None where no share was asked."""
+    if not parts:
+        return None
+    squares, moments = (np.zeros((parts[0][0].count, 3)) for _ in range(2))
+    for batch, draws in parts:
+        drawn = batch.weights > 0
+        squares[batch.positions[drawn]] = draws.squares[drawn]
+        moments[batch.positions[drawn]] = draws.moments[drawn]
+    return DrawStatistics(squares, moments)

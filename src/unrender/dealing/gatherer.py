@@ -15,7 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.dealing import capacity
 from unrender.dealing.assignment import total
-from unrender.dealing.batches import split
+from unrender.dealing.batches import joined, split
 from unrender.dealing.hosts import Hosts
 from unrender.dealing.memories import Memories, Memory, Recipe
 from unrender.dealing.messages import Call, ImageState, Pair, Pilot, Reply, payload_bytes
@@ -131,7 +131,9 @@ class DealtViews:
         self._in_step = False
         if isinstance(kept, Memory):
             self._bound(kept)
-        return self._sample(request, [replies[index] for index in sorted(replies)], kept)
+        found = self._sample(request, [replies[index] for index in sorted(replies)], kept)
+        told = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
+        return replace(found, draws=joined([(part, draws) for part, draws in told if draws is not None]))
 
     def pilot(self, request: PilotRequest) -> list[np.ndarray]:
         """See `Gatherer.pilot`."""
@@ -218,6 +220,9 @@ class DealtViews:
             number = None if memory is None else memory.number
             state = ImageState(known, number, request.state.snapshot is not None, request.state.step)
         asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step)
+        tangents = request.tangents
+        if tangents is not None:
+            tangents = {key: arrays.numpy(value) for key, value in tangents.items()}
         self._calls += 1
         call = Call(
             numbered(request.parameters),
@@ -227,6 +232,7 @@ class DealtViews:
             request.key,
             request.adjoint_spp,
             asked,
+            tangents=tangents,
             tolerance=request.tolerance,
             fresh=request.fresh,
             pictures=self._calls % _PICTURES_EVERY == 1,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.random import Key
+from unrender.pixels.base import DrawStatistics
 from unrender.rendering.renderer import Space
 
 __all__ = ["Batch", "Call", "Difference", "ImageState", "Pair", "Pilot", "Reply", "payload_bytes"]
@@ -108,6 +109,7 @@ class Call:
         spp, adjoint_spp, key, pair, tolerance, fresh: of the request.
         batch: the pixels; None for whole views.
         pilot: whether no gradient is wanted, but what paths through these pixels find.
+        tangents: along which the squared derivatives of the drawn pixels are wanted; None where they are not.
     """
 
     parameters: References
@@ -119,6 +121,7 @@ class Call:
     pair: Pair | None = None
     batch: Batch | None = None
     pilot: Pilot | None = None
+    tangents: dict[str, np.ndarray] | None = None
     tolerance: float = 0.0
     fresh: bool = False
     result: int | None = None
@@ -142,6 +145,7 @@ class Reply:
         info: {name: {view: array}} likewise.
         seconds: that it took.
         paths: what a pilot found of each of the call's pixels.
+        draws: what the samples of a mini-batch's pixels tell, in the batch's order; None where it was not wanted.
     """
 
     gradient: dict[str, np.ndarray]
@@ -153,13 +157,14 @@ class Reply:
     info: dict[str, dict[int, np.ndarray]]
     seconds: float
     paths: tuple[np.ndarray, ...] = ()
+    draws: DrawStatistics | None = None
 
 
 def payload_bytes(message: Any) -> int:
     """Bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Difference, Batch, Pilot)):
+    if isinstance(message, (Difference, Batch, DrawStatistics, Pilot)):
         return sum(payload_bytes(value) for value in vars(message).values())
     if isinstance(message, (Call, Reply)):
         return sum(payload_bytes(value) for value in vars(message).values())

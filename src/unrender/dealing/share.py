@@ -51,7 +51,13 @@ class ViewShare:
             self._remember(call, self._replayed(call, request))
             return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started)
         frames: list[tuple[int, Frame]] = [(-1, self._batch(call.batch))] if call.batch is not None else self._whole()
-        parts = [gather_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
+        tangents = call.tangents
+        if tangents is not None:
+            tangents = {key: self.problem.renderer.array(value) for key, value in tangents.items()}
+        parts = [
+            gather_frame(self.problem, request, frame, call.key.fold(max(index, 0)), tangents)
+            for index, frame in frames
+        ]
         kept = tuple(part.kept for part in parts)
         arrays.evaluate(kept, [(part.gradient, part.previous, part.fresh, part.loss) for part in parts])
         if call.batch is None:
@@ -78,6 +84,7 @@ class ViewShare:
             {index: arrays.numpy(part.image) for index, part in shown},
             info,
             time.perf_counter() - started,
+            parts[0].draws if call.batch is not None else None,
         )
 
     def store(self, number: int, packed: Packed) -> None:

@@ -18,7 +18,7 @@ from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixe
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
-from unrender.pixels.base import PixelSampler, RepeatableSampler
+from unrender.pixels.base import PixelSampler, RepeatableSampler, learned
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import SQUARES, Upsampler, upsampled
 from unrender.rendering.renderer import Space
@@ -314,4 +314,5 @@ class MetaEstimator:
         step = gather(problem, parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
+            pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         return step, pixels

@@ -17,7 +17,7 @@ from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
 from unrender.pixels.all import All
-from unrender.pixels.base import MiniBatch, PixelSampler
+from unrender.pixels.base import MiniBatch, PixelSampler, learned
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler, upsampled
 
@@ -144,6 +144,7 @@ class PathGradient:
             fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
         )
         pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
+        pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         whole, image = batch.sample is None, step.image
         if whole and not isinstance(self.pixels, All):
             image = prepared(problem, self.image, image)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
@@ -15,7 +17,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.damping import damping, smoothed_variance
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.all import All
-from unrender.pixels.base import MiniBatch, PixelSampler
+from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import RenderSession, SampleRequest
@@ -56,6 +58,7 @@ class GradientSample:
         samples: paths traced for images, adjoints and the probabilities of pixels.
         info: for people, {name: {view: array}}: of the image estimator for whole views, and of the pixels' probabilities.
         image: the image estimator's next state.
+        draws: what the samples of a pixel mini-batch tell of its pixels; None where it was not asked for.
     """
 
     gradient: Tree
@@ -66,6 +69,7 @@ class GradientSample:
     samples: int
     info: dict[str, dict[int, Any]]
     image: Any
+    draws: DrawStatistics | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,11 @@ class GatherRequest:
     batch: MiniBatch | None = None
     tolerance: float = 0.0
     fresh: bool = False
+
+    @property
+    def tangents(self) -> Tree | None:
+        """Along which the squared derivatives of the drawn pixels are wanted. Of a pair of states they are not known."""
+        return self.batch.tangents if self.batch is not None and self.pair_request is None else None
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
@@ -135,7 +144,9 @@ def gather(
         return problem.gatherer.gather(request)
     sample = batch.sample if batch else None
     frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
-    parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
+    parts = [
+        gather_frame(problem, request, frame, key.fold(index), request.tangents) for index, frame in enumerate(frames)
+    ]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
     for frame, part in zip(frames, parts, strict=True):
@@ -152,6 +163,7 @@ def gather(
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
         info=info,
         image=image.advance(parameters, state, tuple(part.kept for part in parts)) if sample is None else state,
+        draws=parts[0].draws if sample is not None else None,
     )
 
 
@@ -177,10 +189,13 @@ class FrameGradient:
     samples: int
     info: Mapping[str, Any]
     kept: Any
+    draws: DrawStatistics | None = None
 
 
-def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Key) -> FrameGradient:
-    """The part of one frame; `key` is the frame's own."""
+def gather_frame(
+    problem: Problem, request: GatherRequest, frame: Frame, key: Key, tangents: Tree | None = None
+) -> FrameGradient:
+    """The part of one frame; `key` is the frame's own, `tangents` of `GatherRequest` for a mini-batch."""
     parameters, image, state, spp, adjoint_spp = (
         request.parameters,
         request.image,
@@ -211,7 +226,22 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
     fresh: Tree = {}
     if request.fresh and found.fresh is not None:
         fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
-    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept)
+    draws = None
+    if tangents is not None and isinstance(frame, PixelBatch):
+        draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, tangents))
+    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws)
+
+
+def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:
+    """From the weights of the adjoint (groups, N, 3) and the squared derivatives of its paths, of the same shape or of one group (N, 3).
+
+    Each is unbiased; their product is not, since the weights of one group come from the paths of another.
+    """
+    arrays.evaluate(weights, moments)
+    derivative, of_draw = arrays.numpy(weights).astype(np.float64), arrays.numpy(frame.sample.weights)
+    derivative = np.divide(derivative, of_draw, out=np.zeros_like(derivative), where=of_draw != 0)
+    squares = np.square(derivative).mean(axis=0)
+    return DrawStatistics(squares, arrays.numpy(moments).astype(np.float64).reshape(-1, *squares.shape).mean(axis=0))
 
 
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:

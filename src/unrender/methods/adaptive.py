@@ -31,7 +31,11 @@ class AdaptiveMethod(AdamOptions):
     spp: PositiveInt = Field(2, description="samples per drawn pixel; from 2 on, the adjoint shares their paths")
     levels: NonNegativeInt = Field(0, description="coarser resolutions that the probabilities look at, of adaptive")
     refresh: PositiveInt = Field(20, description="steps between estimates of the probabilities")
-    uniform: PositiveFloat = Field(0.1, le=1, description="share of the draws that all pixels have equally")
+    uniform: PositiveFloat | None = Field(
+        None,
+        le=1,
+        description="share of the draws that all pixels have equally; left out, as much as the samples ask for",
+    )
     image: Literal["plain", "rcv"] = Field(
         "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
     )
@@ -43,7 +47,9 @@ class AdaptiveMethod(AdamOptions):
         return PathGradient(image, self._sampler(), self.spp), self.optimizer()
 
     def _sampler(self) -> PixelSampler:
-        guided: dict[str, Any] = {"refresh": self.refresh, "uniform": self.uniform}
+        guided: dict[str, Any] = {"refresh": self.refresh}
+        if self.uniform is not None:
+            guided["uniform"] = self.uniform
         if self.scheme == "adaptive":
             return pixels.Adaptive(self.pixels, self.levels, **guided)
         if self.scheme == "loss":

@@ -13,7 +13,15 @@ from unrender.core.trees import Tree
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
 
-__all__ = ["MiniBatch", "PixelSampler", "RepeatableSampler", "check_batch"]
+__all__ = [
+    "DrawStatistics",
+    "LearningSampler",
+    "MiniBatch",
+    "PixelSampler",
+    "RepeatableSampler",
+    "check_batch",
+    "learned",
+]
 
 _FEWEST_REFUSED = 1 << 16
 _MOST_DRAWS = 4
@@ -29,11 +37,27 @@ class MiniBatch:
         samples: paths traced to estimate their probabilities.
         probability: per view, the probability of its pixels relative to uniform sampling: a map (rows, columns), coarser than
             the film; empty where it is uniform.
+        tangents: of the parameters, along which the squared derivatives of the drawn pixels are asked for (`DrawStatistics`); None where
+            they are not.
     """
 
     sample: PixelSample | None
     samples: int = 0
     probability: dict[int, np.ndarray] = field(default_factory=dict)
+    tangents: Tree | None = None
+
+
+@dataclass(frozen=True)
+class DrawStatistics:
+    """What the samples of a mini-batch tell of the second moment of its pixels' gradients, on the host.
+
+    Attributes:
+        squares: (∂L/∂I)² of each drawn pixel, without the pixel's weight: the mean over its sample groups, (N, 3).
+        moments: (Σ_k v_k ∂I/∂θ_k)² along the tangents v of the mini-batch, likewise.
+    """
+
+    squares: np.ndarray
+    moments: np.ndarray
 
 
 class PixelSampler(Protocol):
@@ -66,6 +90,27 @@ class RepeatableSampler(PixelSampler, Protocol):
     def redraw(self, problem: Problem, state: Any, key: Key) -> MiniBatch:
         """Another mini-batch of the step that `draw` returned `state` for, with the same probabilities; the state stays as it is."""
         ...
+
+
+@runtime_checkable
+class LearningSampler(PixelSampler, Protocol):
+    """A pixel sampler that asks by `MiniBatch.tangents` for what the samples of a step tell, and learns from it.
+
+    An estimator that cannot tell does not call `learn`.
+    """
+
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, draws: DrawStatistics) -> Any:
+        """The state after the step that `draw` returned `state` for, with what its samples tell."""
+        ...
+
+
+def learned(
+    sampler: PixelSampler, problem: Problem, state: Any, sample: PixelSample | None, draws: DrawStatistics | None
+) -> Any:
+    """The state of a sampler with what a step's samples tell, where it learns from them and they were asked for."""
+    if sample is None or draws is None or not isinstance(sampler, LearningSampler):
+        return state
+    return sampler.learn(problem, state, sample, draws)
 
 
 def check_batch(owner: str, problem: Problem, count: int) -> None:

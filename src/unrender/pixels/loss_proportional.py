@@ -10,7 +10,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
-from unrender.pixels.guided import Denoise, GuidedSampler, GuidedSamplerState, Maps
+from unrender.pixels.guided import GuidedSampler, GuidedSamplerState, Maps
 from unrender.pixels.map_denoising import MapDenoiser
 from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
@@ -68,13 +68,15 @@ class _LossDerivative:
     """The importance of Eq. 5."""
 
     levels: int = 0
+    learns: bool = False
+    by_cost: bool = False
     needs_second_moment: bool = False
 
     def maps(self, statistics: PixelStatistics) -> Maps:
         """The mean magnitude of the loss derivative."""
         return (statistics.magnitudes[0],)
 
-    def density(self, tiles: Tiles, maps: Maps, denoise: Denoise) -> np.ndarray:
+    def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
         """Summed over the channels."""
-        del tiles
-        return denoise(maps[0]).sum(axis=1)
+        del tiles, maps
+        return denoised[0].sum(axis=1)

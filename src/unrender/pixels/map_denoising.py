@@ -10,23 +10,37 @@ from typing import Literal
 import numpy as np
 
 from unrender.evaluation import denoising
+from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import Tiles
 
 __all__ = ["MAP_DENOISERS", "MapDenoiser", "denoise_map", "denoise_side_by_side"]
 
-MapDenoiser = Literal["auto", "oidn", "optix", "variation", "none"]
-MAP_DENOISERS: tuple[MapDenoiser, ...] = ("auto", "oidn", "optix", "variation", "none")
+MapDenoiser = Literal["auto", "oidn", "optix", "pooling", "variation", "none"]
+MAP_DENOISERS: tuple[MapDenoiser, ...] = ("auto", "oidn", "optix", "pooling", "variation", "none")
 
 _MARGIN = 4
 """Tiles of padding around each map where several are denoised in one image."""
 
+_PRIOR = 64.0
+"""Paths that a tile's own mean needs to count as much as its surroundings, where these are pooled."""
 
-def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser) -> np.ndarray:
-    """A map (tiles, 3) denoised, the tiles of each view as an image; unchanged by "none"."""
+
+def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.ndarray) -> np.ndarray:
+    """A map (tiles, 3) denoised, the tiles of each view as an image; unchanged by "none".
+
+    Args:
+        tiles: of all views.
+        values: the mean of each tile's paths.
+        by: "auto": optix on a GPU, oidn where it is installed, else pooling (`pooling.pool`): single bright paths, of which second
+            moments consist, are neither kept nor lost.
+        counts: paths behind each tile, (tiles,).
+    """
     if by == "none":
         return values
     if by == "auto" and denoising.variant.current() != denoising.variant.CUDA:
-        by = "oidn" if importlib.util.find_spec("pyoidn") else "variation"
+        by = "oidn" if importlib.util.find_spec("pyoidn") else "pooling"
+    if by == "pooling":
+        return pool(tiles, values, counts, _PRIOR)
     maps = tiles.split(values)
     denoised: list[np.ndarray] = [np.empty(0)] * len(maps)
     for shape in {part.shape for part in maps}:

@@ -13,16 +13,20 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import InverseCdfTable, Tiles
 from unrender.problem.batches import PixelBatch, PixelSample
 from unrender.problem.problem import Problem
+from unrender.rendering.renderer import CountingSession
 
 __all__ = [
     "PilotRequest",
     "PixelStatistics",
+    "costs",
     "estimate_statistics",
     "pilot",
     "random_signs",
+    "random_tangents",
     "reference_means",
     "scales",
 ]
@@ -33,6 +37,10 @@ ROUNDS = 16
 
 _FLOOR, _LEAST = 0.1, 1e-30
 """Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
+
+
+_COST_PRIOR = 4.0
+"""Paths that a tile's own cost needs to count as much as its surroundings: how many vertices paths have varies little."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +135,30 @@ def estimate_statistics(
     )
 
 
+def costs(
+    problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key
+) -> tuple[np.ndarray, int]:
+    """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1; and how many paths that took.
+
+    1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor a path into the sky costs as
+    much as half a vertex in mini-batches of 16384 pixels, as four in ones of 2048, where launches themselves cost.) From one path in
+    each tile, pooled; ones where the renderer does not count.
+
+    Args:
+        problem, parameters: what to render.
+        tiles: of all views.
+        uniform_table: of these tiles, every pixel equally likely.
+        key: of the random numbers.
+    """
+    session = problem.renderer.prepare(list(parameters), None)
+    if not isinstance(session, CountingSession):
+        return np.ones(len(tiles.views)), 0
+    batch = PixelBatch(problem, uniform_table.draw_per_tile(1, key.fold(0)))
+    vertices = arrays.numpy(session.vertices(parameters, batch.request(1, key.fold(1).uint32())))
+    means = pool(tiles, vertices[:, :1].astype(np.float64), np.ones(len(tiles.views)), _COST_PRIOR)
+    return 1 + means[:, 0] / 2, len(tiles.views)
+
+
 def _round(
     problem: Problem,
     parameters: Tree,
@@ -146,9 +178,7 @@ def _round(
     own = tuple(arrays.gather_rows(reference, tile) for reference in references)
     tangents: Tree = {}
     if scales:
-        signs = random_signs(parameters, key.fold(2))
-        scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
-        tangents = problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
+        tangents = random_tangents(problem, parameters, scales, key.fold(2))
     request = PilotRequest(parameters, sample, key.fold(1), own, tangents)
     return pilot(problem, request) if problem.gatherer is None else problem.gatherer.pilot(request)
 
@@ -171,6 +201,13 @@ def pilot(problem: Problem, request: PilotRequest) -> list[np.ndarray]:
         found.append(session.tangent_moment(request.parameters, rendering.paths, request.tangents))
     arrays.evaluate(found)
     return [arrays.numpy(x) for x in found]
+
+
+def random_tangents(problem: Problem, parameters: Tree, scales: Tree, key: Key) -> Tree:
+    """Tangents of the parameters: scales times random signs, in the coordinates of the descent."""
+    signs = random_signs(parameters, key)
+    scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
+    return problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
 
 
 def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:

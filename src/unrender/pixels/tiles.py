@@ -59,6 +59,20 @@ class Tiles:
         """How many pixels each has."""
         return self.widths * self.heights
 
+    def locate(self, views: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """The tile of each pixel.
+
+        Args:
+            views: index of the view, (N,).
+            pixels: row-major index within its film, (N,).
+        """
+        starts = np.cumsum([0, *(grid.rows * grid.columns for grid in self.grids)])[:-1]
+        columns, sides = np.array([(grid.columns, grid.side) for grid in self.grids]).T
+        films = self.films[starts]
+        row, column = np.divmod(pixels.astype(np.int64), films[views])
+        side = sides[views]
+        return starts[views] + row // side * columns[views] + column // side
+
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """(tiles, ...) to one array (rows, columns, ...) per view."""
         ends = np.cumsum([grid.rows * grid.columns for grid in self.grids])[:-1]

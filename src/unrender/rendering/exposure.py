@@ -13,7 +13,15 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, RenderSession, SampleRequest, Space
+from unrender.rendering.renderer import (
+    CountingSession,
+    ParameterInfo,
+    Renderer,
+    Rendering,
+    RenderSession,
+    SampleRequest,
+    Space,
+)
 
 __all__ = ["EXPOSURE", "ExposedPaths", "ExposedRenderer", "ExposedSession", "gains", "without_exposure"]
 
@@ -171,12 +179,19 @@ class ExposedSession:
 
     def tangent_moment(self, parameters: Tree, paths: ExposedPaths, tangents: Tree) -> Array:
         """See `RenderSession.tangent_moment`, and `ExposedRenderer` for what is left out."""
-        along = self._of_rows(tangents[EXPOSURE] - _mean(tangents[EXPOSURE]), paths.rows) * (_LN2 * paths.images[0])
+        images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
+        along = self._of_rows(tangents[EXPOSURE] - _mean(tangents[EXPOSURE]), paths.rows) * (_LN2 * images)
         moment = along * along
         if scene := _scene(parameters):
             moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents))
         factors = self._gains(parameters, paths.rows)
         return moment * (factors * factors)
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `CountingSession.vertices`: ones where the inner session does not count."""
+        if isinstance(self._inner, CountingSession):
+            return self._inner.vertices(_scene(parameters), request)
+        return self._inner.image(_scene(parameters), replace(request, groups=1)).images[0] * 0.0 + 1.0
 
     def _gains(self, parameters: Tree, rows: Array) -> Array:
         """(1, 3), or (N, 3)."""

@@ -16,6 +16,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
 __all__ = [
+    "CountingSession",
     "LossWeights",
     "ParameterInfo",
     "RenderSession",
@@ -145,12 +146,22 @@ class RenderSession(Protocol):
         ...
 
     def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> Array:
-        """The mean over a pixel's samples of (Σ_k v_k ∂f/∂θ_k)², for the tangents v, on the paths of a rendering in one group: of the
-        shape of one of its images.
+        """The mean over a pixel's samples of (Σ_k v_k ∂f/∂θ_k)², for the tangents v, on the paths of a rendering: of the shape of its
+        images where it has several groups, each from its own samples; of one image where it has one group.
 
         Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
         derivatives of a path.
         """
+        ...
+
+
+@runtime_checkable
+class CountingSession(Protocol):
+    """A session that can count what its paths cost."""
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """The mean number of vertices of a pixel's paths, the camera's not counted, from samples of the request: of the shape of one of its
+        images, all channels alike. A path that meets nothing has none."""
         ...
 
 

@@ -32,6 +32,7 @@ __all__ = [
     "Pass",
     "PosesPass",
     "TangentPass",
+    "VerticesPass",
 ]
 
 Kernel = PathPair | VolumePair | PrbKernel
@@ -143,6 +144,10 @@ class CameraPaths:
         δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),))
         return δ * self._weight
 
+    def vertices(self) -> Any:
+        """The number of vertices of each lane's path."""
+        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray)
+
     def _replayed(self, radiance: Any) -> Any:
         """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay."""
         return dr.select(self._weight != 0, radiance / self._weight, 0)
@@ -217,6 +222,18 @@ class TangentPass(Pass):
         """`own`: the radiance that the primal pass returned."""
         (radiance,) = own
         return dr.square(paths.forward(radiance))
+
+
+@dataclass(frozen=True)
+class VerticesPass(Pass):
+    """The number of vertices of each lane's path."""
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
+        return {}
+
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
+        """As each channel of a spectrum, to be developed as one."""
+        return mi.Spectrum(paths.vertices())
 
 
 @dataclass(frozen=True, eq=False)

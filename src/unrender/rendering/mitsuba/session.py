@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,7 @@ from unrender.rendering.mitsuba.passes import (
     Pass,
     PosesPass,
     TangentPass,
+    VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -222,10 +223,21 @@ class MitsubaSession:
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
         """Path replay in forward mode: the squared derivative of each path along the tangents. See `RenderSession.tangent_moment`."""
         self._check_keys(parameters)
+        if self._pair.volumetric and paths.previous is not None and paths.space == "path":
+            # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
+            paths = self.image(parameters, paths.request).paths
         self._pair.loaded().set_tangents(parameters, tangents)
         squares = self._run(TangentPass(), paths.request, paths.radiance)
         dr.eval(squares)
-        return self._develop(squares, paths.request)[0]
+        moments = self._develop(squares, paths.request)
+        return moments if paths.request.groups > 1 else moments[0]
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
+        """See `CountingSession.vertices`."""
+        self._set_parameters(parameters)
+        found = self._run(VerticesPass(), replace(request, groups=1))
+        dr.eval(found)
+        return self._develop(found, replace(request, groups=1))[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""

@@ -95,8 +95,9 @@ class ExponentialRenderer:
 
     def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
         """See `RenderSession.tangent_moment`."""
-        slopes = paths.unit[0] * float(tangents[RATE]) / float(parameters[RATE]) ** 2
-        return np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
+        slopes = paths.unit * float(tangents[RATE]) / float(parameters[RATE]) ** 2
+        found = np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
+        return found if len(found) > 1 else found[0]
 
     def _images(self, parameters: Tree, paths: ExponentialPaths) -> np.ndarray:
         means = paths.unit.mean(axis=-1) / float(parameters[RATE])

@@ -148,7 +148,9 @@ class AnalyticRenderer:
         slopes = (self.matrix @ self._flat(along))[self._rows(paths.pixels)].reshape(-1, 3, 1)
         samples = slopes * (1 + self.noise * (2 * paths.numbers[..., 0] - 1))
         shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
-        return np.mean(samples**2, axis=-1).reshape(shape)
+        squares = (samples**2).reshape(-1, 3, paths.groups, samples.shape[-1] // paths.groups).mean(axis=-1)
+        found = np.moveaxis(squares, -1, 0).reshape(paths.groups, *shape)
+        return found if paths.groups > 1 else found[0]
 
     def _flat(self, parameters: Tree) -> np.ndarray:
         return np.concatenate([np.ravel(parameters.get(key, value)) for key, value in self._values.items()])

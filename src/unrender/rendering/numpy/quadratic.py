@@ -97,7 +97,8 @@ class QuadraticRenderer:
     def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
         """See `RenderSession.tangent_moment`. Exact."""
         del parameters
-        return self._images(tangents, paths)[0] ** 2
+        found = self._images(tangents, paths) ** 2
+        return found if paths.groups > 1 else found[0]
 
     def _images(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
         shape = (1, 1) if request.pixels is None else (len(request.pixels),)

@@ -68,6 +68,10 @@ class PathKernel(Protocol):
         """
         ...
 
+    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+        """How many vertices each lane's path has, the camera's not counted: what it costs to trace. Arguments as for `sample`."""
+        ...
+
 
 class PathContext:
     """What a path reads and never changes. No dataclass: Dr.Jit would take it for state of its loops.

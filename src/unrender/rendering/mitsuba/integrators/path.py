@@ -109,7 +109,16 @@ class PathPair:
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
-        path = PathState(
+        path = self._trace(context, self._begin(context, ray), sampler)
+        return path.δL if context.forward else path.L[0], path.L[1] if pair else None
+
+    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+        """See `PathKernel.vertices`."""
+        context = PathContext(dr.ADMode.Primal, scene, tables, (), False, None)
+        return mi.Float(self._trace(context, self._begin(context, ray), sampler).depth)
+
+    def _begin(self, context: PathContext, ray: mi.RayDifferential3f) -> PathState:
+        return PathState(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
             L=context.initial_radiance(),
@@ -119,8 +128,6 @@ class PathPair:
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
             active=mi.Bool(True),
         )
-        path = self._trace(context, path, sampler)
-        return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
     @dr.syntax
     def _trace(self, context: PathContext, path: PathState, sampler: Any) -> PathState:

@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.path import PathPair
 
 __all__ = ["PrbKernel"]
 
@@ -20,6 +21,7 @@ class PrbKernel:
 
     def __init__(self, max_depth: int):
         self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth})
+        self._max_depth = max_depth
 
     def sample(
         self,
@@ -38,3 +40,7 @@ class PrbKernel:
             raise ValueError("prb: expected one state and the scene's own geometry")
         δL, state_in = (replay[0].δL, replay[0].radiance) if replay else (None, None)
         return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(True))[0], None
+
+    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+        """See `PathKernel.vertices`: of paths of the same distribution."""
+        return PathPair(self._max_depth).vertices(scene, tables, sampler, ray)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import RepeatingSampler
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import (
     ReplayState,
     ScatteringVertex,
@@ -106,6 +106,13 @@ class VolumePair:
             dr.eval(path.reservoir)  # Two backward passes in one kernel would race for the same gradients.
             path.δL += self._in_scattering(context, path.reservoir, noise)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
+
+    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+        """See `PathKernel.vertices`. Borders that let light pass unchanged do not count."""
+        camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
+        start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
+        context = VolumeContext(start, dr.ADMode.Primal, scene, tables, (), False)
+        return mi.Float(self._trace(context, self._begin(context), sampler, None).depth)
 
     def _begin(self, context: VolumeContext) -> VolumePathState:
         start, count = context.start, context.state_count
