@@ -33,7 +33,7 @@ ESTIMATORS = {
     "plain": lambda: ur.PathGradient(spp=2),
     "rcv": lambda: ur.PathGradient(RCV(), spp=2, fresh_from=8),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=2, image=RCV()),
-    "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(40, refresh=5, denoiser="none"), spp=2),
+    "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(40, refresh=5, samples=256, denoiser="none"), spp=2),
     "rcv of mini-batches": lambda: ur.PathGradient(RCV(whole_views=3), pixels=ur.pixels.Uniform(40), spp=2),
     "filtered": lambda: ur.FilteredGradient(ur.PathGradient(RCV(), spp=2)),
 }
@@ -158,7 +158,7 @@ def test_importance_maps_come_from_the_workers() -> None:
     together = dealt(problem, 3)
     descend(together, "adaptive")
     hosts = together.gatherer._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-    assert hosts.pilots == 1 + 3  # in the warm-up, and every five of twelve steps
+    assert hosts.pilots == 3 * (1 + 3)  # three patterns of signs, in the warm-up and every five of twelve steps
 
 
 def test_auto_chooses_the_same_whoever_has_the_views() -> None:

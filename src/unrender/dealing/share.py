@@ -45,7 +45,7 @@ class ViewShare:
         started = time.perf_counter()
         self._receive(call)
         if call.pilot is not None:
-            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, self._pilot(call, call.pilot))
+            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, paths=self._pilot(call, call.pilot))
         request = self._request(call)
         if call.replay:
             self._remember(call, self._replayed(call, request))
@@ -84,7 +84,7 @@ class ViewShare:
             {index: arrays.numpy(part.image) for index, part in shown},
             info,
             time.perf_counter() - started,
-            parts[0].draws if call.batch is not None else None,
+            draws=parts[0].draws if call.batch is not None else None,
         )
 
     def store(self, number: int, packed: Packed) -> None:
