@@ -109,12 +109,12 @@ def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
 def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.MonkeyPatch) -> None:
     plans, over = [], {"learning_rate": "0.01:0.1:log", "spp": [1, 4]}
 
-    def go_on(console: Any, session: Any, record: Any, search: Any) -> None:
+    def run_trials(console: Any, session: Any, record: Any, search: Any) -> None:
         plans.append((record.plan, session.workers, session.threads, search.trials))
         write_sweep(session.folder, record)
 
     for home in ("sweep_function", "sweep_driver"):
-        monkeypatch.setattr(f"unrender.cli.{home}.go_on", go_on)
+        monkeypatch.setattr(f"unrender.cli.{home}.run_trials", run_trials)
     found = ur.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
     words = ["--method", "plain", "--over", "learning_rate=0.01:0.1:log", "--over", "spp=1,4", "--steps", 3]
     assert unrender("sweep", "quad", *words, "--trials", 5, "-s", "beta_2=0.9", "--threads", 1).status == 0

@@ -201,7 +201,7 @@ def _run_all(console: Console, comparison: _Comparison, progress: Progress) -> t
     from unrender.cli import tasks
 
     folder = Path(comparison.job.folder)
-    tasks.begin_anew(folder, comparison.runs)
+    tasks.discard_earlier(folder, comparison.runs)
     outcomes = _on_workers(console, comparison) if comparison.cluster else _here(console, comparison, progress)
     names = [outcome.folder for outcome in outcomes if outcome.steps]
     directories = [folder / run.name for run in comparison.runs if run.name in names]

@@ -50,7 +50,7 @@ def resume(
         stages.refuse_workers(workers)
         command = shlex.join(context.find_root().obj or ["unrender"])
         with Progress(console) as progress:
-            return stages.go_on(
+            return stages.run_remaining(
                 stages.reopen(directory, (steps, seconds), variant, threads, command), console, progress
             )
     with Progress(console) as progress:

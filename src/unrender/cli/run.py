@@ -79,7 +79,7 @@ def run(
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
                 plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
-                return stages.go_on(stages.begin(Path(problem), *plan), console, progress)
+                return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
             steps, seconds = arguments.budget(steps, seconds)
             chosen.start(given)
             arguments.check_problem(problem, options)

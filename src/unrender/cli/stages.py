@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from unrender.stages.stage_problem import Whole
     from unrender.stages.stages_file import RunOptions, Stages
 
-__all__ = ["StagesRun", "begin", "go_on", "is_stages", "refuse_settings", "refuse_workers", "reopen"]
+__all__ = ["StagesRun", "begin", "is_stages", "refuse_settings", "refuse_workers", "reopen", "run_remaining"]
 
 _SCENES = "scenes"
 
@@ -39,7 +39,7 @@ class StagesRun:
         out: the folder of the run folders.
         variant: of Mitsuba.
         command: what was typed, to be saved with the results.
-        lock: of `out`, held; `go_on` lets it go.
+        lock: of `out`, held; `run_remaining` lets it go.
     """
 
     stages: Stages
@@ -157,7 +157,7 @@ def reopen(
     return StagesRun(stages, whole, folder, running, command, lock)
 
 
-def go_on(run: StagesRun, console: Console, progress: Progress) -> None:
+def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
     """Run the stages that are left, each to its end, or until one is interrupted or fails: leave with its status then."""
     try:
         _run_stages(run, console, progress)

@@ -88,7 +88,7 @@ def sweep(
     The error is the parameters' where the truth is known, else that of the final pictures. Each trial is an ordinary run folder, one for
     each seed, in one folder with sweep.json. A sweep that was interrupted or killed goes on with `unrender sweep DIR`.
     """
-    from unrender.cli.sweep_driver import Session, go_on
+    from unrender.cli.sweep_driver import Session, run_trials
     from unrender.display.terminal import Console
     from unrender.sweeps.record import SweepRecord, read_sweep
 
@@ -97,7 +97,7 @@ def sweep(
     if _is_sweep(what):
         _check_alone(context, what)
         record = _extended(read_sweep(Path(what)), trials)
-        go_on(console, Session(Path(what), where, threads), record, search_of(record.plan)[1])
+        run_trials(console, Session(Path(what), where, threads), record, search_of(record.plan)[1])
         return
     names = {"trials": trials, "prune": prune, "window": window, "seeds": seeds, "seed": seed, "steps": steps}
     names |= {"seconds": seconds, "final_spp": final_spp, "variant": variant, "cached": not no_cache}
@@ -109,7 +109,7 @@ def sweep(
     folder = arguments.folder(out, f"{arguments.short_name(what)}-sweep", overwrite, MARK)
     try:
         record = SweepRecord(command=shlex.join(context.find_root().obj or ["unrender"]), plan=plan)
-        go_on(console, Session(folder, where, threads, fresh=True), record, found)
+        run_trials(console, Session(folder, where, threads, fresh=True), record, found)
     finally:
         arguments.remove_if_empty(folder)
 

@@ -30,7 +30,7 @@ from unrender.sweeps.record import SWEEP, RunOutcome, SweepPlan, SweepRecord, Tr
 from unrender.sweeps.search import Search
 from unrender.sweeps.trials import Started, Trials, trial_record
 
-__all__ = ["Session", "go_on"]
+__all__ = ["Session", "run_trials"]
 
 _POLL_SECONDS = 0.5
 _WINDOW = 4
@@ -79,7 +79,7 @@ class _State:
         write_sweep(folder, self.record)
 
 
-def go_on(console: Console, session: Session, record: SweepRecord, search: Search) -> None:
+def run_trials(console: Console, session: Session, record: SweepRecord, search: Search) -> None:
     """Carry out the trials that have not ended, write the page, say what was found.
 
     Raises:

@@ -12,7 +12,7 @@ import typer
 from unrender.cli import arguments
 from unrender.cli.exit_status import FAILED
 from unrender.cli.sweep import MARK, plan_of, search_of
-from unrender.cli.sweep_driver import Session, go_on
+from unrender.cli.sweep_driver import Session, run_trials
 from unrender.cluster import Workers
 from unrender.display.terminal import Console
 from unrender.sweeps.record import SweepRecord, read_sweep
@@ -88,7 +88,7 @@ def _carried_out(
     folder = arguments.folder(out, f"{arguments.short_name(plan.problem)}-sweep", overwrite, MARK)
     session = Session(folder, workers, threads, fresh=True)
     try:
-        go_on(Console(file=io.StringIO()), session, SweepRecord(command="unrender.sweep", plan=plan), search)
+        run_trials(Console(file=io.StringIO()), session, SweepRecord(command="unrender.sweep", plan=plan), search)
     except typer.Exit as end:
         if end.exit_code != FAILED:
             raise KeyboardInterrupt from end

@@ -32,7 +32,7 @@ from unrender.runs.resume import load_run, resume_run
 from unrender.sweeps.pruning import RUNG_FILE, Pruning, read_rungs, stated_error
 from unrender.sweeps.record import RunOutcome
 
-__all__ = ["Job", "RunTask", "begin_anew", "carry_out", "in_turn", "on_worker", "open_job", "quiet", "receive"]
+__all__ = ["Job", "RunTask", "carry_out", "discard_earlier", "in_turn", "on_worker", "open_job", "quiet", "receive"]
 
 _PATIENCE_SECONDS = 30.0
 """For a run folder that a dying process still holds."""
@@ -82,7 +82,7 @@ class RunTask:
     limits: Mapping[float, float] | None = None
 
 
-def begin_anew(folder: Path, tasks: Sequence[RunTask]) -> None:
+def discard_earlier(folder: Path, tasks: Sequence[RunTask]) -> None:
     """Let no task take an earlier run in its folder for its own."""
     for task in tasks:
         (folder / task.name / RECORD).unlink(missing_ok=True)

@@ -11,13 +11,13 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.sweeps.axes import Axis
 
-__all__ = ["Grid", "Random", "Search", "Told"]
+__all__ = ["Grid", "Random", "Search", "TrialOutcome"]
 
 _MOST_TRIALS = 100_000
 
 
 @dataclass(frozen=True)
-class Told:
+class TrialOutcome:
     """What became of a trial.
 
     Attributes:
@@ -48,7 +48,7 @@ class Search(Protocol):
         """{option: value as text} of a trial."""
         ...
 
-    def tell(self, number: int, told: Told) -> None:
+    def tell(self, number: int, outcome: TrialOutcome) -> None:
         """What became of one that was asked for."""
         ...
 
@@ -86,7 +86,7 @@ class Grid:
             found[axis.name] = points[index]
         return {axis.name: found[axis.name] for axis in self.axes}
 
-    def tell(self, number: int, told: Told) -> None:
+    def tell(self, number: int, outcome: TrialOutcome) -> None:
         """See `Search.tell`."""
 
 
@@ -108,5 +108,5 @@ class Random:
         key = Key(self.seed, number)
         return {axis.name: axis.at(key.fold(i).uint32() / 2**32) for i, axis in enumerate(self.axes)}
 
-    def tell(self, number: int, told: Told) -> None:
+    def tell(self, number: int, outcome: TrialOutcome) -> None:
         """See `Search.tell`."""

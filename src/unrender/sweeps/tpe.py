@@ -9,7 +9,7 @@ from typing import Any
 
 from unrender.core.errors import InputError
 from unrender.sweeps.axes import Axis
-from unrender.sweeps.search import Told
+from unrender.sweeps.search import TrialOutcome
 
 __all__ = ["TPE"]
 
@@ -57,18 +57,18 @@ class TPE:
         self._asked[number] = trial
         return {axis.name: _text(axis, trial.params[axis.name]) for axis in self.axes}
 
-    def tell(self, number: int, told: Told) -> None:
+    def tell(self, number: int, outcome: TrialOutcome) -> None:
         """See `Search.tell`."""
         from optuna.trial import TrialState
 
         trial = self._asked.pop(number)
-        if told.error is None:
+        if outcome.error is None:
             self._study.tell(trial, state=TrialState.FAIL)
             return
-        if told.status == "finished":
-            self._study.tell(trial, told.error)
+        if outcome.status == "finished":
+            self._study.tell(trial, outcome.error)
             return
-        for share, error in told.rungs.items():
+        for share, error in outcome.rungs.items():
             trial.report(error, round(1000 * share))
         self._study.tell(trial, state=TrialState.PRUNED)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from unrender.core.errors import InputError
 from unrender.sweeps import pruning
 from unrender.sweeps.record import RunOutcome, TrialRecord
-from unrender.sweeps.search import Search, Told
+from unrender.sweeps.search import Search, TrialOutcome
 
 __all__ = ["Started", "Trials", "trial_record"]
 
@@ -93,7 +93,7 @@ class Trials:
 
     def _tell(self, number: int) -> None:
         trial = self.ended[number]
-        self.search.tell(number, Told(trial.status, trial.error, _rungs(trial)))
+        self.search.tell(number, TrialOutcome(trial.status, trial.error, _rungs(trial)))
 
     def _limits(self, number: int) -> dict[float, float]:
         if not self.prune:
