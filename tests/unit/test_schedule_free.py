@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.optimizers import Adam, ScheduleFree, schedule_free
+from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
 from unrender.schedules import Cosine
 
@@ -121,6 +123,39 @@ def test_the_schedule_is_a_further_factor():
     for step in range(1, 12):
         moved, as_scheduled = (found[step].fast["x"] - found[step - 1].fast["x"] for found in (plain, scheduled))
         np.testing.assert_allclose(as_scheduled, Cosine(10, 0.25)(step) * moved, rtol=1e-9)
+
+
+def test_the_mean_square_is_of_all_gradients_once_there_are_many():
+    """Twenty gradients of 1, then of 0: the decay of 0.95 until then, and their share of all steps from then on."""
+    _, states = descend(ScheduleFree(0.1), np.zeros(2), lambda step, x: np.full_like(x, float(step < 20)), 60)
+    for made, expected in (
+        (5, 1 - 0.95**5),
+        (20, 1 - 0.95**20),
+        (30, 2 / 3 * (1 - 0.95**20)),
+        (60, (1 - 0.95**20) / 3),
+    ):
+        np.testing.assert_allclose(states[made - 1].second_moment["x"], expected, rtol=1e-12)
+    _, states = descend(ScheduleFree(0.1, growth=0.0), np.zeros(2), lambda step, x: 2.0 + 0 * x, 60)
+    moved = states[-1].fast["x"] - states[-2].fast["x"]
+    np.testing.assert_allclose(moved, -0.1, rtol=1e-9)  # debiased by the sum of these weights
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.0, 4.0])
+def test_where_smoothing_becomes_stronger_the_iterate_begins_again_at_the_mean(
+    gain: float, monkeypatch: pytest.MonkeyPatch
+):
+    """At the third step: the direction differs by what the mean square remembers."""
+    changed = StrengthFit(gain=gain)
+    monkeypatch.setattr(
+        StrengthFit, "after", lambda *args: changed if args[0].count == 9 else replace(args[0], count=9)
+    )
+    optimizer = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",), growth=0.0, decay=0.0)
+    g = np.ones((4, 4, 1), np.float32)
+    _, states = descend(optimizer, np.zeros((4, 4, 1)), lambda step, x: g, 3)
+    begun = states[1].average["x"] if gain < 1 else states[1].fast["x"]
+    root = math.sqrt((states[2].second_moment["x"] / (1 - 0.95**3)).mean())
+    np.testing.assert_allclose(states[2].fast["x"] - begun, -0.1 / root, rtol=0.04)
+    assert np.abs(states[1].fast["x"] - states[1].average["x"]).min() > 0.02
 
 
 def test_noise_is_averaged_where_a_constant_rate_leaves_it():

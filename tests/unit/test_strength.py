@@ -112,6 +112,14 @@ def test_detail_that_fresh_samples_confirm_is_no_longer_smoothed_away():
     assert second.gain == pytest.approx(1 / np.divide(*squares), rel=0.5), "steps by a gradient that has so grown"
 
 
+def test_detail_that_falls_in_smoothed_steps_too_is_left_to_them(monkeypatch: pytest.MonkeyPatch):
+    """A third of the first gradients is less than step^(-3/4) leaves of them; what then stays waits, what has halved again does not."""
+    assert [fit.share < 0.1 for fit in watched(0.3, 0.03)] == [False, False, True]
+    assert [fit.share for fit in watched(0.3, 0.03, late=0.5)] == [1.0] * 3
+    monkeypatch.setattr(strength, "_SLOWEST", 2.0)
+    assert watched(0.3, 0.03, late=0.5)[1].share < 0.1, "without that condition"
+
+
 def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPatch):
     assert [fit.share for fit in watched(0.0, 1.0)] == [1.0] * 3
     assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"

@@ -49,7 +49,7 @@ _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
 _CAMERA_SHARE = 0.1
 """First steps of sensors' poses, in units of the world and radians, over `learning_rate`."""
-_FRESH_FROM = 16
+_FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _MOST_PIXELS = 1 << 19
 """Of all views, that a step renders whole; where there are more, it draws half as many of them."""

@@ -52,7 +52,7 @@ class ScheduleFreeState:
         learning_rates: of each parameter, before schedule and decay.
         fast: z, the iterate that takes the steps.
         average: x, the weighted mean of z.
-        second_moment: exponentially weighted mean of the squared gradient, not debiased.
+        second_moment: weighted mean of the squared gradient, not debiased.
         gradient: the last one, preconditioned.
         product, square: exponentially weighted sums of g_t g_{t-1}, and of the mean of the squares of both, per element of the
             preconditioned parameters.
@@ -104,8 +104,10 @@ class ScheduleFree:
 
         z ← z − η_t g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
-    v̂ is the debiased mean square of g, r is `averaging`: x is the mean of z with weights that grow as t^r. The parameters of a run are
-    its y, near x. An average has less noise than an iterate, and parameters that move slowly suit estimators that reuse earlier samples.
+    v̂ is the debiased mean square of g, with decay β₂ over the first 1 / (1 − β₂) steps and of all gradients alike from then on: with a
+    decay that stays, steps grow as gradients vanish, and burst (Reddi et al. 2018, "On the Convergence of Adam and Beyond"). r is
+    `averaging`: x is the mean of z with weights that grow as t^r. The parameters of a run are its y, near x. An average has less noise than
+    an iterate, and parameters that move slowly suit estimators that reuse earlier samples.
 
     The rate needs no horizon. It is halved at the first step, and then changes by
 
@@ -126,12 +128,13 @@ class ScheduleFree:
     ρ count by the share confirmed (`StrengthFit`). Adam's division lets all elements walk alike, and those that the images tell little of
     would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps.
 
-    Parameters that bounds have moved take their iterates along.
+    Parameters that bounds have moved take their iterates along. Where smoothing becomes stronger again, z begins again at x: its noise in
+    what hardly moves any more would become that of the mean.
 
     Args:
         learning_rate: η_0, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
         beta: β, in [0, 1).
-        beta_2: decay of the mean square, in [0, 1).
+        beta_2: β₂, decay of the mean square at first, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         averaging: r, >= 0.
         growth: q, >= 0; 0 for a rate that never grows.
@@ -210,7 +213,8 @@ class ScheduleFree:
     def update(self, estimate: Estimate, state: ScheduleFreeState, parameters: Tree) -> tuple[Tree, ScheduleFreeState]:
         """See `Optimizer.update`. Waits for the device: the correlation of gradients and the parameters' size are read."""
         made = state.step - state.begun
-        debias = 1.0 / math.sqrt(1.0 - self.beta_2 ** (made + 1))
+        weight_of_square, weights = _mean_square(self.beta_2, made)
+        debias = 1.0 / math.sqrt(weights)
         factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
         weight = (1.0 + self.averaging) / (made + 1.0 + self.averaging)
 
@@ -230,8 +234,8 @@ class ScheduleFree:
         for key, g in gradient.items():
             y = parameters[key]
             fit = strengths.get(key, _NOT_FITTED)
-            before = state.second_moment[key] * arrays.scalar(self.beta_2 * fit.gain, g)
-            second[key] = before + (1.0 - self.beta_2) * (g * g)
+            before = state.second_moment[key] * arrays.scalar((1.0 - weight_of_square) * fit.gain, g)
+            second[key] = before + arrays.scalar(weight_of_square, g) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)
             if key in maps:
@@ -240,6 +244,8 @@ class ScheduleFree:
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             tolerance = state.learning_rates[key] * _PROJECTED
             before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
+            if fit.gain < 1.0:
+                before = mean
             fast[key] = before + arrays.scalar(rate, g) * direction
             average[key] = mean + arrays.scalar(weight, g) * (fast[key] - mean)
             steps[key] = self._between(fast[key], average[key]) - y
@@ -326,6 +332,18 @@ class ScheduleFree:
             return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
 
         return moved(fast), moved(average)
+
+
+def _mean_square(beta_2: float, made: int) -> tuple[float, float]:
+    """The weight of a step's squared gradient in the mean square: the lesser of 1 - β₂ and 1 / count; and the sum of all weights so far.
+
+    Args:
+        beta_2: β₂.
+        made: steps before this one.
+    """
+    count, alike = made + 1, math.floor(1.0 / (1.0 - beta_2))
+    left = beta_2 ** min(count, alike) * min(1.0, alike / count)
+    return min(1.0 - beta_2, 1.0 / count), 1.0 - left
 
 
 def _size(x: Array, square: float) -> float:

@@ -21,10 +21,12 @@ _LEAST_DESCENT = 0.4
 """Of the best candidate's."""
 _ROWS = 8
 """Fresh gradients from one judgement to the next; it is by those of the last two."""
-_LEAST_FRESH_DESCENT, _ERRORS = 0.7, 5.5
+_LEAST_FRESH_DESCENT, _ERRORS = 0.7, 3.3
 """Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
-_CONFIRMED, _REFUTED = 0.75, 0.2
-"""Shares of what successive gradients agree on that fresh samples have to show for less smoothing, and below which it is given up."""
+_CONFIRMED = 0.6
+"""Share of what successive gradients agree on that fresh samples have to show for less smoothing, and later for keeping it."""
+_SLOWEST = 0.75
+"""The power of 1 / step that detail's gradient falls by at most where it waits for less smoothing."""
 _LEAST_CONFIRMED = 0.02
 """The share by which such an agreement counts at least."""
 
@@ -40,9 +42,15 @@ class StrengthFit:
 
     Later, gradients of an estimator that remembers samples agree on the noise remembered, too. Where an estimate has the gradient f of
     fresh samples (`FreshGradient`), S g · S f is what is no noise. Smoothing is reduced, to the strongest that descends at least 0.7 times
-    as much as the best, if by that the descent grows by more than 5.5 standard errors, and S g · S f is at least 0.75 of S g · S g': a
-    checkerboard of single texels does that, noise that has got into a texture does not. When fresh samples come to show less than 0.2 of
-    what successive gradients agree on, the strength is that of the first fit again. What of that agreement is no noise, is `confirmed`.
+    as much as the best, if by that the descent grows by more than 3.3 standard errors, and S g · S f is at least 0.6 of S g · S g'.
+
+    Steps by smoothed gradients recover detail, too, only later: reducing their smoothing pays where the detail waits for it. So the root of
+    S g · S f with the new strength must fall more slowly than step^(-3/4) from one look at fresh gradients to the next, the first
+    gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. What is then
+    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, the
+    strength is that of the first fit again.
+
+    What is no noise of what successive gradients agree on, is `confirmed`.
 
     Attributes:
         share: of the λ given, in (0, 1].
@@ -52,6 +60,8 @@ class StrengthFit:
             candidates.
         unjudged: how many of these came after the last judgement.
         gain: |S g|² with this share over that with the share before, where fresh gradients have changed it at this step; 1 elsewhere.
+        steps: gradients seen after the first.
+        seen: of the last look, (1 + n,): S g · S f for the n candidates, and the mean of `steps` then; empty before the first.
         confirmed: the share of S g · S g' that is S g · S f, at most, in [0.02, 1]: by how much gradients agree for what is no noise.
     """
 
@@ -61,6 +71,8 @@ class StrengthFit:
     fresh: tuple[np.ndarray, ...] = ()
     unjudged: int = 0
     gain: float = 1.0
+    steps: int = 0
+    seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
     confirmed: float = 1.0
 
     def after(
@@ -74,7 +86,7 @@ class StrengthFit:
             gradient: that of this step, as it is.
             fresh: that of this step's samples alone; None where it was not estimated. Left out where it is not finite.
         """
-        found = replace(self, gain=1.0)
+        found = replace(self, gain=1.0, steps=self.steps + 1)
         if found.count < STEPS:
             return found._with_pair(preconditioner, previous, gradient)
         if fresh is not None:
@@ -104,22 +116,31 @@ class StrengthFit:
         """With the strength that the fresh gradients speak for."""
         rows = np.stack(self.fresh)
         products, squares = rows[:, 0], rows[:, 1]
-        first = _share(self.sums)
-        if self.share < first and _confirmed(rows[-self.unjudged :], 0)[0] < _REFUTED:
+        first, before = _share(self.sums), self._before
+        looked = np.append(products[-self.unjudged :, 1:].mean(axis=0), self.steps - 0.5 * (self.unjudged - 1))
+        found = replace(self, seen=looked, unjudged=0)
+        if self.share < first and _confirmed(rows[-self.unjudged :], 0)[0] < _CONFIRMED:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
-            return self._changed(first, float(known / squares[:, 0].mean()))
+            return found._changed(first, float(known / squares[:, 0].mean()))
         descents = products / np.sqrt(squares)
         means = descents.mean(axis=0)[1:]
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
         more = descents[:, 1 + best] - descents[:, 0]
         beyond_doubt = more.mean() > _ERRORS * more.std(ddof=1) / math.sqrt(len(more))
         if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best)[0] >= _CONFIRMED:
-            return self._changed(float(self._shares[best]), float(squares[:, 1 + best].sum() / squares[:, 0].sum()))
-        return replace(self, unjudged=0, confirmed=_most_confirmed(rows))
+            waits = looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
+            if waits:
+                return found._changed(float(self._shares[best]), float(squares[:, 1 + best].sum() / squares[:, 0].sum()))
+        return replace(found, confirmed=_most_confirmed(rows))
 
     def _changed(self, share: float, gain: float) -> StrengthFit:
         """With another strength, of which nothing is known yet."""
         return replace(self, share=share, gain=gain, fresh=(), unjudged=0, confirmed=1.0)
+
+    @property
+    def _before(self) -> np.ndarray:
+        """`seen`, or of the first fit."""
+        return self.seen if len(self.seen) else np.append(self.sums[:, 0] / self.count, 0.5 * (self.count + 1))
 
     @property
     def _shares(self) -> np.ndarray:
