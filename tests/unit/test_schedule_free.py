@@ -144,8 +144,8 @@ def test_the_mean_square_is_of_all_gradients_once_there_are_many():
 def test_where_smoothing_becomes_stronger_the_iterate_begins_again_at_the_mean(
     gain: float, monkeypatch: pytest.MonkeyPatch
 ):
-    """At the third step: the direction differs by what the mean square remembers."""
-    changed = StrengthFit(gain=gain)
+    """At the third step; and the mean square is that of the gradients of then, 4 in each of 16 texels, and the new one's, 1."""
+    changed = StrengthFit(gain=gain, level=64.0)
     monkeypatch.setattr(
         StrengthFit, "after", lambda *args: changed if args[0].count == 9 else replace(args[0], count=9)
     )
@@ -153,7 +153,9 @@ def test_where_smoothing_becomes_stronger_the_iterate_begins_again_at_the_mean(
     g = np.ones((4, 4, 1), np.float32)
     _, states = descend(optimizer, np.zeros((4, 4, 1)), lambda step, x: g, 3)
     begun = states[1].average["x"] if gain < 1 else states[1].fast["x"]
-    root = math.sqrt((states[2].second_moment["x"] / (1 - 0.95**3)).mean())
+    expected = 0.95 * (1 - 0.95**2) * 4 + 0.05
+    np.testing.assert_allclose(states[2].second_moment["x"], expected, rtol=1e-3)
+    root = math.sqrt(expected / (1 - 0.95**3))
     np.testing.assert_allclose(states[2].fast["x"] - begun, -0.1 / root, rtol=0.04)
     assert np.abs(states[1].fast["x"] - states[1].average["x"]).min() > 0.02
 

@@ -37,6 +37,9 @@ _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
 _VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
 """Positions are as large as the mesh, but a mesh does not survive steps of a tenth of that."""
+_ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
+"""An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
+product, and the extinction, whose range is open, has further to go."""
 _TOLERANCE = 2.0
 """κ of `PathGradient`."""
 _FIREFLIES = 0.8
@@ -259,6 +262,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
         if key.endswith(_VERTICES):
             size *= _VERTEX_SHARE
+        if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
+            size *= _ALBEDO_SHARE
         if key in problem.coordinates.transforms:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
             size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))

@@ -128,8 +128,8 @@ class ScheduleFree:
     ρ count by the share confirmed (`StrengthFit`). Adam's division lets all elements walk alike, and those that the images tell little of
     would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps.
 
-    Parameters that bounds have moved take their iterates along. Where smoothing becomes stronger again, z begins again at x: its noise in
-    what hardly moves any more would become that of the mean.
+    Parameters that bounds have moved take their iterates along. Where smoothing changes, v̂ becomes as large as the gradients of then.
+    Where it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
 
     Args:
         learning_rate: η_0, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
@@ -234,7 +234,10 @@ class ScheduleFree:
         for key, g in gradient.items():
             y = parameters[key]
             fit = strengths.get(key, _NOT_FITTED)
-            before = state.second_moment[key] * arrays.scalar((1.0 - weight_of_square) * fit.gain, g)
+            before = state.second_moment[key]
+            if fit.level > 0.0 and (whole := arrays.number(arrays.total(before))) > 0.0:
+                before = before * arrays.scalar(fit.level * _mean_square(self.beta_2, made - 1)[1] / whole, g)
+            before = before * arrays.scalar(1.0 - weight_of_square, g)
             second[key] = before + arrays.scalar(weight_of_square, g) * (g * g)
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)

@@ -24,7 +24,7 @@ _ROWS = 8
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 3.3
 """Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
 _CONFIRMED = 0.6
-"""Share of what successive gradients agree on that fresh samples have to show for less smoothing, and later for keeping it."""
+"""Share of what successive gradients agree on that fresh samples have to show for less smoothing, and must not be found below later."""
 _SLOWEST = 0.75
 """The power of 1 / step that detail's gradient falls by at most where it waits for less smoothing."""
 _LEAST_CONFIRMED = 0.02
@@ -47,8 +47,8 @@ class StrengthFit:
     Steps by smoothed gradients recover detail, too, only later: reducing their smoothing pays where the detail waits for it. So the root of
     S g · S f with the new strength must fall more slowly than step^(-3/4) from one look at fresh gradients to the next, the first
     gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. What is then
-    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, the
-    strength is that of the first fit again.
+    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, by two
+    standard errors, the strength is that of the first fit again.
 
     What is no noise of what successive gradients agree on, is `confirmed`.
 
@@ -60,6 +60,7 @@ class StrengthFit:
             candidates.
         unjudged: how many of these came after the last judgement.
         gain: |S g|² with this share over that with the share before, where fresh gradients have changed it at this step; 1 elsewhere.
+        level: |S g|² with this share, where it was changed at this step; 0 elsewhere.
         steps: gradients seen after the first.
         seen: of the last look, (1 + n,): S g · S f for the n candidates, and the mean of `steps` then; empty before the first.
         confirmed: the share of S g · S g' that is S g · S f, at most, in [0.02, 1]: by how much gradients agree for what is no noise.
@@ -71,6 +72,7 @@ class StrengthFit:
     fresh: tuple[np.ndarray, ...] = ()
     unjudged: int = 0
     gain: float = 1.0
+    level: float = 0.0
     steps: int = 0
     seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
     confirmed: float = 1.0
@@ -86,7 +88,7 @@ class StrengthFit:
             gradient: that of this step, as it is.
             fresh: that of this step's samples alone; None where it was not estimated. Left out where it is not finite.
         """
-        found = replace(self, gain=1.0, steps=self.steps + 1)
+        found = replace(self, gain=1.0, level=0.0, steps=self.steps + 1)
         if found.count < STEPS:
             return found._with_pair(preconditioner, previous, gradient)
         if fresh is not None:
@@ -119,9 +121,9 @@ class StrengthFit:
         first, before = _share(self.sums), self._before
         looked = np.append(products[-self.unjudged :, 1:].mean(axis=0), self.steps - 0.5 * (self.unjudged - 1))
         found = replace(self, seen=looked, unjudged=0)
-        if self.share < first and _confirmed(rows[-self.unjudged :], 0)[0] < _CONFIRMED:
+        if self.share < first and _most_confirmed(rows[-self.unjudged :]) < _CONFIRMED:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
-            return found._changed(first, float(known / squares[:, 0].mean()))
+            return found._changed(first, float(known), squares[:, 0].mean())
         descents = products / np.sqrt(squares)
         means = descents.mean(axis=0)[1:]
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
@@ -130,12 +132,13 @@ class StrengthFit:
         if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best)[0] >= _CONFIRMED:
             waits = looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
             if waits:
-                return found._changed(float(self._shares[best]), float(squares[:, 1 + best].sum() / squares[:, 0].sum()))
+                return found._changed(float(self._shares[best]), squares[:, 1 + best].mean(), squares[:, 0].mean())
         return replace(found, confirmed=_most_confirmed(rows))
 
-    def _changed(self, share: float, gain: float) -> StrengthFit:
-        """With another strength, of which nothing is known yet."""
-        return replace(self, share=share, gain=gain, fresh=(), unjudged=0, confirmed=1.0)
+    def _changed(self, share: float, level: float, before: float) -> StrengthFit:
+        """With another strength, of which nothing is known yet; |S g|² with it, and with the one before."""
+        gain = float(level / before)
+        return replace(self, share=share, gain=gain, level=float(level), fresh=(), unjudged=0, confirmed=1.0)
 
     @property
     def _before(self) -> np.ndarray:
