@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,15 @@ def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
     assert optimizer.learning_rate == pytest.approx({"*": 0.02, "map": 0.02, "gain": 2.0})
     state = optimizer.init(problem(learning_rate=0.5).initial(), problem(learning_rate=0.5).learning_rates)
     assert state.learning_rates == pytest.approx({"map": 0.5, "gain": 2.0})
+
+
+def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
+    known: Any = SimpleNamespace(coordinates=SimpleNamespace(transforms={}))
+    fog, haze = "fog.interior_medium.{}.data", "haze.interior_medium.{}.data"
+    found = {fog.format("albedo"): 0.6, fog.format("sigma_t"): 2.0, haze.format("albedo"): 0.6}
+    known.initial_values = lambda: {key: np.full((2, 2, 2, 1), value) for key, value in found.items()}
+    known.bounds = {key: (0.0, None if "sigma_t" in key else 1.0) for key in found}
+    assert list(module._rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
 
 
 def test_positive_numbers_move_as_logarithms() -> None:

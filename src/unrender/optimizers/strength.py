@@ -23,8 +23,11 @@ _ROWS = 8
 """Fresh gradients from one judgement to the next; it is by those of the last two."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 3.3
 """Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
-_CONFIRMED = 0.6
-"""Share of what successive gradients agree on that fresh samples have to show for less smoothing, and must not be found below later."""
+_CONFIRMED, _KEPT = 0.5, 0.6
+"""Shares of what successive gradients agree on that fresh samples have to show for less smoothing, and must not be below by a standard
+error once it is less."""
+_CLEAR = 0.15
+"""Share of |S g|² that fresh samples have to show for less smoothing."""
 _SLOWEST = 0.75
 """The power of 1 / step that detail's gradient falls by at most where it waits for less smoothing."""
 _LEAST_CONFIRMED = 0.02
@@ -42,13 +45,14 @@ class StrengthFit:
 
     Later, gradients of an estimator that remembers samples agree on the noise remembered, too. Where an estimate has the gradient f of
     fresh samples (`FreshGradient`), S g · S f is what is no noise. Smoothing is reduced, to the strongest that descends at least 0.7 times
-    as much as the best, if by that the descent grows by more than 3.3 standard errors, and S g · S f is at least 0.6 of S g · S g'.
+    as much as the best, if by that the descent grows by more than 3.3 standard errors, and S g · S f is at least half of S g · S g', and
+    0.15 of |S g|²: the rest is noise, which nothing would average any more.
 
     Steps by smoothed gradients recover detail, too, only later: reducing their smoothing pays where the detail waits for it. So the root of
     S g · S f with the new strength must fall more slowly than step^(-3/4) from one look at fresh gradients to the next, the first
     gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. What is then
-    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, by two
-    standard errors, the strength is that of the first fit again.
+    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, by a
+    standard error, the strength is that of the first fit again.
 
     What is no noise of what successive gradients agree on, is `confirmed`.
 
@@ -121,18 +125,22 @@ class StrengthFit:
         first, before = _share(self.sums), self._before
         looked = np.append(products[-self.unjudged :, 1:].mean(axis=0), self.steps - 0.5 * (self.unjudged - 1))
         found = replace(self, seen=looked, unjudged=0)
-        if self.share < first and _most_confirmed(rows[-self.unjudged :]) < _CONFIRMED:
+        if self.share < first and sum(_confirmed(rows[-self.unjudged :], 0)) < _KEPT:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
             return found._changed(first, float(known), squares[:, 0].mean())
         descents = products / np.sqrt(squares)
         means = descents.mean(axis=0)[1:]
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
         more = descents[:, 1 + best] - descents[:, 0]
-        beyond_doubt = more.mean() > _ERRORS * more.std(ddof=1) / math.sqrt(len(more))
-        if self._shares[best] < self.share and beyond_doubt and _confirmed(rows, 1 + best)[0] >= _CONFIRMED:
-            waits = looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
-            if waits:
-                return found._changed(float(self._shares[best]), squares[:, 1 + best].mean(), squares[:, 0].mean())
+        product, square = products[:, 1 + best].mean(), squares[:, 1 + best].mean()
+        if (
+            self._shares[best] < self.share
+            and more.mean() > _ERRORS * more.std(ddof=1) / math.sqrt(len(more))
+            and _confirmed(rows, 1 + best)[0] >= _CONFIRMED
+            and product >= _CLEAR * square
+            and looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
+        ):
+            return found._changed(float(self._shares[best]), square, squares[:, 0].mean())
         return replace(found, confirmed=_most_confirmed(rows))
 
     def _changed(self, share: float, level: float, before: float) -> StrengthFit:
