@@ -15,6 +15,10 @@ MOST = float(SHARES[-1])
 the map."""
 
 
+_UNKNOWN = 3.0
+"""Samples' worth of second moment that n effective samples may have missed: with 95 % confidence no more than 3 of 3 + n (rule of three)."""
+
+
 @dataclass(frozen=True)
 class ShareEvidence:
     """Second moments of the gradient under other probabilities, from samples drawn since the map that they judge.
@@ -49,10 +53,10 @@ def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
     """The share λ of uniform draws in p = λ + (1 - λ) q that minimises a pessimistic estimate of the gradient's second moment over that of
     uniform sampling:
 
-        J(λ) = (1 - ε) R(λ) / R(1) + ε / λ,        R(λ) = Σ y / p(λ),        ε = 1 / (1 + n),        n = (Σ y)² / Σ y².
+        J(λ) = (1 - ε) R(λ) / R(1) + ε / λ,        R(λ) = Σ y / p(λ),        ε = 3 / (3 + n),        n = (Σ y)² / Σ y².
 
-    n is the effective number of samples, and ε what they leave unknown of the second moment: as much as one more sample like them
-    (Laplace's rule of succession). The map may be zero there, which costs 1 / λ. J is the larger of that of the two factors. Without
+    n is the effective number of samples, and ε the share of the second moment that they may have missed, as much as three more samples
+    like them (the rule of three: 95 % confidence). The map may be zero there, which costs 1 / λ. J is the larger of that of the two factors. Without
     evidence it is `MOST`; heavy tails, of which few samples are all, keep it large.
 
     Args:
@@ -64,6 +68,6 @@ def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
         uniform = float(moments[-1])
         if not (uniform > 0 and square > 0):
             return MOST
-        unknown = 1 / (1 + uniform**2 / float(square))
+        unknown = _UNKNOWN / (_UNKNOWN + uniform**2 / float(square))
         worst = np.maximum(worst, (1 - unknown) * moments[:-1] / uniform + unknown / SHARES)
     return float(SHARES[np.argmin(worst * (SHARES + (1 - SHARES) * cost))])
