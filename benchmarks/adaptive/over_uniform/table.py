@@ -36,7 +36,14 @@ def table(record: Record) -> str:
     for label, summary in record["summary"].items():
         worst = [f"{ratio:.2f} ± {error:.1g}" for ratio, error in summary["worst"]]
         rows.append([label, summary["problems"], *(f"{mean:.2f}" for mean in summary["mean"]), *worst])
-    head = ["sampler", "problems", "geometric mean at the end, plain", "relative", "worst of all steps, plain", "relative"]
+    head = [
+        "sampler",
+        "problems",
+        "geometric mean at the end, plain",
+        "relative",
+        "worst of all steps, plain",
+        "relative",
+    ]
     return markdown.blocks(*parts, markdown.table(head, rows))
 
 

@@ -16,7 +16,7 @@ the map."""
 
 
 _UNKNOWN = 3.0
-"""Samples' worth of second moment that n effective samples may have missed: with 95 % confidence no more than 3 of 3 + n (rule of three)."""
+"""Samples' worth of second moment that n effective samples may have missed: 3 of 3 + n at most, with 95 % confidence (rule of three)."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
         J(λ) = (1 - ε) R(λ) / R(1) + ε / λ,        R(λ) = Σ y / p(λ),        ε = 3 / (3 + n),        n = (Σ y)² / Σ y².
 
     n is the effective number of samples, and ε the share of the second moment that they may have missed, as much as three more samples
-    like them (the rule of three: 95 % confidence). The map may be zero there, which costs 1 / λ. J is the larger of that of the two factors. Without
-    evidence it is `MOST`; heavy tails, of which few samples are all, keep it large.
+    like them (the rule of three: 95 % confidence). The map may be zero there, which costs 1 / λ. J is the larger of that of the two
+    factors. Without evidence λ is `MOST`; heavy tails, of which few samples are all, keep it large.
 
     Args:
         evidence: of samples.
