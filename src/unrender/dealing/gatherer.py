@@ -140,13 +140,13 @@ class DealtViews:
         self._restart_traffic()
         known, tangents = self._outbox.numbered(request.parameters), self._outbox.once(request.tangents)
         sent = {one.number: one for tree in (known, tangents) for one in tree.values()}
-        numbers = self._outbox.values(tangents)
         references = [arrays.numpy(reference) for reference in request.references]
-        call = Call(self._outbox.values(known), Plain(), None, 1, request.key)
+        numbers = self._outbox.values(tangents)
+        call = Call(self._outbox.values(known), Plain(), None, 1, request.key, tangents=numbers)
         parts = split(self._problem, request.sample, self._shares)
         used = {share: part.positions[part.weights > 0] for share, part in enumerate(parts) if part is not None}
         calls = {
-            share: replace(call, batch=part, pilot=Pilot(tuple(own[part.positions] for own in references), numbers))
+            share: replace(call, batch=part, pilot=Pilot(tuple(own[part.positions] for own in references)))
             for share, part in enumerate(parts)
             if part is not None
         }
@@ -208,10 +208,12 @@ class DealtViews:
         """The call that all shares have in common, and its arrays."""
         sent: dict[int, Sent] = {}
 
-        def numbered(tree: Tree) -> dict[str, int]:
-            found = self._outbox.numbered(tree)
+        def named(found: Mapping[str, Sent]) -> dict[str, int]:
             sent.update({one.number: one for one in found.values()})
             return self._outbox.values(found)
+
+        def numbered(tree: Tree) -> dict[str, int]:
+            return named(self._outbox.numbered(tree))
 
         pair, state = request.pair_request, None
         if isinstance(request.state, RecursiveControlVariateState):
@@ -220,9 +222,6 @@ class DealtViews:
             number = None if memory is None else memory.number
             state = ImageState(known, number, request.state.snapshot is not None, request.state.step)
         asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step)
-        tangents = request.tangents
-        if tangents is not None:
-            tangents = {key: arrays.numpy(value) for key, value in tangents.items()}
         self._calls += 1
         call = Call(
             numbered(request.parameters),
@@ -232,7 +231,7 @@ class DealtViews:
             request.key,
             request.adjoint_spp,
             asked,
-            tangents=tangents,
+            tangents=named(self._outbox.once(request.tangents)),
             tolerance=request.tolerance,
             fresh=request.fresh,
             pictures=self._calls % _PICTURES_EVERY == 1,

@@ -85,11 +85,9 @@ class Pilot:
 
     Attributes:
         references: (N, 3) each, of the call's pixels.
-        tangents: by number; {} for none.
     """
 
     references: tuple[np.ndarray, ...]
-    tangents: References
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class Call:
         spp, adjoint_spp, key, pair, tolerance, fresh: of the request.
         batch: the pixels; None for whole views.
         pilot: whether no gradient is wanted, but what paths through these pixels find.
-        tangents: along which the squared derivatives of the drawn pixels are wanted; None where they are not.
+        tangents: along which the squared derivatives of the pixels are wanted; {} where they are not.
     """
 
     parameters: References
@@ -121,7 +119,7 @@ class Call:
     pair: Pair | None = None
     batch: Batch | None = None
     pilot: Pilot | None = None
-    tangents: dict[str, np.ndarray] | None = None
+    tangents: References = field(default_factory=dict)
     tolerance: float = 0.0
     fresh: bool = False
     result: int | None = None

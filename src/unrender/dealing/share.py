@@ -15,6 +15,7 @@ from unrender.dealing.messages import Batch, Call, Difference, Pilot, References
 from unrender.estimators.sample_groups import GatherRequest, gather_frame, leave_one_out_groups
 from unrender.images.base import PairRequest
 from unrender.images.recursive_control_variate import RecursiveControlVariateState
+from unrender.pixels.base import MiniBatch
 from unrender.pixels.pixel_statistics import PilotRequest, pilot
 from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView
 from unrender.problem.problem import Problem
@@ -50,14 +51,12 @@ class ViewShare:
         if call.replay:
             self._remember(call, self._replayed(call, request))
             return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started)
-        frames: list[tuple[int, Frame]] = [(-1, self._batch(call.batch))] if call.batch is not None else self._whole()
-        tangents = call.tangents
-        if tangents is not None:
-            tangents = {key: self.problem.renderer.array(value) for key, value in tangents.items()}
-        parts = [
-            gather_frame(self.problem, request, frame, call.key.fold(max(index, 0)), tangents)
-            for index, frame in frames
-        ]
+        frames: list[tuple[int, Frame]] = self._whole()
+        if call.batch is not None:
+            sample = self._sample(call.batch)
+            frames = [(-1, PixelBatch(self.problem, sample))]
+            request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
+        parts = [gather_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
         kept = tuple(part.kept for part in parts)
         arrays.evaluate(kept, [(part.gradient, part.previous, part.fresh, part.loss) for part in parts])
         if call.batch is None:
@@ -138,19 +137,18 @@ class ViewShare:
     def _whole(self) -> list[tuple[int, Frame]]:
         return [(index, WholeView(self.problem, local)) for local, index in enumerate(self.views)]
 
-    def _batch(self, batch: Batch) -> PixelBatch:
+    def _sample(self, batch: Batch) -> PixelSample:
         like = self.problem.renderer.array(batch.weights[:, None])
 
         def integers(values: np.ndarray) -> Any:
             return arrays.like_integers(values, like)
 
-        sample = PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
-        return PixelBatch(self.problem, sample)
+        return PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
 
     def _pilot(self, call: Call, asked: Pilot) -> tuple[np.ndarray, ...]:
         assert call.batch is not None
         references = tuple(self.problem.renderer.array(reference) for reference in asked.references)
-        sample, tangents = self._batch(call.batch).sample, self._tree(asked.tangents)
+        sample, tangents = self._sample(call.batch), self._tree(call.tangents)
         request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
         return tuple(pilot(self.problem, request))
 

@@ -99,9 +99,9 @@ class GatherRequest:
     fresh: bool = False
 
     @property
-    def tangents(self) -> Tree | None:
-        """Along which the squared derivatives of the drawn pixels are wanted. Of a pair of states they are not known."""
-        return self.batch.tangents if self.batch is not None and self.pair_request is None else None
+    def tangents(self) -> Tree:
+        """Along which the squared derivatives of the drawn pixels are wanted; {} for none. Of a pair of states they are not known."""
+        return self.batch.tangents if self.batch is not None and self.pair_request is None else {}
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
@@ -144,9 +144,7 @@ def gather(
         return problem.gatherer.gather(request)
     sample = batch.sample if batch else None
     frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
-    parts = [
-        gather_frame(problem, request, frame, key.fold(index), request.tangents) for index, frame in enumerate(frames)
-    ]
+    parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
     for frame, part in zip(frames, parts, strict=True):
@@ -192,10 +190,8 @@ class FrameGradient:
     draws: DrawStatistics | None = None
 
 
-def gather_frame(
-    problem: Problem, request: GatherRequest, frame: Frame, key: Key, tangents: Tree | None = None
-) -> FrameGradient:
-    """The part of one frame; `key` is the frame's own, `tangents` of `GatherRequest` for a mini-batch."""
+def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Key) -> FrameGradient:
+    """The part of one frame; `key` is the frame's own."""
     parameters, image, state, spp, adjoint_spp = (
         request.parameters,
         request.image,
@@ -227,8 +223,8 @@ def gather_frame(
     if request.fresh and found.fresh is not None:
         fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
     draws = None
-    if tangents is not None and isinstance(frame, PixelBatch):
-        draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, tangents))
+    if request.tangents and isinstance(frame, PixelBatch):
+        draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, request.tangents))
     return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws)
 
 

@@ -37,14 +37,14 @@ class MiniBatch:
         samples: paths traced to estimate their probabilities.
         probability: per view, the probability of its pixels relative to uniform sampling: a map (rows, columns), coarser than
             the film; empty where it is uniform.
-        tangents: of the parameters, along which the squared derivatives of the drawn pixels are asked for (`DrawStatistics`); None where
+        tangents: of the parameters, along which the squared derivatives of the drawn pixels are asked for (`DrawStatistics`); {} where
             they are not.
     """
 
     sample: PixelSample | None
     samples: int = 0
     probability: dict[int, np.ndarray] = field(default_factory=dict)
-    tangents: Tree | None = None
+    tangents: Tree = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

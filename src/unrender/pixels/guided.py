@@ -196,7 +196,7 @@ class GuidedSampler:
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
         """See `PixelSampler.draw`."""
-        traced, tangents = 0, None
+        traced, tangents = 0, {}
         if not state.maps or state.age >= self.options.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
         early = state.refreshes == 1 and state.age < _FIRST
