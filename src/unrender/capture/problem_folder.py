@@ -22,6 +22,7 @@ from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.io import toml_lines
 from unrender.judging.held_out import HELD_OUT
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.exposure import EXPOSURE
 from unrender.stages import stages_file
 
@@ -38,8 +39,6 @@ _WHOLE = 0.999
 _BAND_WEIGHT = 0.1
 _WHITE = 0.95
 """Of a saturated pixel, linear: resizing mixes it with its neighbours."""
-_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""A camera's axes left, up, forwards, which are Mitsuba's, in those of `cameras`: right, up, backwards."""
 
 
 def write(
@@ -102,7 +101,7 @@ def write(
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
     """The pose of a camera as `to_world` of Mitsuba's sensors, (4, 4)."""
-    return camera_to_world @ _FROM_MITSUBA
+    return camera_to_world @ MITSUBA_TO_OPENGL
 
 
 def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.exporting.asset import Asset, Camera
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 __all__ = ["SCRIPT", "write"]
 
@@ -17,8 +18,6 @@ SCRIPT = "open_in_blender.py"
 _TEMPLATE, _PLACE = "open_in_blender.py.txt", '"SETTINGS"'
 # glTF's and Mitsuba's y is up, Blender's z is: its importer takes (x, y, z) to (x, -z, y).
 _TO_BLENDER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-# Mitsuba's cameras have x left and z forwards, Blender's x right and z backwards.
-_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 # Mitsuba looks a direction (x, y, z) up at u = atan2(x, -z) / 2π, Blender (x, -z, y) at u = 1/2 - atan2(-z, x) / 2π: a quarter more.
 _QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -47,7 +46,7 @@ def _camera(camera: Camera) -> dict[str, Any]:
     width, height = camera.size
     return {
         "name": camera.name,
-        "matrix": (turned @ camera.to_world @ _AXES).tolist(),
+        "matrix": (turned @ camera.to_world @ MITSUBA_TO_OPENGL).tolist(),
         "angle_x": float(np.radians(camera.x_fov)),
         "shift": [camera.offset[0], -camera.offset[1] * height / width],
         "size": [width, height],

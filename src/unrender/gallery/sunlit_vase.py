@@ -16,9 +16,9 @@ from unrender.gallery import fields, meshes, parts, skies, textures
 from unrender.losses import L1, Loss
 from unrender.problem.parameter import Parameter
 
-__all__ = ["SunlitVase"]
+__all__ = ["SUN", "SunlitVase", "vase"]
 
-_SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
+SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
 """Direction to the sun."""
 _SUN_RADIUS = np.radians(2.5)
 
@@ -52,7 +52,7 @@ class SunlitVase:
             },
             "sky": skies.environment(_sky()),
             "ground": parts.rectangle((0, 0, 0), (15, 0, 0), (0, 0, -15), {"type": "diffuse", "reflectance": gravel}),
-            "vase": meshes.sheet("vase", _vase_points(96, 96), _glaze(self.texture_resolution), closed=True),
+            "vase": vase(self.texture_resolution),
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -60,9 +60,14 @@ class SunlitVase:
         return (Parameter("vase.bsdf.brdf_0.base_color.data", initial=0.5),)
 
 
+def vase(texture_resolution: int) -> dict[str, Any]:
+    """The vase alone, with its true glaze."""
+    return meshes.sheet("vase", _vase_points(96, 96), _glaze(texture_resolution), closed=True)
+
+
 def _sky() -> np.ndarray:
     """The sky and its sun: see `skies.picture`."""
-    return skies.picture(_SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
+    return skies.picture(SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
 
 
 def _vase_points(rows: int, columns: int) -> np.ndarray:

@@ -11,13 +11,15 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core import checks
 from unrender.core.errors import InputError
-from unrender.gallery import skies, sunlit_vase
+from unrender.gallery import parts, skies, sunlit_vase
 from unrender.io import files
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 __all__ = ["photographs"]
 
 _FIELD_OF_VIEW = 30.0
 _DISTANCE, _MIDDLE = 4.4, 0.85
+_TEXELS, _MAX_DEPTH = 64, 5
 _WHITE = 0.98
 """Of the brightest pixel but one in a thousand."""
 
@@ -42,26 +44,22 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
     """
     for name, value, least in (("views", views, 3), ("size", size, 8), ("spp", spp, 1), ("seed", seed, 0)):
         checks.integer("photographs", name, value, at_least=least)
-    place = Path(folder)
-    files.check_replaceable(place, (), "transforms.json", False, f"photographs: {place}", "photographs")
+    out = Path(folder)
+    files.check_replaceable(out, (), "transforms.json", False, f"photographs: {out}", "photographs")
     variant.ensure()
-    problem = sunlit_vase.SunlitVase()
-    described = {"type": "scene", "sky": skies.environment(_sky()), "vase": problem.scene()["vase"]}
-    scene = mi.load_dict(described)
-    path = mi.load_dict({"type": "path", "max_depth": problem.max_depth, "hide_emitters": True})
-    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    scene = mi.load_dict({"type": "scene", "sky": skies.environment(_sky()), "vase": sunlit_vase.vase(_TEXELS)})
+    path = mi.load_dict({"type": "path", "max_depth": _MAX_DEPTH, "hide_emitters": True})
     pictures, frames = [], []
     for index in range(views):
         angle, height = 2 * np.pi * index / views, _MIDDLE + 1.5 * np.sin(2.4 * index)
         level = np.sqrt(_DISTANCE**2 - (height - _MIDDLE) ** 2)
-        pose = mi.ScalarTransform4f().look_at(
-            origin=[level * np.sin(angle), height, level * np.cos(angle)], target=[0, _MIDDLE, 0], up=[0, 1, 0]
-        )
-        camera = mi.load_dict({"type": "perspective", "fov": _FIELD_OF_VIEW, "to_world": pose, "film": film})
-        picture = mi.render(scene, sensor=camera, integrator=path, spp=spp, seed=seed + index)  # pyright: ignore[reportArgumentType]
+        place = level * np.sin(angle), height, level * np.cos(angle)
+        camera = parts.camera(place, (0, _MIDDLE, 0), _FIELD_OF_VIEW, size)
+        camera["film"]["pixel_format"] = "rgba"
+        seen = mi.load_dict(camera)
+        picture = mi.render(scene, sensor=seen, integrator=path, spp=spp, seed=seed + index)  # pyright: ignore[reportArgumentType]
         pictures.append(np.array(picture))
-        # Mitsuba's cameras have x to the left and look along +z, OpenGL's have x to the right and look along -z.
-        matrix = np.array(pose.matrix) @ np.diag([-1, 1, -1, 1])
+        matrix = np.array(camera["to_world"].matrix) @ MITSUBA_TO_OPENGL
         frames.append({"file_path": f"images/{index:02}.png", "transform_matrix": matrix.tolist()})
     white = np.quantile(np.stack(pictures)[..., :3], 0.999) / _WHITE
 
@@ -75,12 +73,12 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
         (made / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
     try:
-        files.write_folder(place, fill)
+        files.write_folder(out, fill)
     except OSError as error:
-        raise InputError(f"photographs: {place}: {error.strerror or error}") from error
-    return place
+        raise InputError(f"photographs: {out}: {error.strerror or error}") from error
+    return out
 
 
 def _sky() -> np.ndarray:
     """A sky whose sun is veiled, so that shadows are soft."""
-    return skies.picture(np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56]), 0.3, (14.0, 12.5, 10.5))
+    return skies.picture(sunlit_vase.SUN, 0.3, (14.0, 12.5, 10.5))
