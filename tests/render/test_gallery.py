@@ -770,9 +770,9 @@ def test_the_sun_of_the_vase_casts_the_light_that_its_direction_says():
     scene = mi.load_dict({"type": "scene", "sky": {"type": "envmap", "bitmap": mi.Bitmap(sunlit_vase._sky())}})
     sky = scene.emitters()[0]
     si = mi.SurfaceInteraction3f()
-    si.wi = mi.Vector3f((-sunlit_vase._SUN).tolist())
+    si.wi = mi.Vector3f((-sunlit_vase.SUN).tolist())
     away = mi.SurfaceInteraction3f()
-    away.wi = mi.Vector3f((sunlit_vase._SUN * [1, -1, 1]).tolist())
+    away.wi = mi.Vector3f((sunlit_vase.SUN * [1, -1, 1]).tolist())
     assert np.array(sky.eval(si)).min() > 100
     assert np.array(sky.eval(away)).max() < 1
 
