@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from unrender.rendering.mitsuba import frozen
@@ -114,3 +115,38 @@ def test_a_recording_of_one_thread_is_not_replayed_by_two(warned: list[str]) -> 
         assert dr.allclose(once(nothing, x, index), 1 << 14)
         assert len(calls) == traced
     assert not warned
+
+
+def test_kernels_of_a_textured_area_light_are_recorded(warned: list[str]) -> None:
+    """Such a light makes the distribution of its texels at its first sample, which is too late within a recording."""
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+    from unrender.rendering.renderer import SampleRequest
+
+    scene = {
+        "type": "scene",
+        "camera": {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 2, 4], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+        },
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)},
+        "screen": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -1]),
+            "emitter": {
+                "type": "area",
+                "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32)), "raw": True},
+            },
+        },
+        "lamp": {"type": "point", "position": [0, 2, 0]},
+    }
+    key = "screen.emitter.radiance.data"
+    session = MitsubaRenderer(scene).prepare([key], None)
+    bright, dark = (
+        np.array(
+            session.image({key: mi.TensorXf(np.full((2, 2, 3), value, np.float32))}, SampleRequest(0, 4, 0, 1)).images
+        )
+        for value in (3.0, 0.0)
+    )
+    assert not warned
+    assert bright.mean() > 1.2 * dark.mean()

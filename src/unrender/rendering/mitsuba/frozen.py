@@ -52,7 +52,7 @@ class FrozenFunction:
             prepare()
             result = self._function(*arguments)  # its own error is the one that counts
             self._frozen = None
-            _warn(str(error).partition("\n")[0])
+            _warn(str(_first_cause(error)).partition("\n")[0])
         self._recorded = True
         return result
 
@@ -84,6 +84,12 @@ def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -
     finally:
         if enabled:
             gc.enable()
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 @functools.cache

@@ -103,6 +103,7 @@ class LoadedScene:
         self.meshed: list[str] = []
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
+        _make_distributions(self.scene)
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
@@ -223,6 +224,17 @@ class LoadedScene:
 
     def _spend(self) -> None:
         self._settings = {key: replace(setting, spent=True) for key, setting in self._settings.items()}
+
+
+def _make_distributions(scene: mi.Scene) -> None:
+    """Have lights with textures make the distributions of their texels, which they make at their first sample and keep up to date.
+
+    Made within a kernel that is recorded, they are none of its inputs, and Dr.Jit refuses to record it.
+    """
+    somewhere = dr.zeros(mi.Interaction3f)
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+            dr.eval(emitter.sample_direction(somewhere, mi.Point2f(0.5)))
 
 
 def _index(value: Any) -> tuple[int, ...]:
