@@ -89,6 +89,30 @@ def test_broken_meshes_have_finite_gradients(broken: str) -> None:
     assert np.abs(found).max() > 0
 
 
+def test_auto_smooths_colours_of_vertices_over_the_edges_of_their_mesh() -> None:
+    """As (n V,), or given as (V, n); positions are left to `LargeSteps`."""
+    colours = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    points, faces = meshes.icosphere(1)
+    thing = meshes.triangles("thing", 0.4 * points, faces, colours)
+    thing.add_attribute("vertex_color", 3, np.full(3 * len(points), 0.8, np.float32))
+    key, start = "thing.vertex_color", np.linspace(0.2, 0.9, 3 * len(points)).reshape(-1, 3)
+    problem = ur.Problem(
+        scene(thing=thing), [ur.Parameter(key, initial=start)], [ur.View(np.full((SIZE, SIZE, 3), 0.1))], max_depth=2
+    )
+    np.testing.assert_allclose(problem.initial_values()[key], start.ravel(), rtol=1e-6)
+    chosen: Any = method("auto").choose(problem, {})
+    assert chosen.optimizer.preconditioned == (key,)
+    assert "two states would share" in chosen.reasons[0]  # a mesh that is made already: no control variates
+    assert chosen.estimator.image == ur.images.Plain()
+    result = ur.optimize(problem, chosen.estimator, chosen.optimizer, steps=3, seed=0)
+    moved = result.parameters[key] - problem.initial_values()[key]
+    assert np.isfinite(moved).all()
+    assert (moved != 0).mean() > 0.9  # those behind, too
+    positions = ur.Problem(scene(), [ur.Parameter(KEY)], [ur.View(np.zeros((SIZE, SIZE, 3)))], max_depth=2)
+    chosen = method("auto").choose(positions, {})
+    assert chosen.optimizer.preconditioned == ()
+
+
 @pytest.mark.slow
 def test_slivers_change_nothing() -> None:
     _, faces = meshes.icosphere(1)

@@ -18,6 +18,7 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
     A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C), a .vol file to (Z, Y, X, C); an
     array, also of a .npy file or the only one of an .npz archive, must have the shape, but for the last axis where that is of length 1.
+    Where the shape has one axis, as of a mesh's vertices (n V,), it may be (V, n), too.
 
     Raises:
         InputError: it does not fit, cannot be read, or is not finite.
@@ -38,6 +39,8 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
         raise InputError("must be finite, got NaN or infinite values")
     if array.shape == shape:
         return array.copy(), ""
+    if len(shape) == 1 and array.size == shape[0] and array.ndim == 2:
+        return array.reshape(shape), ""
     scalar = array.shape in ((), (1,))
     colour = array.ndim == 1 and len(shape) > 1 and array.shape[0] == shape[-1]
     if scalar or colour:

@@ -73,9 +73,9 @@ class AutoMethod(Options):
 
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
-    memory, each step has its own rendering. Textures and grids move along Sobolev gradients, parameters by steps in proportion to their
-    range. Where path gradients do not reach a parameter, as of a pose, it is `smoothed`; cameras move along path gradients. Every choice
-    can be set.
+    memory, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the vertices of
+    meshes move along Sobolev gradients, parameters by steps in proportion to their range. Where path gradients do not reach a parameter,
+    as of a pose, it is `smoothed`; cameras move along path gradients. Every choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -93,7 +93,9 @@ class AutoMethod(Options):
     parameterise: bool = Field(
         True, description="whether positive numbers, colours and textures without an upper bound move as logarithms"
     )
-    smooth: bool = Field(True, description="whether textures and grids move along Sobolev gradients")
+    smooth: bool = Field(
+        True, description="whether textures, grids and values at vertices move along Sobolev gradients"
+    )
     learning_rate: PositiveFloat = Field(
         _RATE,
         le=1,
@@ -166,11 +168,9 @@ class AutoMethod(Options):
         if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:
             reason = f"{share:.0%} of the noise is in 1% of the pixels, where a control variate would remember it"
             return _Image("plain", Plain(), reason)
-        space: Literal["path", "primary"] = "path"
-        try:
-            problem.renderer.prepare(list(problem.shapes()), "path")
-        except InputError:
-            space = "primary"
+        space, obstacle = _shared_space(problem)
+        if obstacle and self.image is None:
+            return _Image("plain", Plain(), f"no control variates: {obstacle}")
         reason = "as asked for" if self.image else "earlier samples are used again"
         return _Image("rcv", RecursiveControlVariate(space), reason)
 
@@ -190,12 +190,29 @@ class AutoMethod(Options):
         return self.spp or min(max(1 << ((_PATHS // count).bit_length() - 1 if count <= _PATHS else 0), _FEWEST), _MOST)
 
     def _smoothed(self, problem: Problem) -> tuple[str, ...]:
-        """Textures and grids that have no preconditioner of their own."""
-        if not self.smooth:
-            return ()
+        """Textures, grids and values at vertices, but for positions, that have no preconditioner of their own."""
+        known = problem.renderer.parameters()
         return tuple(
-            key for key, shape in problem.shapes().items() if key not in problem.preconditioners and grid.is_map(shape)
+            key
+            for key, shape in problem.shapes().items()
+            if self.smooth
+            and key not in problem.preconditioners
+            and (grid.is_map(shape) or (known[key].mesh is not None and not known[key].welded))
         )
+
+
+def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:
+    """Where two states of the parameters share samples, and why nowhere; "" where they do."""
+    keys = list(problem.shapes())
+    try:
+        problem.renderer.prepare(keys, "path")
+    except InputError:
+        try:
+            problem.renderer.prepare(keys, "primary")
+        except InputError as error:
+            return "primary", str(error)
+        return "primary", ""
+    return "path", ""
 
 
 def _is_of_cameras(problem: Problem) -> bool:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
+from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Choosing", "Optimizer", "Reparameterising"]
+__all__ = ["Choosing", "OnMeshes", "Optimizer", "Reparameterising"]
 
 
 class Optimizer(Protocol):
@@ -39,6 +40,15 @@ class Reparameterising(Protocol):
     @property
     def parameterisations(self) -> Mapping[str, Any]:
         """{key: parameterisation, or its name}; keys that the problem does not have, or that have their own, are left out."""
+        ...
+
+
+@runtime_checkable
+class OnMeshes(Protocol):
+    """An optimizer that has preconditioners which suit values at the vertices of meshes, once they know these."""
+
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Optimizer:
+        """The same, given the mesh of a parameter's key; None for what has none."""
         ...
 
 

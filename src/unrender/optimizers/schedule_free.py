@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-
-import numpy as np
+from typing import cast
 
 from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
@@ -16,9 +15,11 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.optimizers import rates
+from unrender.optimizers.signal_share import signal_share
 from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
-from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
 
@@ -37,8 +38,6 @@ _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 _MOST_GROWTH = 3.0
 """Times the first rate, and times what the parameters themselves have grown by."""
 _NOT_FITTED = StrengthFit()
-_LEAST_SIGNAL = 0.02
-"""The least factor of a step: gradients that were noise may come to tell something."""
 _PROJECTED = 1e-5
 """Difference, relative to parameter and first rate, from which a parameter counts as moved by its bounds; below it, as rounded."""
 
@@ -159,6 +158,9 @@ class ScheduleFree:
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
     parameterisations: Mapping[str, str] = field(default_factory=dict)
+    _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self):
         given = self._given_rates
@@ -185,6 +187,16 @@ class ScheduleFree:
         """A gradient."""
         return Capabilities(Gradient)
 
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> ScheduleFree:
+        """See `OnMeshes.on_meshes`."""
+        smooth, bound = self.preconditioner, {}
+        if isinstance(smooth, MeshPreconditioner):
+            found = {key: topology(key) for key in self.preconditioned}
+            bound = {key: (mesh, smooth.on_mesh(mesh)) for key, mesh in found.items() if mesh is not None}
+        optimizer = replace(self)
+        object.__setattr__(optimizer, "_on_meshes", bound)
+        return optimizer
+
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ScheduleFreeState:
         """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
         given = self._given_rates
@@ -194,7 +206,7 @@ class ScheduleFree:
             if key not in parameters:
                 raise InputError(f'ScheduleFree: preconditioned: unknown parameter "{key}"')
             if self.preconditioner is not None:
-                self.preconditioner.check(key, arrays.shape(parameters[key]))
+                self._smooth(key).check(key, arrays.shape(parameters[key]))
         iterate = dict(parameters)
         zeros = trees.zeros_like(parameters)
         ones = dict.fromkeys(parameters, 1.0)
@@ -242,7 +254,8 @@ class ScheduleFree:
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)
             if key in maps:
-                share = _signal(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed)
+                cells = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
+                share = signal_share(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed, cells)
                 direction = maps[key].apply(direction) * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             tolerance = state.learning_rates[key] * _PROJECTED
@@ -302,13 +315,12 @@ class ScheduleFree:
 
     def _fitted(self, state: ScheduleFreeState, estimate: Estimate) -> dict[str, StrengthFit]:
         """The strengths after another gradient."""
-        smooth = self.preconditioner
-        if not isinstance(smooth, Sobolev):
-            return state.strengths
         found = estimate.get(FreshGradient)
         fresh: Mapping[str, Array] = {} if found is None else found.values
         return {
-            key: fit.after(smooth, state.gradient[key], estimate.gradient[key], fresh.get(key))
+            key: fit.after(
+                cast("Sobolev", self._smooth(key)), state.gradient[key], estimate.gradient[key], fresh.get(key)
+            )
             for key, fit in state.strengths.items()
         }
 
@@ -317,9 +329,14 @@ class ScheduleFree:
         smooth = self.preconditioner
         if smooth is None:
             return {}
-        if not isinstance(smooth, Sobolev):
-            return dict.fromkeys(self.preconditioned, smooth)
-        return {key: smooth.scaled(fit.share) for key, fit in strengths.items()}
+        found = {key: self._smooth(key) for key in self.preconditioned}
+        return {k: s.scaled(strengths[k].share) if isinstance(s, Sobolev) else s for k, s in found.items()}
+
+    def _smooth(self, key: str) -> Preconditioner:
+        """The preconditioner of a parameter in `preconditioned`, all of it."""
+        found = self._on_meshes[key][1] if key in self._on_meshes else self.preconditioner
+        assert found is not None
+        return found
 
     def _between(self, fast: Array, average: Array) -> Array:
         """y."""
@@ -352,18 +369,6 @@ def _mean_square(beta_2: float, made: int) -> tuple[float, float]:
 def _size(x: Array, square: float) -> float:
     """The root mean square of an array whose squares sum up to `square`; 0 of no elements."""
     return math.sqrt(square / max(1, math.prod(arrays.shape(x))))
-
-
-def _signal(smooth: Preconditioner, product: Array, square: Array, unknown: float, confirmed: float) -> np.ndarray:
-    """The share of signal per element: as far as gradients agree, and fresh ones confirm it; 1 as far as it is `unknown` yet."""
-    parts = [arrays.numpy(x).astype(np.float64) for x in (product, square)]
-    means = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
-    for _ in range(2):
-        means = np.asarray(smooth.apply(means))
-    whole, squares = means[..., :1] * confirmed, means[..., 1:]
-    share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
-    share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
-    return np.broadcast_to(share, parts[0].shape).astype(np.float32)
 
 
 def _remember(state: ScheduleFreeState, gradient: Tree, strengths: Mapping[str, StrengthFit]) -> tuple[Tree, Tree]:

@@ -27,8 +27,8 @@ class Preconditioner(Protocol):
 
 @runtime_checkable
 class MeshPreconditioner(Protocol):
-    """A preconditioner that suits vertex positions, once it knows their mesh."""
+    """A preconditioner that suits values at the vertices of a mesh, such as positions, once it knows the mesh."""
 
     def on_mesh(self, topology: MeshTopology) -> Preconditioner:
-        """The same for the vertex positions (3 V,) of a mesh."""
+        """The same for values at the V vertices of a mesh, (n V,)."""
         ...

@@ -11,7 +11,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid
-from unrender.preconditioners.mesh import MeshSolver, MeshTopology
+from unrender.preconditioners.mesh import MeshTopology
 
 __all__ = ["LargeSteps"]
 
@@ -25,10 +25,10 @@ class LargeSteps:
     pass unchanged and no detail is out of reach: S has full rank, so the descent has the same minima. S is symmetric,
     its eigenvalues lie in [1/(1 + 4 d λ), 1] on d axes.
 
-    Suits textures (H, W, C), grids (Z, Y, X, C) and the vertex positions (3 V,) of meshes, which go with `Adam(uniform=True)` as in the
-    paper: one rate for all vertices keeps smooth steps smooth. Vertices of a mesh at the same place move as one. The result
-    is computed on the host in float32 and has the
-    argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU.
+    Suits textures (H, W, C), grids (Z, Y, X, C), values at the vertices of meshes (n V,) and their positions, which go with
+    `Adam(uniform=True)` as in the paper: one rate for all vertices keeps smooth steps smooth. Vertices of a mesh at the same place move as
+    one. The result is computed on the host in float32 and has the argument's type; on Dr.Jit it waits for the device, and copies to and fro
+    where that is a GPU.
 
     Args:
         strength: λ, >= 0; 0 does nothing. 1 to 100 is usual.
@@ -38,7 +38,7 @@ class LargeSteps:
 
     strength: float = 10.0
     wrap: bool | tuple[bool, ...] = False
-    _mesh: MeshSolver | None = field(default=None, init=False, repr=False, compare=False)
+    _mesh: MeshTopology | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         checks.number("LargeSteps", "strength", self.strength, above=0.0, inclusive=True)
@@ -47,7 +47,7 @@ class LargeSteps:
     def on_mesh(self, topology: MeshTopology) -> LargeSteps:
         """See `MeshPreconditioner.on_mesh`."""
         bound = LargeSteps(self.strength, self.wrap)
-        object.__setattr__(bound, "_mesh", MeshSolver(float(self.strength), topology))
+        object.__setattr__(bound, "_mesh", topology)
         return bound
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
@@ -59,7 +59,7 @@ class LargeSteps:
     def apply(self, x: Array) -> Array:
         """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
         if self._mesh is not None:
-            return arrays.like(self._mesh.solve(arrays.numpy(x)), x)
+            return arrays.like(self._mesh.solver(float(self.strength)).solve(arrays.numpy(x)), x)
         shape = arrays.shape(x)
         self.check("parameter", shape)
         solver = grid.solver(float(self.strength), shape[:-1], grid.per_axis(self.wrap, len(shape) - 1))

@@ -1,19 +1,33 @@
-"""The solver of (C + λ L) y = x over the places of a mesh, L its graph Laplacian, C how many vertices are there.
+"""Solvers of (C + λ L) y = x over the places of a mesh, L its graph Laplacian, C how many vertices are there; and powers of their inverse.
 
-(L x)_i is the sum of x_i − x_j over the vertices j that an edge joins with vertex i. Vertices at the same place are one: what is cut along
-seams of texture coordinates or of normals moves together.
+(L x)_i is the sum of x_i − x_j over the places j that an edge joins with place i. Of positions, vertices at the same place are one: what is
+cut along seams of texture coordinates or of normals moves together. Of attributes, such as colours, each vertex is a place of its own, and
+what is cut there are neighbours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["MeshSolver", "MeshTopology"]
+if TYPE_CHECKING:
+    import scipy.sparse
+
+__all__ = ["MeshSolver", "MeshSpectrum", "MeshTopology"]
+
+_POLE_FACTOR = 16.0
+"""Strengths of the solvers that functions of L are sums of, from one to the next: with 4 in its place, errors are smaller, and there are
+twice as many solvers."""
+_WEAKEST_POLE = 1 / 16
+_SAMPLES = 200
+"""Of the spectrum of L, at which such a sum is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +41,53 @@ class MeshTopology:
 
     places: np.ndarray
     neighbours: np.ndarray
+    _solvers: dict[float, MeshSolver] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
-    def of(cls, positions: np.ndarray, faces: np.ndarray) -> MeshTopology:
-        """Of a mesh as loaded: positions (V, 3), faces (F, 3)."""
+    def of(cls, positions: np.ndarray, faces: np.ndarray, welded: bool = True) -> MeshTopology:
+        """Of a mesh as loaded: positions (V, 3), faces (F, 3). `welded`: vertices at the same place are one; else they are neighbours."""
         _, places = np.unique(positions, axis=0, return_inverse=True)
         places = places.reshape(-1)
-        corners = places[faces]
-        pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-        return cls(places, np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0))
+        if welded:
+            return cls(places, _pairs(_edges(places[faces])))
+        order = np.argsort(places, kind="stable")
+        cut = places[order[:-1]] == places[order[1:]]
+        links = np.stack([order[:-1][cut], order[1:][cut]], axis=1)
+        return cls(np.arange(len(places)), _pairs(np.concatenate([_edges(faces), links])))
+
+    @cached_property
+    def copies(self) -> np.ndarray:
+        """The diagonal of C, (P,): vertices at each place."""
+        return np.bincount(self.places)
+
+    @cached_property
+    def laplacian(self) -> scipy.sparse.csr_matrix:
+        """L, (P, P)."""
+        import scipy.sparse
+
+        i, j = self.neighbours.T
+        edges = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (len(self.copies),) * 2)
+        adjacency = edges + edges.T
+        return (scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+
+    def solver(self, strength: float) -> MeshSolver:
+        """That of (C + λ L) y = x, factorised once."""
+        if strength not in self._solvers:
+            self._solvers[strength] = MeshSolver(strength, self)
+        return self._solvers[strength]
+
+    def gathered(self, x: np.ndarray) -> np.ndarray:
+        """Bᵀ x, (P, n) float64: the sums of what the vertices at each place have, x (V, n)."""
+        found = np.zeros((len(self.copies), x.shape[1]))
+        np.add.at(found, self.places, x)
+        return found
+
+    def split(self, owner: str, x: np.ndarray) -> np.ndarray:
+        """An array of all vertices' values, (n V,), as (V, n). Raises `InputError` for another number of vertices."""
+        vertices = len(self.places)
+        if x.ndim != 1 or x.size == 0 or x.size % vertices:
+            raise InputError(f"{owner}: expected values of the mesh's {vertices} vertices, got shape {x.shape}")
+        return x.reshape(vertices, -1)
 
 
 class MeshSolver:
@@ -50,29 +102,92 @@ class MeshSolver:
 
     def __init__(self, strength: float, topology: MeshTopology):
         self._strength, self._topology = strength, topology
-        self._copies = np.bincount(topology.places)
-        self._count = len(self._copies)
 
     @cached_property
     def _factor(self):
         import scipy.sparse
         from cholespy import CholeskySolverF, MatrixType  # type: ignore  (a compiled module without stubs)
 
-        i, j = self._topology.neighbours.T
-        edges = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (self._count, self._count))
-        adjacency = edges + edges.T
-        laplacian = scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
-        matrix = (scipy.sparse.diags(self._copies.astype(float)) + self._strength * laplacian).tocoo()
+        copies = scipy.sparse.diags(self._topology.copies.astype(float))
+        matrix = (copies + self._strength * self._topology.laplacian).tocoo()
         rows, columns = matrix.row.astype(np.int32), matrix.col.astype(np.int32)
-        return CholeskySolverF(self._count, rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
+        return CholeskySolverF(matrix.shape[0], rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """y of the shape of x, (3 V,) float32, each coordinate by itself. Raises `InputError` for another number of vertices."""
-        places = self._topology.places
-        if x.shape != (3 * len(places),):
-            raise InputError(f"LargeSteps: expected the {3 * len(places)} coordinates of the mesh, got shape {x.shape}")
-        right = np.zeros((self._count, 3), np.float32)
-        np.add.at(right, places, np.asarray(x, np.float32).reshape(-1, 3))
+        """y of the shape of x, (n V,) float32, each of the n channels by itself. Raises `InputError` for another number of vertices."""
+        values = self._topology.split("LargeSteps", np.asarray(x, np.float32))
+        return self.solve_places(self._topology.gathered(values))[self._topology.places].reshape(-1)
+
+    def solve_places(self, x: np.ndarray) -> np.ndarray:
+        """(C + λ L)^-1 x, (P, n), float32."""
+        right = np.ascontiguousarray(x, np.float32)
         result = np.empty_like(right)
         self._factor.solve(right, result)
-        return result[places].reshape(-1)
+        return result
+
+
+class MeshSpectrum:
+    """Functions of C^-1/2 L C^-1/2 as sums of solvers, C^1/2 Σ_k w_k (C + λ_k L)^-1 C^1/2: those that are such integrals with positive w.
+
+    So are (1 + λ x)^-1 and its square root for any λ up to the strongest. λ_k are 0 and the strongest over powers of 16; the weights are
+    fitted by non-negative least squares over the spectrum, to an error of some percent: the sum is symmetric and positive, as a
+    preconditioner has to be, and leaves a constant as it is.
+
+    Args:
+        topology: of the mesh.
+        strongest: λ, > 0.
+    """
+
+    def __init__(self, topology: MeshTopology, strongest: float):
+        self._topology = topology
+        count = 1 + max(0, math.ceil(math.log(max(strongest, _WEAKEST_POLE) / _WEAKEST_POLE, _POLE_FACTOR)))
+        self._poles = (0.0, *(strongest * _POLE_FACTOR ** -np.arange(count, dtype=float)))
+        self._largest = max(1.0, 2.0 * float((topology.laplacian.diagonal() / topology.copies).max(initial=0.0)))
+        self._roots: dict[float, np.ndarray] = {}
+
+    def solved(self, x: np.ndarray) -> np.ndarray:
+        """Of all poles, (poles, P, n): (C + λ_k L)^-1 x, x (P, n)."""
+        return np.stack(
+            [
+                x / self._topology.copies[:, None],
+                *(self._topology.solver(pole).solve_places(x) for pole in self._poles[1:]),
+            ]
+        )
+
+    def weights(self, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """w, (poles,), >= 0 and of sum 1, of a function of the eigenvalues that is 1 at 0."""
+        from scipy.optimize import nnls
+
+        x = np.geomspace(1e-3 / self._poles[1], self._largest, _SAMPLES)
+        wanted = function(x)
+        basis = 1.0 / (1.0 + np.outer(x, self._poles))
+        found, _ = nnls(basis / wanted[:, None], np.ones(len(x)))
+        return found / found.sum()
+
+    def root(self, strength: float, x: np.ndarray) -> np.ndarray:
+        """Near B C^-1/2 (I + λ C^-1/2 L C^-1/2)^-1/2 C^-1/2 Bᵀ x, of the shape of x, (V, n) float32."""
+        if strength not in self._roots:
+            self._roots[strength] = self.weights(lambda x: 1.0 / np.sqrt(1.0 + strength * x))
+        found = np.tensordot(self._roots[strength], self.solved(self._topology.gathered(x)), 1)
+        return np.asarray(found[self._topology.places], np.float32)
+
+    def descents(self, strength: float, smooth: np.ndarray, gradient: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """See `Sobolev.descents`; smooth, gradient: (V, n)."""
+        topology = self._topology
+        places = np.zeros((len(topology.copies), smooth.shape[1]))
+        places[topology.places] = self.root(strength, smooth)  # (C + λ L)^-1 Bᵀ g
+        first = topology.copies[:, None] * places + strength * (topology.laplacian @ places)
+        second, solved = topology.gathered(gradient), self.solved(first)
+        sums = np.einsum("kpn,spn->sk", solved, np.stack([second, first]))
+        weights = [self.weights(lambda x, share=share: 1.0 / (1.0 + share * strength * x)) for share in shares]
+        return sums @ np.transpose(weights)
+
+
+def _edges(corners: np.ndarray) -> np.ndarray:
+    return np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+
+
+def _pairs(edges: np.ndarray) -> np.ndarray:
+    """Each once, of two different ends."""
+    pairs = np.sort(edges, axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)

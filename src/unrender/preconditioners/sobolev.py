@@ -1,4 +1,4 @@
-"""Sobolev gradients of textures and grids.
+"""Sobolev gradients of textures, grids and values at the vertices of meshes.
 
 Descent along the gradient of the H¹ inner product in place of that of L²: Neuberger 1997, "Sobolev Gradients and Differential Equations".
 """
@@ -6,7 +6,7 @@ Descent along the gradient of the H¹ inner product in place of that of L²: Neu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid
+from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
 __all__ = ["Sobolev"]
 
@@ -31,11 +32,13 @@ class Sobolev:
     Among linear preconditioners it is the natural one for textures like those of photographs, whose spectra fall with the frequency f
     as 1/f² in power: (I + λ L)^-1 is the covariance of such a texture beyond √λ texels.
 
-    Suits textures (H, W, C) and grids (Z, Y, X, C). The result is computed on the host in float32 and has the argument's type; on Dr.Jit
-    it waits for the device, and copies to and fro where that is a GPU. S is symmetric, its eigenvalues lie in [(1 + 4 d λ)^(-1/2), 1].
+    Suits textures (H, W, C), grids (Z, Y, X, C) and values at the V vertices of a mesh (n V,), the cells of whose grid are its vertices,
+    neighbours along edges; there S is near that root, to some percent (`MeshSpectrum`). The result is computed on the host in float32 and
+    has the argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU. S is symmetric, its eigenvalues
+    lie in [(1 + 4 d λ)^(-1/2), 1].
 
     Args:
-        strength: λ, >= 0; 0 does nothing. None for (`correlation` N)², N the geometric mean of the grid's sides.
+        strength: λ, >= 0; 0 does nothing. None for (`correlation` N)², N the geometric mean of the grid's sides, of meshes √V.
         wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per axis.
         correlation: √λ where no strength is given, as a share of N, >= 0.
     """
@@ -43,6 +46,8 @@ class Sobolev:
     strength: float | None = None
     wrap: bool | tuple[bool, ...] = False
     correlation: float = 1 / 8
+    _mesh: MeshTopology | None = field(default=None, init=False, repr=False, compare=False)
+    _spectrum: MeshSpectrum | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if self.strength is not None:
@@ -50,19 +55,32 @@ class Sobolev:
         checks.number("Sobolev", "correlation", self.correlation, above=0.0, inclusive=True)
         object.__setattr__(self, "wrap", grid.wraps("Sobolev", self.wrap))
 
+    def on_mesh(self, topology: MeshTopology) -> Sobolev:
+        """See `MeshPreconditioner.on_mesh`."""
+        bound = replace(self)
+        strongest = bound._strength_on(topology)
+        return bound._bound(topology, MeshSpectrum(topology, strongest))
+
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""
+        if self._mesh is not None:
+            return
         grid.check("Sobolev", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
         """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
+        if self._mesh is not None and self._spectrum is not None:
+            values = self._mesh.split("Sobolev", arrays.numpy(x))
+            return arrays.like(self._spectrum.root(self._strength_on(self._mesh), values).reshape(-1), x)
         shape = arrays.shape(x)
         self.check("parameter", shape)
         solver = grid.square_root_solver(self.strength_of(shape), shape[:-1], self._wraps(shape))
         return arrays.like(solver.solve(arrays.numpy(x)), x)
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
-        """λ for a texture or grid of this shape."""
+        """λ for a texture or grid of this shape; of its mesh, where it has one."""
+        if self._mesh is not None:
+            return self._strength_on(self._mesh)
         cells = shape[:-1]
         if self.strength is not None:
             return float(self.strength)
@@ -71,8 +89,10 @@ class Sobolev:
     def scaled(self, share: float) -> Sobolev:
         """The same with `share` of λ, >= 0."""
         if self.strength is None:
-            return replace(self, correlation=self.correlation * math.sqrt(share))
-        return replace(self, strength=self.strength * share)
+            found = replace(self, correlation=self.correlation * math.sqrt(share))
+        else:
+            found = replace(self, strength=self.strength * share)
+        return found._bound(self._mesh, self._spectrum)
 
     def descents(self, smooth: Array, gradient: Array, shares: np.ndarray) -> np.ndarray:
         """With `shares` s of λ and S_s = (I + s λ L)^(-1/2), of two estimates g and g' of a gradient: S_s g · S_s g' and |S_s g|².
@@ -85,6 +105,9 @@ class Sobolev:
         Returns:
             (2, n), float64: sums over all elements.
         """
+        if self._mesh is not None and self._spectrum is not None:
+            first, second = (self._mesh.split("Sobolev", arrays.numpy(x)) for x in (smooth, gradient))
+            return self._spectrum.descents(self._strength_on(self._mesh), first, second, shares)
         shape = arrays.shape(gradient)
         transform = grid.transform(shape[:-1], self._wraps(shape))
         strength, eigenvalues = self.strength_of(shape), transform.eigenvalues
@@ -93,6 +116,15 @@ class Sobolev:
         sums = [np.real(first * np.conj(second)).sum(axis=-1), np.square(np.abs(first)).sum(axis=-1)]
         gains = [1.0 / (1.0 + share * strength * eigenvalues[..., 0]) for share in shares]
         return np.array([[np.vdot(gain, part) for gain in gains] for part in sums])
+
+    def _bound(self, mesh: MeshTopology | None, spectrum: MeshSpectrum | None) -> Sobolev:
+        object.__setattr__(self, "_mesh", mesh)
+        object.__setattr__(self, "_spectrum", spectrum)
+        return self
+
+    def _strength_on(self, mesh: MeshTopology) -> float:
+        vertices = len(mesh.places)
+        return float(self.strength) if self.strength is not None else self.correlation**2 * vertices
 
     def _wraps(self, shape: tuple[int, ...]) -> tuple[bool, ...]:
         return grid.per_axis(self.wrap, len(shape) - 1)

@@ -16,6 +16,7 @@ from unrender.core.arrays import Array
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
+from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
@@ -171,6 +172,11 @@ class Problem:
         transforms = {key: transform for key, (_, transform) in made.items() if transform is not None}
         found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
         return found
+
+    def topology(self, key: str) -> MeshTopology | None:
+        """Of the mesh at whose vertices a parameter has values, (n V,); None for textures, grids and numbers."""
+        info = self.renderer.parameters()[key]
+        return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
 
     def gathered_by(self, gatherer: Gatherer | None) -> Problem:
         """The same problem, its gradients computed by workers that its views are dealt to."""

@@ -212,8 +212,8 @@ def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner
         return None
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
-    if info.mesh is not None and isinstance(preconditioner, MeshPreconditioner):
-        preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh()))
+    if isinstance(preconditioner, MeshPreconditioner) and info.mesh is not None:
+        preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh(), info.welded))
     try:
         preconditioner.check(parameter.key, info.shape)
     except InputError as error:

@@ -50,7 +50,8 @@ class ParameterInfo:
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
         viewpoint: whether it is a sensor's pose or lens.
-        mesh: of vertex positions (3 V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
+        mesh: of values at the V vertices of a mesh, (n V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
+        welded: whether they are its positions, which vertices at the same place share.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
     """
 
@@ -66,6 +67,7 @@ class ParameterInfo:
     rigid: bool = False
     viewpoint: bool = False
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
+    welded: bool = False
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.coordinates import by_coordinates
-from unrender.optimizers.base import Choosing, Optimizer, Reparameterising
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Reparameterising
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
@@ -85,6 +85,8 @@ def prepare(
         problem.gatherer.check(estimator)
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
+    if isinstance(optimizer, OnMeshes):
+        optimizer = optimizer.on_meshes(problem.topology)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)

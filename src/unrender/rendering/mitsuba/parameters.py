@@ -9,13 +9,14 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
-__all__ = ["ParameterTraits", "normals_key", "parameter_traits", "physical_range"]
+__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range"]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
 # depend on the parameter.
 _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
 _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
+_COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,7 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
         return ParameterTraits(True, None, "it moves the sensor")
     shapes = [n for n in chain if isinstance(n, mi.Shape)]
     if shapes:
-        if leaf.startswith(("vertex_color", "face_color")) or (leaf.startswith(("vertex_", "face_")) and leaf not in (
-            "vertex_positions", "vertex_normals", "vertex_texcoords"
-        )):  # fmt: skip
+        if leaf.startswith(("vertex_", "face_")) and leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED):
             return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
         if shapes[-1].is_sensor():
             return ParameterTraits(True, None, "it moves a shape that carries a sensor", replayable=False)
@@ -142,6 +141,12 @@ def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | No
     ):  # fmt: skip
         return 0.0, 1.0
     return None, None
+
+
+def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:
+    """Whether a parameter has values at the vertices of a mesh that images depend on: their positions, or an attribute."""
+    owner, _, name = key.rpartition(".")
+    return name.startswith("vertex_") and name not in _COMPUTED_OR_FIXED and f"{owner}.faces" in parameters
 
 
 def normals_key(key: str) -> str:

@@ -24,7 +24,7 @@ from unrender.rendering.mitsuba.grid_transforms import attached_media, extinctio
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import ParameterTraits, parameter_traits, physical_range
+from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo
@@ -264,13 +264,16 @@ class ScenePair:
             low,
             high,
             resizable=self._resizable(key, shape),
-            mesh=partial(self._mesh, key) if key.endswith(".vertex_positions") else None,
+            mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
+            welded=key.endswith(".vertex_positions"),
         )
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
-        """The mesh whose vertex positions a parameter has, as loaded."""
-        faces = self.current_parameters[f"{key.rpartition('.')[0]}.faces"]
-        return self._current.value(key).numpy().reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
+        """The mesh at whose vertices a parameter has values, as loaded."""
+        owner = key.rpartition(".")[0]
+        faces = self.current_parameters[f"{owner}.faces"]
+        positions = self._current.value(f"{owner}.vertex_positions").numpy()
+        return positions.reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
 
     def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
         """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
