@@ -228,3 +228,20 @@ def test_one_unknown_number() -> None:
     made = Problem(renderer, [Parameter("x", initial=0.0)], [View(renderer.exact({"x": np.full(1, 0.7)}))])
     result = optimize(made, steps=300)
     assert abs(float(result.parameters["x"][0]) - 0.7) < 0.02
+
+
+def test_textures_of_one_material_share_the_rate() -> None:
+    """Base colour and roughness of the pot halve it; the wall's, and a number of the pot's, have all of it."""
+    values = {
+        "pot.bsdf.base_color.data": np.full((4, 4, 3), 0.5),
+        "pot.bsdf.roughness.data": np.full((4, 4, 1), 0.5),
+        "pot.bsdf.metallic.value": np.full(1, 0.5),
+        "wall.bsdf.reflectance.data": np.full((4, 4, 3), 0.5),
+    }
+    count = sum(value.size for value in values.values())
+    renderer = AnalyticRenderer(values, np.ones((SHAPE[0] * SHAPE[1] * 3, count)), 0.1, 0.0, shape=SHAPE)
+    unknown = [Parameter(key, initial=0.5, bounds=(0, 1)) for key in values]
+    made = Problem(renderer, unknown, [View(renderer.exact(values))])
+    _, optimizer = chosen(made)
+    rates = [optimizer.learning_rate[key] for key in values]
+    assert rates == pytest.approx([0.05, 0.05, 0.1, 0.1])

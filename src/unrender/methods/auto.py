@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -40,6 +41,7 @@ _VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
 """An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
 product, and the extinction, whose range is open, has further to go."""
+_TEXELS = ".data"
 _TOLERANCE = 2.0
 """κ of `PathGradient`."""
 _FIREFLIES = 0.8
@@ -269,9 +271,12 @@ def _logarithms(problem: Problem) -> dict[str, str]:
 
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
-    values, or the share itself where they are 0. With a parameterisation, that of u which is such a step in the middle or at that size."""
+    values, or the share itself where they are 0; over the number of unknown textures of its material, which all answer the same residuals
+    and would together go too far. With a parameterisation, that of u which is such a step in the middle or at that size."""
     found: dict[str, float] = {}
-    for key, value in problem.initial_values().items():
+    initial = problem.initial_values()
+    maps = Counter(_owner(key) for key, value in initial.items() if key.endswith(_TEXELS) and value.ndim == _TEXTURE)
+    for key, value in initial.items():
         low, high = problem.bounds[key]
         if low is not None and high is not None:
             size = high - low
@@ -281,8 +286,14 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size *= _VERTEX_SHARE
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
+        size /= maps[_owner(key)] if key.endswith(_TEXELS) and value.ndim == _TEXTURE else 1
         if key in problem.coordinates.transforms:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
             size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))
         found[key] = share * size
     return found
+
+
+def _owner(key: str) -> str:
+    """Of the texture that a parameter is the data of: its material."""
+    return key.rsplit(".", 2)[0]
