@@ -131,7 +131,7 @@ class SmoothedDerivatives:
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
         """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed, has a preconditioner, or has no σ."""
-        for key in problem.preconditioners:
+        for key in (key for key in problem.preconditioners if key in parameters):
             raise InputError(
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
