@@ -24,7 +24,7 @@ from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
-__all__ = ["LoadedScene", "loaded_scenes"]
+__all__ = ["LoadedScene", "detach_all", "loaded_scenes"]
 
 
 class _Registry:
@@ -32,12 +32,14 @@ class _Registry:
 
     Attributes:
         any_died: whether one died since the last `collect`: its Mitsuba objects may live on in reference cycles.
+        any_tangents: whether any has ever had tangents.
     """
 
     def __init__(self) -> None:
         self._scenes: dict[int, weakref.ref[LoadedScene]] = {}
         self._serial = itertools.count()
         self.any_died = False
+        self.any_tangents = False
 
     def add(self, scene: LoadedScene) -> None:
         number = next(self._serial)
@@ -65,6 +67,13 @@ _registry = _Registry()
 def loaded_scenes() -> list[LoadedScene]:
     """All of this process, in the order of loading."""
     return _registry.scenes()
+
+
+def detach_all() -> None:
+    """Keep the values of all scenes, and cut them from the derivative graph, if any has ever had tangents."""
+    if _registry.any_tangents:
+        for scene in loaded_scenes():
+            scene.detach()
 
 
 @dataclass(frozen=True)
@@ -207,6 +216,7 @@ class LoadedScene:
         Afterwards what the scene holds has tangents, no way leads back to the leaves, and every other scene of the process is detached.
         """
         _registry.collect()
+        _registry.any_tangents = True
         for other in loaded_scenes():
             if other is not self:
                 other.detach()

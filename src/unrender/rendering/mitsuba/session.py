@@ -21,7 +21,7 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
-from unrender.rendering.mitsuba.loaded_scene import loaded_scenes
+from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
@@ -179,6 +179,7 @@ class MitsubaSession:
             self._set_parameters(at)
             radiance = self._run(ImagePass(), request)
         else:
+            detach_all()  # where scenes have tangents now and then, Dr.Jit would record many a step anew
             self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
             radiance = self._run(PosesPass(self._posed, count), request, tensor(numbers).array)
