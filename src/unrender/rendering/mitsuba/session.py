@@ -145,8 +145,8 @@ class MitsubaSession:
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render. Unbiased; box filter. Without derivatives posed shapes are in one group only."""
-        if self._posed is not None and not self._attached:
+        """Render. Unbiased; box filter."""
+        if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
         self._set_parameters(parameters)
