@@ -74,6 +74,9 @@ class HybridGradient:
     alone. So each has the bias that its estimator states, and no more: the two gradients are of one loss, but of a smoothed one for the
     second, whose minimum moves to that of the loss itself as σ falls.
 
+    Let `perturbed` be `debiased`: the noise of a few samples a pixel adds to the loss of each perturbed render, and less where the second
+    parameters make for darker images; the first, which do not see that, would follow the second away.
+
     The two kinds of steps have no common scale: give the second learning rates of their own.
 
     Provides a gradient, and its variance where `path` does. The loss is that of `path`.
@@ -85,12 +88,16 @@ class HybridGradient:
     """
 
     path: Estimator = field(default_factory=PathGradient)
-    perturbed: SmoothedDerivatives = field(default_factory=lambda: SmoothedDerivatives(0.2, samples=16, spp=2))
+    perturbed: SmoothedDerivatives = field(
+        default_factory=lambda: SmoothedDerivatives(0.2, samples=16, spp=2, debiased=True)
+    )
     keys: tuple[str, ...] | None = None
 
     def __post_init__(self):
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
-            raise InputError(f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}")
+            raise InputError(
+                f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}"
+            )
         if isinstance(self.path, (SmoothedDerivatives, HybridGradient)) or Gradient.name not in self.path.provides:
             raise InputError(
                 f"HybridGradient: path must be an estimator of path gradients, such as PathGradient(), got "

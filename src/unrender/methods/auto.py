@@ -140,7 +140,9 @@ class AutoMethod(Options):
         each = widths if isinstance(widths, dict) else {"*": widths}
         rates = {key: _STEP * each.get(key, each["*"]) for key in perturbed}
         choice = self._of_paths(problem, rates)
-        smoothing = SmoothedDerivatives(widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=Exponential(*_ANNEALING))
+        smoothing = SmoothedDerivatives(
+            widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=Exponential(*_ANNEALING), debiased=True
+        )
         estimator = HybridGradient(choice.estimator, smoothing, tuple(perturbed))
         known = problem.renderer.parameters()
         reason = f"perturbed renders of {', '.join(f'{key}: {known[key].reason}' for key in perturbed)}"

@@ -54,7 +54,8 @@ class HybridMethod(AdamOptions):
     samples: int = Field(16, ge=4, description="perturbed renders per view and step")
     perturbed_spp: PositiveInt = Field(2, description="samples per pixel of a perturbed render")
     perturbed: str | None = Field(
-        None, description="the parameters to be perturbed, with commas between; none for poses, and all without path gradients"
+        None,
+        description="the parameters to be perturbed, with commas between; none for poses, and all without path gradients",
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
@@ -80,7 +81,11 @@ class HybridMethod(AdamOptions):
         image = Plain() if self.image == "plain" else RecursiveControlVariate(space)
         widths = parse_widths(self.sigma)
         smoothing = SmoothedDerivatives(
-            widths, self.samples, spp=self.perturbed_spp, schedule=parse_schedule(self.sigma_schedule)
+            widths,
+            self.samples,
+            spp=self.perturbed_spp,
+            schedule=parse_schedule(self.sigma_schedule),
+            debiased=self.perturbed_spp > 1,
         )
         path, optimizer = self._path(image, space), self.optimizer()
         if rates and isinstance(optimizer, (Adam, MetaAdam)):

@@ -105,9 +105,7 @@ class _PartialSession:
         return self._inner.image(parameters, request).images[0] * 0.0 + 1.0
 
     def _completed(self, gradient: Tree, parameters: Tree) -> Tree:
-        return {
-            key: arrays.zeros_like(x) if key in self._constant else gradient[key] for key, x in parameters.items()
-        }
+        return {key: arrays.zeros_like(x) if key in self._constant else gradient[key] for key, x in parameters.items()}
 
 
 @dataclass(frozen=True, eq=False)

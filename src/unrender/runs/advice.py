@@ -22,7 +22,9 @@ def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
     if not isinstance(optimizer, (Adam, MetaAdam)):
         return []
     found = []
-    each = rates.per_parameter(type(optimizer).__name__, problem.bounds, optimizer.learning_rate, problem.learning_rates)
+    each = rates.per_parameter(
+        type(optimizer).__name__, problem.bounds, optimizer.learning_rate, problem.learning_rates
+    )
     for key, (low, high) in problem.bounds.items():
         rate = each[key]
         natural = key not in problem.coordinates.transforms
