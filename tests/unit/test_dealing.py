@@ -292,10 +292,9 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
         ur.optimize(dealt(analytic.problem(views=2), 2), smoothed, adam, steps=1)
     with pytest.raises(ur.InputError, match="HybridGradient renders all views"):
         ur.optimize(dealt(analytic.problem(views=2), 2), ur.HybridGradient(keys=("colour",)), adam, steps=1)
+    memory, drawn = ur.images.RecursiveControlVariate(), ur.pixels.Uniform(8)
+    remembering = ur.MetaEstimator(coupled=True, image=memory, pixels=drawn)
     with pytest.raises(ur.InputError, match="a control variate of images and mini-batches of pixels at once"):
-        remembering = ur.MetaEstimator(
-            coupled=True, image=ur.images.RecursiveControlVariate(), pixels=ur.pixels.Uniform(8)
-        )
         ur.optimize(dealt(analytic.problem(views=2), 2), remembering, adam, steps=1)
     with pytest.raises(ur.InputError, match="one view, which cannot be dealt to 2"), ur.deal(analytic.problem(), 2):
         pass

@@ -90,7 +90,7 @@ def worst(rows: np.ndarray, mean: np.ndarray) -> float:
 
 
 def test_both_parts_are_unbiased() -> None:
-    """Loss and image are quadratic and linear, so the smoothed gradient is the gradient. Without the debiased loss it is not, and is seen."""
+    """Loss and image are quadratic and linear, so the smoothed gradient is the gradient; with the loss of noisy images it is not."""
     asked, at = problem(), problem().initial()
     expected = exact(asked, at)
     rows: dict[bool, list[np.ndarray]] = {True: [], False: []}

@@ -91,7 +91,8 @@ class Pass(ABC):
             del loaded  # read through pointers, if at all
             assembly = None
             if posed is not None:
-                assembly = posed.at(*scene, mi.UInt32(0))
+                scenes, numbers_of_pose = scene
+                assembly = posed.at(scenes, numbers_of_pose, mi.UInt32(0))
                 scene = assembly.static
             # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
             seed, positions = seeds
