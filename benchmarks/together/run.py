@@ -48,7 +48,7 @@ SIGMA = {"mug, label": 0.6, "ajar, pot": 0.1, TRAY: 0.3}
 POSE_RATE = 5.0
 """Learning rate of a pose as a share of its sigma, over that of textures."""
 RATES, META_RATES = (0.01, 0.03), (0.002, 0.006)
-SPP, SAMPLES = 2, 16
+SPP, SAMPLES = 2, 8
 MERGE = ("problems.*.methods",)
 QUICK = {
     "problem": ("mug, label", "caustic"),
@@ -211,7 +211,7 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
 def run(
     problem: tuple[str, ...] = (*GALLERY, TRAY),
     assets: Path | None = None,
-    seconds: float = 6.0,
+    seconds: float = 12.0,
     seeds: int = 3,
     only: tuple[str, ...] = (),
     resolution: int | None = None,
