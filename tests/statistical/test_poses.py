@@ -157,9 +157,9 @@ def test_path_gradients_of_other_parameters_where_poses_stand() -> None:
         found: tuple[list[np.ndarray], list[np.ndarray]] = [], []
         for run in range(RUNS // 2):
             request = SampleRequest(0, 16, run, 2, pixels, sensors)
-            rendering = session.image_pair(*states, request, "primary")
+            rendering = session.image_pair(states[0], states[1], request, "primary")
             assert rendering.previous is not None
-            trees = session.adjoint_pair(*states, rendering.paths, weights, weights)
+            trees = session.adjoint_pair(states[0], states[1], rendering.paths, weights, weights)
             for into, image, tree in zip(found, (rendering.images, rendering.previous), trees, strict=True):
                 assert set(tree) == set(keys)
                 into.append(

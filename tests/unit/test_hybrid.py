@@ -56,6 +56,7 @@ def exact(asked: ur.Problem, at: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         asked.loss_derivative(view, renderer.exact(at)).reshape(-1) @ renderer.matrix
         for view in range(len(asked.views))
     )
+    assert isinstance(flat, np.ndarray)
     return {"map": flat[:4].reshape(2, 2, 1), "pose": flat[4:]}
 
 
@@ -163,8 +164,10 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     choice = method("auto").choose(asked, {"sigma": "0.3, pose=0.4"})
     assert isinstance(choice.estimator, ur.HybridGradient)
     assert choice.estimator.keys == ("pose",)
+    assert isinstance(choice.estimator.path, ur.PathGradient)
     assert choice.estimator.path.image == CV("primary")
-    assert choice.optimizer.learning_rate["pose"] == pytest.approx(0.2)
+    assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
+    assert dict(choice.optimizer.learning_rate)["pose"] == pytest.approx(0.2)  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert choice.reasons[0] == "perturbed renders of pose: it moves"
     settings = {"sigma": "0.3", "step": 0.1, "gradient": "coupled", "image": "rcv", "pixels": 16, "spp": 2}
     choice = method("hybrid").choose(asked, settings)
@@ -180,14 +183,19 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     assert isinstance(method("auto").choose(problem(keys=("map",))).estimator, ur.PathGradient)
 
 
+def wrong(given: Any) -> Any:
+    """An argument of the wrong type."""
+    return given
+
+
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda: ur.HybridGradient(ur.PathGradient), "path must be an estimator"),
+        (lambda: ur.HybridGradient(wrong(ur.PathGradient)), "path must be an estimator"),
         (lambda: ur.HybridGradient(ur.SmoothedDerivatives(0.1)), "of path gradients"),
         (lambda: ur.HybridGradient(ur.LossValues()), "of path gradients"),
         (lambda: ur.HybridGradient(perturbed=ur.SmoothedDerivatives(0.1, order="hvp")), "no curvature"),
-        (lambda: ur.HybridGradient(keys="pose"), "keys must be a list"),
+        (lambda: ur.HybridGradient(keys=wrong("pose")), "keys must be a list"),
         (lambda: ur.SmoothedDerivatives(0.1, spp=1, debiased=True), "spp must be"),
     ],
 )

@@ -162,7 +162,8 @@ class HybridGradient:
             own = beyond_paths(renderer.parameters(), list(parameters))
             if not own:
                 raise InputError(
-                    "HybridGradient: path gradients reach all parameters; name those to be perturbed by keys, or use PathGradient"
+                    "HybridGradient: path gradients reach all parameters; name those to be perturbed (keys; of method hybrid, perturbed), "
+                    "or use PathGradient"
                 )
         else:
             for key in self.keys:
