@@ -79,7 +79,9 @@ class HybridGradient:
 
     The two kinds of steps have no common scale: give the second learning rates of their own.
 
-    Provides a gradient, and its variance where `path` does. The loss is that of `path`.
+    Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
+    gradient, which is what a meta-estimate has of as many samples. By the variance alone, which is small where perturbations agree,
+    `MetaAdam` would take steps many times as long as its learning rate. The loss is that of `path`.
 
     Args:
         path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
@@ -199,7 +201,8 @@ def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Ca
         match capability:
             case Variance(values):
                 other = perturbed.require("HybridGradient", Variance).values
-                found.append(Variance({key: other[key] if key in own else v for key, v in values.items()}))
+                squares = {key: other[key] + perturbed.gradient[key] * perturbed.gradient[key] for key in own}
+                found.append(Variance({key: squares.get(key, v) for key, v in values.items()}))
             case FreshGradient(values):
                 fresh = {key: perturbed.gradient[key] if key in own else g for key, g in values.items()}
                 found.append(FreshGradient(fresh))
