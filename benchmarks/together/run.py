@@ -49,6 +49,8 @@ POSE_RATE = 5.0
 """Learning rate of a pose as a share of its sigma, over that of textures."""
 RATES, META_RATES = (0.01, 0.03), (0.002, 0.006)
 SPP, SAMPLES = 2, 8
+WHOLE_VIEWS = 2
+"""Mini-batches between steps of whole views, where an image has a memory."""
 MERGE = ("problems.*.methods",)
 QUICK = {
     "problem": ("mug, label", "caustic"),
@@ -99,7 +101,9 @@ def estimator(problem: ur.Problem, combination: tuple[bool, ...], sigma: float) 
     """Of a combination of ingredients."""
     images, gradients, pixels, perturbed = combination
     poses = pose_keys(problem)
-    image = ur.images.RecursiveControlVariate("primary" if poses else "path") if images else ur.images.Plain()
+    image = ur.images.Plain()
+    if images:
+        image = ur.images.RecursiveControlVariate("primary" if poses else "path", whole_views=WHOLE_VIEWS)
     sampler = ur.pixels.Adaptive(max(1, problem.pixels // 4)) if pixels else ur.pixels.All()
     path: Any = ur.PathGradient(image, sampler, SPP)
     if gradients:
