@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from unrender.dealing.deal import deal
     from unrender.estimators.base import Estimate
     from unrender.estimators.filtered import FilteredGradient
+    from unrender.estimators.hybrid import HybridGradient
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
@@ -88,6 +89,7 @@ _HOMES = {
     "Estimate": "estimators.base",
     "FilteredGradient": "estimators.filtered",
     "Grid": "io.volumes",
+    "HybridGradient": "estimators.hybrid",
     "Key": "core.random",
     "Live": "runs.live",
     "LossValues": "estimators.loss_values",
@@ -127,6 +129,7 @@ __all__ = [
     "Estimate",
     "FilteredGradient",
     "Grid",
+    "HybridGradient",
     "InputError",
     "Key",
     "Live",

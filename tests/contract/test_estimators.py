@@ -28,6 +28,13 @@ from unrender.runs.run import Run
 
 Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate
+
+
+def hybrid(path: Any) -> ur.HybridGradient:
+    """Path gradients of the map, perturbed renders for the colour."""
+    return ur.HybridGradient(path, ur.SmoothedDerivatives(0.03, samples=16, debiased=True), keys=("colour",))
+
+
 ESTIMATORS: dict[str, Callable[[], Any]] = {
     "plain, dual buffers": lambda: ur.PathGradient(spp=2),
     "plain, leave-one-out groups": lambda: ur.PathGradient(spp=6),
@@ -67,6 +74,13 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
+    "coupled, control variate, adaptive pixels": lambda: ur.MetaEstimator(
+        coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none")
+    ),
+    "hybrid": lambda: hybrid(ur.PathGradient(spp=2)),
+    "hybrid, all four": lambda: hybrid(
+        ur.MetaEstimator(coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none"))
+    ),
     "stock": lambda: ur.StockGradient(spp=2),
     "filtered": lambda: ur.FilteredGradient(ur.PathGradient(spp=2)),
     "filtered, control variate": lambda: ur.FilteredGradient(ur.PathGradient(CV(), spp=2)),
@@ -88,11 +102,12 @@ BIASED = {
     "coupled",
     "coupled, own paths",
     "coupled, control variate",
+    "coupled, control variate, adaptive pixels",
     "filtered, coupled",
 }
 # A black box's loss is that of noisy images: a test of its own.
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
-BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values"))}
+BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values", "hybrid"))}
 BIASED |= set(others("estimator"))
 DEAR = {
     "meta, other statistics",

@@ -537,8 +537,6 @@ def test_what_makes_no_sense_is_refused() -> None:
     for pixels in (ur.pixels.All, "all", None, 100):
         with pytest.raises(ur.InputError, match="PathGradient: pixels"):
             ur.PathGradient(pixels=pixels)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ur.InputError, match="MetaEstimator: pixel mini-batches go with plain images"):
-        ur.MetaEstimator(coupled=True, image=ur.images.RecursiveControlVariate(), pixels=ur.pixels.Uniform(8))
     with pytest.raises(ur.InputError, match="whole_views"):
         ur.images.RecursiveControlVariate(whole_views=0)
 

@@ -14,6 +14,7 @@ import unrender as ur
 from tiers import quick, slow
 from unrender.backend import cache
 from unrender.gallery import boxes, mesh_files, meshes, specification, textures
+from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.numpy.quadratic import QuadraticRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -421,6 +422,18 @@ def test_a_cup_with_its_handle_hidden_looks_the_same_whichever_way_it_is_turned(
     # What is left lies at outlines, which are polygons'.
     assert [np.mean(picture > 0.01) < 0.005 for picture in difference] == [True, True, True, False]
     assert difference[3].mean() > 50 * difference[1:3].mean()
+
+
+@pytest.mark.slow
+def test_a_cup_s_angle_and_its_label_are_recovered_in_one_run():
+    problem = ur.gallery.problem("mug", label=6, resolution=24, reference_spp=256)
+    choice = method("auto").choose(problem, {"sigma": 0.6, "spp": 2})
+    assert isinstance(choice.estimator, ur.HybridGradient)
+    assert choice.estimator.keys == ("mug.rotation.y",)
+    found = ur.optimize(problem, choice.estimator, choice.optimizer, steps=60)
+    angle, label = problem.parameter_error(found.parameters).values()
+    assert angle < 0.06
+    assert label < 0.3 * problem.parameter_error(found.initial)["mug.bsdf.brdf_0.bsdf_1.reflectance.data"]
 
 
 def test_the_pose_of_the_cup_turns_it_about_its_axis():

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from zscores import agree
+from scipy import stats
+from zscores import agree, z_scores
 
 import unrender as ur
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -91,12 +93,15 @@ def test_a_posed_sensor_sees_as_if_it_had_been_moved() -> None:
 
 @pytest.mark.slow
 def test_a_pose_beside_other_parameters() -> None:
-    """Those are the scene's: one launch for each state."""
+    """Those are the scene's: one launch for each state, or for all that share a value of them."""
     key = "block.bsdf.alpha_u.value"
     renderer = MitsubaRenderer(scene, DEPTH)
     session = renderer.prepare(["ball.translation", key], None, derivatives=False)
     states = {"ball.translation": np.array([[0, 0, 0], [0, -0.5, 0.0]]), key: np.array([0.1, 0.5])}
     both = [session.image_batch(states, SampleRequest(0, SPP, run)).numpy() for run in range(RUNS)]
+    copied, shared = ({**states, key: of(np.array(0.3), 2)} for of in (np.repeat, lambda x, n: np.broadcast_to(x, (n,))))
+    images = [session.image_batch(each, SampleRequest(0, SPP, 5)).numpy() for each in (copied, shared)]
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
     for index, (place, alpha) in enumerate((((-0.45, 0.3, 0.2), 0.1), ((-0.45, -0.2, 0.2), 0.5))):
         described = scene(ball=place)
         described["block"]["bsdf"]["alpha_u"] = alpha
@@ -133,3 +138,43 @@ def test_what_poses_refuse() -> None:
         with pytest.raises(ur.InputError, match=rf"cannot be recovered by path gradients.*{why}.*SmoothedDerivatives"):
             renderer.prepare([key], None)
     renderer.prepare(["block.rotation", "sensor.x_fov"], None, derivatives=False)  # the lens goes with poses
+
+
+@pytest.mark.slow
+def test_path_gradients_of_other_parameters_where_poses_stand() -> None:
+    """Of both states of a pair, each in poses of its own, against scenes in which shape and sensor were moved for good; of drawn pixels."""
+    shift = [-0.2, 0.25, 0.1]
+    block = motion([0.2, 0.1, 0.3], shift)
+    camera = mi.ScalarTransform4f().translate([0.2, -0.1, 0.15])
+    keys = ["block.bsdf.alpha_u.value", "white.reflectance.value", "light.emitter.radiance.value"]
+    poses = {"block.translation": shift, "block.rotation": TURN, "sensor.translation": [0.2, -0.1, 0.15]}
+    pixels = mi.UInt32(np.arange(0, 1024, 3, dtype=np.uint32))
+    sensors, shape = dr.zeros(mi.UInt32, dr.width(pixels)), (2, dr.width(pixels), 3)
+    weights = mi.TensorXf(np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32))
+
+    def rows(description: Any, now: dict[str, Any], before: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        renderer = MitsubaRenderer(description, 3)
+        session = renderer.prepare([*keys, *now], "primary", frozenset(keys))
+        own = renderer.values(keys)
+        states = [own | {k: renderer.array(np.array(x, np.float32)) for k, x in of.items()} for of in (now, before)]
+        found: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+        for run in range(RUNS // 2):
+            request = SampleRequest(0, 16, run, 2, pixels, sensors)
+            rendering = session.image_pair(states[0], states[1], request, "primary")
+            assert rendering.previous is not None
+            trees = session.adjoint_pair(states[0], states[1], rendering.paths, weights, weights)
+            for into, image, tree in zip(found, (rendering.images, rendering.previous), trees, strict=True):
+                assert set(tree) == set(keys)
+                into.append(
+                    np.concatenate([image.numpy().mean((0, 1)).ravel(), *(g.numpy().ravel() for g in tree.values())])
+                )
+        return np.array(found[0]), np.array(found[1])
+
+    unmoved = {key: np.zeros(3) for key in poses}
+    now, before = rows(scene, poses, unmoved)
+    moved, _ = rows(lambda: scene(block, camera=camera), {}, {})
+    still, _ = rows(scene, {}, {})
+    limit = stats.norm.isf((1 - (1 - 1e-3) ** (1 / (2 * now.shape[1]))) / 2)
+    assert np.abs(z_scores(now, moved)).max() < limit
+    assert np.abs(z_scores(before, still)).max() < limit
+    assert np.abs(z_scores(now, still)).max() > limit, "a pose that was left out went unseen"

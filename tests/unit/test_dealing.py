@@ -290,6 +290,12 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
     smoothed, adam = ur.SmoothedDerivatives(sigma=0.1, samples=4), ur.optimizers.Adam(learning_rate=0.1)
     with pytest.raises(ur.InputError, match="SmoothedDerivatives renders all views"):
         ur.optimize(dealt(analytic.problem(views=2), 2), smoothed, adam, steps=1)
+    with pytest.raises(ur.InputError, match="HybridGradient renders all views"):
+        ur.optimize(dealt(analytic.problem(views=2), 2), ur.HybridGradient(keys=("colour",)), adam, steps=1)
+    memory, drawn = ur.images.RecursiveControlVariate(), ur.pixels.Uniform(8)
+    remembering = ur.MetaEstimator(coupled=True, image=memory, pixels=drawn)
+    with pytest.raises(ur.InputError, match="a control variate of images and mini-batches of pixels at once"):
+        ur.optimize(dealt(analytic.problem(views=2), 2), remembering, adam, steps=1)
     with pytest.raises(ur.InputError, match="one view, which cannot be dealt to 2"), ur.deal(analytic.problem(), 2):
         pass
 

@@ -31,6 +31,7 @@ from unrender.images.recursive_control_variate import (
     RecursiveControlVariateState,
     Snapshot,
 )
+from unrender.pixels.all import All
 from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.problem.problem import Problem
 from unrender.runs.folder.state import pack, unpack
@@ -112,6 +113,10 @@ class DealtViews:
         image = found.image.inner if isinstance(found.image, Denoised) else found.image
         if not isinstance(image, (Plain, RecursiveControlVariate)):
             raise InputError(f"{name}: what {type(image).__name__} remembers of views cannot be dealt to workers")
+        if isinstance(found, MetaEstimator) and not (isinstance(found.pixels, All) or isinstance(image, Plain)):
+            raise InputError(
+                f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
+            )
         capacity.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
 
     def gather(self, request: GatherRequest) -> GradientSample:

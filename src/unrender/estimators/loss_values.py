@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from unrender.core import arrays, checks, vectors
+from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -15,7 +16,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.renderer import RenderSession, SampleRequest
 
 __all__ = ["BlackBox", "LossState", "LossValues"]
 
@@ -69,13 +70,15 @@ class BlackBox:
         parameters: the current ones; they give keys and shapes.
         spp: samples per pixel.
         key: of the renders' random numbers.
+        debiased: whether to leave out what the noise of the images adds to the loss, see `SmoothedDerivatives`.
 
     Attributes:
         info: for `Estimate.info`: "samples", the paths traced so far, and "images", each view's at the parameters themselves.
     """
 
-    def __init__(self, problem: Problem, parameters: Tree, spp: int, key: Key):
+    def __init__(self, problem: Problem, parameters: Tree, spp: int, key: Key, debiased: bool = False):
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
+        self.debiased = debiased
         self.info: dict[str, Any] = {"samples": 0}
         self._theta = vectors.ravel(parameters)
         self._center: float | None = None
@@ -112,9 +115,28 @@ class BlackBox:
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             request = SampleRequest(view.sensor, self.spp, self.key.fold(index).uint32())
-            images[index] = session.image_batch(stacked, request)
-            parts.append(self.problem.loss_values(index, images[index]))
+            images[index], values = self._view(session, stacked, request, index)
+            parts.append(values)
             height, width = renderer.resolutions()[view.sensor]
             self.info["samples"] += len(points) * self.spp * height * width
         arrays.evaluate(parts)
         return np.stack([arrays.numpy(part).astype(np.float64) for part in parts]).sum(axis=0), images
+
+    def _view(self, session: RenderSession, states: Tree, request: SampleRequest, view: int) -> tuple[Array, Array]:
+        """The images (B, H, W, 3) of a view, and their part of the losses (B,)."""
+        if not self.debiased:
+            images = session.image_batch(states, request)
+            return images, self.problem.loss_values(view, images)
+        first = request.spp // 2
+        a = session.image_batch(states, replace(request, spp=first))
+        b = session.image_batch(states, replace(request, spp=request.spp - first, seed=_other(request.seed)))
+        share = first / request.spp
+        images = a * share + b * (1.0 - share)
+        apart = self.problem.loss_values(view, a) * share + self.problem.loss_values(view, b) * (1.0 - share)
+        # Of a quadratic loss with value Q at the noise: the mean's is L + Q / n, of n samples in all, that of the parts' L + 2 Q / n.
+        return images, self.problem.loss_values(view, images) * 2.0 - apart
+
+
+def _other(seed: int) -> int:
+    """The seed of other random numbers."""
+    return Key(seed, 1).uint32()

@@ -14,11 +14,11 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Variance
-from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
+from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather, prepared
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
-from unrender.pixels.base import PixelSampler, RepeatableSampler, learned
+from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import SQUARES, Upsampler, upsampled
 from unrender.rendering.renderer import Space
@@ -39,7 +39,8 @@ class MetaState:
         elements: {key: meta-estimate and statistics of each element of its gradient}; empty before the first step.
         image: the image estimator's, in the coupled form.
         pixels: the pixel sampler's.
-        step: how many steps were made; see `PairRequest.step`.
+        step: how many steps of whole views were made; see `PairRequest.step`.
+        batches: steps with pixel mini-batches since the last of whole views.
     """
 
     parameters: Tree | None
@@ -47,6 +48,7 @@ class MetaState:
     image: Any
     pixels: Any = None
     step: int = 0
+    batches: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> MetaState:
         """See `Upsamplable`: gradients, their moments and the previous parameters are interpolated."""
@@ -94,7 +96,8 @@ class MetaEstimator:
 
     The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and computes
     M = F + w (M − H), with w from their covariance: each sample serves both terms, at little more than the cost of a plain one. With
-    `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes.
+    `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes; of mini-batches it is
+    that of the last whole views, and a pass for the state in between comes with it.
 
     In path space the two states share directions, weighted by the current state's density: the paper's shift mapping, which
     reuses BSDF samples, in the solid angle measure, where its Jacobian is one. Var ΔF then falls with the square of the step.
@@ -117,8 +120,7 @@ class MetaEstimator:
         coupled: take the coupled form.
         spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
         image: estimates the image that the loss sees, in the coupled form; the independent form uses plain images.
-        pixels: the pixels of a step; F and ΔF of the independent form draw their own, with the same probabilities. Mini-batches go
-            with plain images.
+        pixels: the pixels of a step; F and ΔF of the independent form draw their own, with the same probabilities.
         space: "path", "primary", or "auto": path space where all parameters share paths.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
@@ -170,10 +172,6 @@ class MetaEstimator:
                 'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
             )
         check_pixels("MetaEstimator", self.pixels, self.image)
-        if not isinstance(self.pixels, All) and not isinstance(self.image, Plain):
-            raise InputError(
-                "MetaEstimator: pixel mini-batches go with plain images; a control variate's snapshot is of another step"
-            )
         if self.image.space is not None and self.space not in ("auto", self.image.space):
             raise InputError(
                 f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'
@@ -202,7 +200,7 @@ class MetaEstimator:
             moved = trees.subtract(of(parameters), of(previous))
             step_norm = arrays.sqrt(sum(arrays.total(x * x) for x in moved.values()))
         space = self._space(problem, parameters)
-        pair_request = PairRequest(previous, space, state.step)
+        pair_request = PairRequest(previous, space, state.step, state.batches)
         take = self._coupled if self.coupled else self._independent
         first, second, step, pixels = take(problem, parameters, state, pair_request, fresh, key)
         observed, samples = None, step.samples
@@ -229,7 +227,8 @@ class MetaEstimator:
         }
         gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
         elements = {name: parts[3] for name, parts in found.items()}
-        after = MetaState(parameters, elements, step.image, pixels, state.step + 1)
+        steps = (state.step + 1, 0) if self._whole(parameters, state) else (state.step, state.batches + 1)
+        after = MetaState(parameters, elements, step.image, pixels, *steps)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
         info = {
             "samples": samples,
@@ -307,7 +306,9 @@ class MetaEstimator:
         """A gradient of pixels of its own, and the pixel sampler's next state. Where it is not the `first` of a step, that state stays: the
         step has been counted, and its gradient observed."""
         draw_key = key.fold(PIXELS)
-        if first or not isinstance(self.pixels, RepeatableSampler):
+        if not isinstance(self.pixels, All) and self._whole(parameters, state):
+            batch, pixels = MiniBatch(None), state.pixels
+        elif first or not isinstance(self.pixels, RepeatableSampler):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
         else:
             batch, pixels = self.pixels.redraw(problem, state.pixels, draw_key), state.pixels
@@ -315,4 +316,10 @@ class MetaEstimator:
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
             pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
+            if batch.sample is None and not isinstance(self.pixels, All):
+                step = replace(step, image=prepared(problem, self.image, step.image))
         return step, pixels
+
+    def _whole(self, parameters: Tree, state: MetaState) -> bool:
+        """Whether a step renders whole views: all do, or the image estimator needs them."""
+        return isinstance(self.pixels, All) or self.image.needs_whole_views(parameters, state.image, state.batches)

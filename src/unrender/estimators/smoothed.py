@@ -66,8 +66,8 @@ class SmoothedDerivatives:
     included. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not
     of the noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
-    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss; but
-    products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
+    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss, unless it is
+    `debiased`; but products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
 
     Args:
         sigma: σ in units of the parameters, > 0: one number, or {key: number}, where "*" stands for all keys that are not named.
@@ -81,6 +81,9 @@ class SmoothedDerivatives:
             taking twice `samples` renders. `aggregate` and `baseline` are for that.
         antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
+        debiased: leave out what the noise of the images adds to the loss: from two halves of the samples with mean images A and B, the
+            loss is 2 L((A + B) / 2) − (L(A) + L(B)) / 2. Unbiased for a loss that is quadratic in the image (`loss.linear`), with the
+            bias of the noise's fourth power for others that are smooth. Takes two launches, and 2 samples at least.
         epsilon: of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): images of edges jump, so more than the
             default there.
         schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.schedules.functions`.
@@ -105,6 +108,7 @@ class SmoothedDerivatives:
     epsilon: float = 0.3
     schedule: Schedule | None = None
     adaptive_annealing: bool = False
+    debiased: bool = False
 
     def __post_init__(self):
         if self.order not in ("gradient", "hessian", "hvp"):
@@ -114,7 +118,7 @@ class SmoothedDerivatives:
         for name, value in self.sigma.items() if isinstance(self.sigma, Mapping) else [("sigma", self.sigma)]:
             checks.number("SmoothedDerivatives", f"sigma of {name}" if name != "sigma" else name, value, above=0.0)
         checks.integer("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
-        checks.integer("SmoothedDerivatives", "spp", self.spp, at_least=1)
+        checks.integer("SmoothedDerivatives", "spp", self.spp, at_least=2 if self.debiased else 1)
         checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
 
     @property
@@ -131,7 +135,7 @@ class SmoothedDerivatives:
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
         """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed, has a preconditioner, or has no σ."""
-        for key in problem.preconditioners:
+        for key in (key for key in problem.preconditioners if key in parameters):
             raise InputError(
                 f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
             )
@@ -144,7 +148,7 @@ class SmoothedDerivatives:
     ) -> tuple[Estimate, SmoothedState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced, those of products included), "images" per view
         at the parameters themselves."""
-        box = BlackBox(problem, parameters, self.spp, key.fold(0))
+        box = BlackBox(problem, parameters, self.spp, key.fold(0), self.debiased)
         factor = self.schedule(state.age) if self.schedule else 1.0
         sigma = {name: factor * value for name, value in self._sigma_per_parameter(parameters).items()}
         perturbed: list[np.ndarray] = []

@@ -37,10 +37,12 @@ class Sheet:
     Attributes:
         positions: (rows, columns, 3), as for `sheet`.
         closed: whether the last column lies on the first one.
+        origin: (u, v) of its first corner; both grow by 1 from there.
     """
 
     positions: np.ndarray
     closed: bool = True
+    origin: tuple[float, float] = (0.0, 0.0)
 
 
 def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
@@ -48,7 +50,7 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
 
     Args:
         name: the mesh's id.
-        pieces: at least one; texture coordinates run from 0 to 1 on each.
+        pieces: at least one; texture coordinates run from 0 to 1 on each, unless it has another origin.
         bsdf: its material.
 
     Returns:
@@ -62,7 +64,7 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
         faces += [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]
         positions.append(piece.positions.reshape(-1, 3))
-        coordinates.append(np.stack([u, v], -1).reshape(-1, 2))
+        coordinates.append(np.stack([u, v], -1).reshape(-1, 2) + np.array(piece.origin))
         normals.append(_normals(piece.positions, piece.closed).reshape(-1, 3))
         count += rows * columns
     mesh = _mesh(name, np.concatenate(positions), np.concatenate(faces), bsdf, np.concatenate(coordinates))

@@ -1,7 +1,8 @@
 """`mug`: how far a cup is turned about its axis, from a picture that shows its handle.
 
 After Wang et al., section 4. All but the handle is a solid of revolution, so while the handle is hidden behind the cup, a turn changes
-nothing in the picture.
+nothing in the picture. With a label to be recovered, too, it is a pose that calls for perturbed renders and a texture that calls for
+paths: see `estimators/hybrid.py`.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, staging
+from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.losses import L2, Loss
 from unrender.problem.parameter import Parameter
 
@@ -24,13 +26,22 @@ _SIDE = np.radians(105.0)
 _HIDDEN = np.radians(158.0)
 """Where it is at the start."""
 
+_LABEL_WIDTH, _LABEL_HEIGHTS = np.radians(100.0), (0.24, 0.86)
+"""Of the label: the angle that it goes around, from and to which height."""
+
+_LABEL = "mug.bsdf.brdf_0.bsdf_1.reflectance.data"
+
+_CUP, _ELSEWHERE = (0.0, 0.0), (0.0, 2.0)
+"""Origins of texture coordinates: of the cup, and of what has no label."""
+
 
 @register(name="mug", position=17)
 @dataclass(frozen=True)
 class Mug:
     """How far a cup is turned: one angle, its handle hidden behind it at the start.
 
-    One view; the unknown is the rotation about the vertical. A plateau, and a pit: the picture stays the same until the handle comes out
+    One view; the unknown is the rotation about the vertical and, with `label`, also a texture (label², 3) on the cup's front, from grey. A
+    plateau, and a pit: the picture stays the same until the handle comes out
     from behind the cup; then the loss rises, on the wrong side for good, on the right side for some 15 degrees, where the handle does
     not yet lie over its place. A smoothing of about 25 degrees or more (σ) sees beyond.
     """
@@ -38,23 +49,28 @@ class Mug:
     resolution: int = fields.resolution(48)
     reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(2, at_least=2)
+    label: int = fields.integer(0, "texels along a side of an unknown label on the cup, 0 for no label", at_least=0)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """The cup: 1 high, on a table y = 0, around the y axis; the camera and the sun, which is higher, in front of it."""
-        cup = parts.twosided(parts.diffuse(0.75, 0.3, 0.15))
+        pieces, glaze = _pieces(), parts.diffuse(0.75, 0.3, 0.15)
+        if self.label:
+            glaze = _labelled(glaze, pieces[0].positions, self.label)
+        turned = [meshes.Sheet(piece.positions @ _turn(_SIDE).T, origin=piece.origin) for piece in pieces]
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.5, 3.6), (0, 0.42, 0), 30.0, self.resolution),
             "sun": staging.sun((0, 0.5, 1), 1.0),
             "table": parts.rectangle((0, 0, 0), (6, 0, 0), (0, 0, -4), parts.diffuse(0.3, 0.35, 0.4)),
             "wall": parts.rectangle((0, 2, -4), (6, 0, 0), (0, 2, 0), parts.diffuse(0.5, 0.5, 0.45)),
-            "mug": meshes.sheets("mug", [meshes.Sheet(piece @ _turn(_SIDE).T) for piece in _pieces()], cup),
+            "mug": meshes.sheets("mug", turned, parts.twosided(glaze)),
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The angle; counted from the truth."""
-        return tuple(staging.unknown("mug", "rotation", {"y": _HIDDEN - _SIDE}))
+        """The angle; counted from the truth. The label, grey at first."""
+        angle = staging.unknown("mug", "rotation", {"y": _HIDDEN - _SIDE})
+        return (*angle, Parameter(_LABEL, initial=0.4)) if self.label else tuple(angle)
 
 
 def _turn(angle: float) -> np.ndarray:
@@ -63,7 +79,36 @@ def _turn(angle: float) -> np.ndarray:
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
-def _pieces() -> list[np.ndarray]:
+def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, Any]:
+    """The glaze with a label, which faces the camera in truth.
+
+    Args:
+        glaze: the material around it.
+        cup: of `_pieces()`.
+        texels: along a side.
+    """
+    outside = np.arange(len(cup)) <= np.argmax(cup[:, 0, 1])
+    rows = np.flatnonzero(outside & (cup[:, 0, 1] >= _LABEL_HEIGHTS[0]) & (cup[:, 0, 1] <= _LABEL_HEIGHTS[1]))
+    bottom, top = rows[[0, -1]] / (len(cup) - 1)
+    width = _LABEL_WIDTH / (2 * np.pi)
+    left = 0.5 - _SIDE / (2 * np.pi) - width / 2  # u = 0.5 looks to the handle
+    to = mi.ScalarTransform4f
+    inside = to().scale([1 / width, 1 / (top - bottom), 1]) @ to().translate([-left, -bottom, 0])
+    upright = to().translate([0, 1, 0]) @ to().scale([1, -1, 1])
+    picture = textures.bitmap(textures.photograph("coffee", texels)) | {"to_uv": upright @ inside}
+    ninth = to().translate([1 / 3, 1 / 3, 0]) @ to().scale([1 / 3, 1 / 3, 1])
+    middle = np.zeros((3, 3), np.float32)
+    middle[1, 1] = 1.0
+    weight = textures.bitmap(middle) | {"filter_type": "nearest", "to_uv": ninth @ inside}
+    return {
+        "type": "blendbsdf",
+        "weight": weight,
+        "glaze": glaze,
+        "label": {"type": "diffuse", "reflectance": picture},
+    }
+
+
+def _pieces() -> list[meshes.Sheet]:
     """Cup, handle (towards +z) and saucer. The saucer reaches farther than the handle, so that the middle of the mesh's bounding box,
     about which poses turn, lies on the axis."""
     cup = [(0, 0.03), (0.2, 0.03), (0.3, 0.04), (0.34, 0.12), (0.4, 0.5), (0.44, 0.98), (0.425, 1), (0.41, 0.98)]
@@ -72,7 +117,11 @@ def _pieces() -> list[np.ndarray]:
     bend = np.linspace(np.radians(118), np.radians(-118), 24)
     path = np.stack([0.45 + 0.33 * np.cos(bend), 0.55 + 0.27 * np.sin(bend), 0 * bend], -1)
     handle = meshes.sweep(path, 0.09, 16) @ _turn(-np.pi / 2).T
-    return [_lathe(cup, 40), handle, _lathe(saucer, 30)]
+    return [
+        meshes.Sheet(_lathe(cup, 40), origin=_CUP),
+        meshes.Sheet(handle, origin=_ELSEWHERE),
+        meshes.Sheet(_lathe(saucer, 30), origin=_ELSEWHERE),
+    ]
 
 
 def _lathe(knots: list[tuple[float, float]], rows: int) -> np.ndarray:

@@ -84,12 +84,15 @@ class PairRequest:
     Attributes:
         previous: the parameters of the last step that the estimator took.
         space: in which to share samples, for image estimators without a space of their own.
-        step: how many steps the estimator has taken. Image estimators with a state of earlier steps require it to be their own count.
+        step: how many steps of whole views the estimator has taken. Image estimators with a state of earlier steps require it to be their
+            own count.
+        batches: steps with pixel mini-batches since then: where there are any, `previous` is not of what such a state remembers.
     """
 
     previous: Tree
     space: Space
     step: int = 0
+    batches: int = 0
 
 
 class ImageEstimator(Protocol):

@@ -158,7 +158,8 @@ class RecursiveControlVariate:
         """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone.
 
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
-        one as far as the two can share it: they differ by F − H.
+        one as far as the two can share it: they differ by F − H. Where the control variate is a snapshot of an earlier step s, and the
+        pair requested of a later one, that is rendered from the same random numbers, too: P + w (⟨F_s⟩_CV − H) for its image P.
 
         Raises:
             InputError: the pair requested is not of the step of the control variate, or a mini-batch comes before whole views.
@@ -172,30 +173,37 @@ class RecursiveControlVariate:
         request = frame.request(spp, key.uint32(), groups)
         session = problem.renderer.prepare(list(parameters), self.space)
         rendering = session.image_pair(parameters, previous, request, self.space)
+        asked = rendering
+        if pair_request is not None and pair_request.batches:
+            asked = session.image_pair(parameters, pair_request.previous, request, self.space)
         match frame:
             case PixelBatch():
                 if first or state.snapshot is None:
                     raise InputError("RecursiveControlVariate: a pixel mini-batch needs an earlier step of whole views")
-                return self._combine_pixels(problem, state.snapshot, frame, rendering), None
+                return self._combine_pixels(problem, state.snapshot, frame, rendering, asked), None
             case WholeView():
                 if first:
                     variance = variance_of_mean(rendering.images)
                     estimate = ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance)
                     return estimate, self._start(estimate.mean())
-                return self._combine_view(state.views[frame.view], rendering)
+                return self._combine_view(state.views[frame.view], rendering, asked)
         raise InputError(f"RecursiveControlVariate: expected a whole view or a pixel mini-batch, got {frame!r}")
 
     @staticmethod
-    def _combine_pixels(problem: Problem, snapshot: Snapshot, frame: PixelBatch, rendering: Rendering) -> ImageEstimate:
-        """Both images of a mini-batch, (groups, N, 3), with the snapshot as control variate."""
+    def _combine_pixels(
+        problem: Problem, snapshot: Snapshot, frame: PixelBatch, rendering: Rendering, asked: Rendering
+    ) -> ImageEstimate:
+        """Both images of a mini-batch, (groups, N, 3), with the snapshot as control variate; the previous one is that of `asked`."""
         row = problem.references.rows(frame.sample.views, frame.sample.pixels)
         image, weight = (arrays.gather_rows(x, row) for x in (snapshot.image, snapshot.weight))
         current = advance(image, rendering.images, rendering.previous, weight)
-        previous = advance(image, rendering.previous, rendering.previous, weight)
-        return ImageEstimate(current, rendering.paths, previous=previous)
+        previous = advance(image, asked.previous, rendering.previous, weight)
+        return ImageEstimate(current, asked.paths, previous=previous)
 
-    def _combine_view(self, memory: ViewMemory, rendering: Rendering) -> tuple[ImageEstimate, ViewMemory]:
-        """Both images of a view, (groups, H, W, 3), and the view's memory after the step."""
+    def _combine_view(
+        self, memory: ViewMemory, rendering: Rendering, asked: Rendering
+    ) -> tuple[ImageEstimate, ViewMemory]:
+        """Both images of a view, (groups, H, W, 3), and the view's memory after the step; the previous image is that of `asked`."""
         F, H = arrays.mean_over_first(rendering.images), arrays.mean_over_first(rendering.previous)
         used = self._observe(memory, F, H) if self.update_before_use else memory
         past, weight = memory.relative_variance, self._weight(used)
@@ -207,10 +215,10 @@ class RecursiveControlVariate:
         known = var_current > 0
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
         info = {"control_weight": weight, "variance": variance}
-        previous = advance(memory.image, rendering.previous, rendering.previous, weight)
+        previous = advance(memory.image, asked.previous, rendering.previous, weight)
         if (within := variance_of_mean(rendering.images)) is not None:
             variance = arrays.where(known, variance, relative * within)
-        estimate = ImageEstimate(current, rendering.paths, info, previous, variance, fresh=rendering.images)
+        estimate = ImageEstimate(current, asked.paths, info, previous, variance, fresh=rendering.images)
         return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
 
     def advance(

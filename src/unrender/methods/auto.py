@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,11 +15,14 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
+from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Choice, Options, method, parameterised
+from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
@@ -27,6 +30,7 @@ from unrender.pixels.base import PixelSampler
 from unrender.preconditioners import Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
+from unrender.rendering.partial import PartialDerivatives
 from unrender.rendering.renderer import SampleRequest
 from unrender.schedules import Exponential
 
@@ -42,6 +46,7 @@ _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
 """An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
 product, and the extinction, whose range is open, has further to go."""
 _TEXELS = ".data"
+"""End of the key of a texture's texels."""
 _TOLERANCE = 2.0
 """κ of `PathGradient`."""
 _FIREFLIES = 0.8
@@ -56,6 +61,10 @@ _CAMERA_SHARE = 0.1
 """First steps of sensors' poses, in units of the world and radians, over `learning_rate`."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
+_SIGMA, _STEP = 0.2, 0.5
+"""Width of the smoothing of what is perturbed, and its first rate as a share of that."""
+_PERTURBED, _PERTURBED_SPP, _ANNEALING = 16, 2, (25.0, 0.1)
+"""Perturbed renders per view and step, their samples per pixel, and half-life and floor of their width."""
 _MOST_PIXELS = 1 << 19
 """Of all views, that a step renders whole; where there are more, it draws half as many of them."""
 
@@ -77,7 +86,8 @@ class AutoMethod(Options):
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
     memory, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the vertices of
     meshes move along Sobolev gradients, parameters by steps in proportion to their range. Where path gradients do not reach a parameter,
-    as of a pose, it is `smoothed`; cameras move along path gradients. Every choice can be set.
+    as of a pose, it moves by perturbed renders, beside path gradients of the others (`hybrid`), or `smoothed` where there are no others;
+    cameras alone move along path gradients. Every choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -94,6 +104,10 @@ class AutoMethod(Options):
     )
     parameterise: bool = Field(
         True, description="whether positive numbers, colours and textures without an upper bound move as logarithms"
+    )
+    sigma: PositiveFloat | str = Field(
+        _SIGMA,
+        description="width of the smoothing of what path gradients do not reach, in its units: 0.2, mug.rotation.y=0.6",
     )
     smooth: bool = Field(
         True, description="whether textures, grids and values at vertices move along Sobolev gradients"
@@ -114,20 +128,44 @@ class AutoMethod(Options):
         """See `Options.choose`."""
         if _is_of_cameras(problem):
             return self._of_cameras(problem)
+        perturbed = beyond_paths(problem.renderer.parameters(), list(problem.shapes()))
+        part = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(perturbed)))
+        if 0 < len(perturbed) < len(problem.shapes()) and not _refusal(part):
+            return self._hybrid(part, perturbed)
         if unreachable := _unreachable(problem):
             reason = f"derivatives of a smoothed loss (method smoothed): {unreachable}"
-            return Choice(*method("smoothed").start(), (reason,))
+            return Choice(*method("smoothed").start({"sigma": self.sigma}), (reason,))
+        return self._of_paths(problem)
+
+    def _hybrid(self, problem: Problem, perturbed: Sequence[str]) -> Choice:
+        """Where some parameters are beyond path gradients, and `problem` differentiates the others alone."""
+        widths = parse_widths(self.sigma)
+        each = widths if isinstance(widths, dict) else {"*": widths}
+        rates = {key: _STEP * each.get(key, each["*"]) for key in perturbed}
+        choice = self._of_paths(problem, rates)
+        smoothing = SmoothedDerivatives(
+            widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=Exponential(*_ANNEALING), debiased=True
+        )
+        estimator = HybridGradient(choice.estimator, smoothing, tuple(perturbed))
+        known = problem.renderer.parameters()
+        reason = f"perturbed renders of {', '.join(f'{key}: {known[key].reason}' for key in perturbed)}"
+        return replace(choice, estimator=estimator, reasons=(reason, *choice.reasons))
+
+    def _of_paths(self, problem: Problem, given: Mapping[str, float] | None = None) -> Choice:
+        """By path gradients; `given`: first rates that are known already."""
+        given = given or {}
         sampler, drawn = self._sampler(problem)
         image = self._image(problem, isinstance(sampler, pixels.All))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = _logarithms(problem) if self.parameterise else {}
+        moved = {key: name for key, name in moved.items() if key not in given}
         problem = problem.reparameterised(moved)
         moved = {
             k: type(p).__name__.lower()
             for k, p in problem.parameterisations.items()
             if k in problem.coordinates.transforms
         }
-        rates = _rates(problem, self.learning_rate)
+        rates = {**_rates(problem, self.learning_rate), **given}
         optimizer = ScheduleFree(
             {"*": self.learning_rate, **rates},
             preconditioner=Sobolev() if smoothed else None,
@@ -228,6 +266,11 @@ def _unreachable(problem: Problem) -> str:
     known = problem.renderer.parameters()
     if rigid := next((key for key in problem.shapes() if known[key].rigid), ""):
         return f"parameter {rigid} moves a shape or sensor as a whole, with plateaus of the loss; --method plain has path gradients"
+    return _refusal(problem)
+
+
+def _refusal(problem: Problem) -> str:
+    """Why the renderer has no path gradients of the parameters; "" where it has."""
     try:
         problem.renderer.prepare(list(problem.shapes()), None)
     except InputError as error:

@@ -13,7 +13,7 @@ from unrender.optimizers.base import Optimizer
 __all__ = ["StockMethod"]
 
 
-@register(name="stock", position=7)
+@register(name="stock", position=8)
 class StockMethod(AdamOptions):
     """the loop of Mitsuba's tutorials, to compare with: mi.render with prb, dr.backward, Adam"""
 

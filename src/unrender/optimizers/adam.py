@@ -57,7 +57,7 @@ class Adam:
     by their momentum for some steps.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
         beta_1: decay of the mean, in [0, 1).
         beta_2: decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
@@ -66,7 +66,7 @@ class Adam:
             For vertices of a mesh with `preconditioners.LargeSteps`, whose steps stay as smooth as their gradients.
     """
 
-    learning_rate: float = 0.01
+    learning_rate: float | Mapping[str, float] = 0.01
     beta_1: float = 0.9
     beta_2: float = 0.999
     epsilon: float = 1e-8

@@ -53,14 +53,14 @@ class MetaAdam:
     At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
         epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 do not move.
             It is far below Adam's (whose ε is outside the root): a texel's gradient of a mean over pixels is small.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
         longest: the longest step of an element in units of η, > 0; None for no limit.
     """
 
-    learning_rate: float = 0.002
+    learning_rate: float | Mapping[str, float] = 0.002
     epsilon: float = 1e-24
     schedule: Schedule | None = None
     longest: float | None = None

@@ -17,18 +17,29 @@ __all__ = ["check", "elements", "factor", "from_sizes", "per_parameter"]
 
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
-    """Raise `InputError` unless `learning_rate` is a positive number and `schedule` a schedule or None."""
-    checks.number(owner, "learning_rate", learning_rate, above=0.0)
+    """Raise `InputError` unless `learning_rate` is a positive number, or {key: one, "*": of the others}, and `schedule` a schedule or
+    None."""
+    if isinstance(learning_rate, Mapping):
+        if "*" not in learning_rate:
+            raise InputError(f'{owner}: learning_rate needs the rate of the others, {{"*": rate}}')
+        for key, rate in learning_rate.items():
+            checks.number(owner, "learning_rate" if key == "*" else f"learning_rate of {key}", rate, above=0.0)
+    else:
+        checks.number(owner, "learning_rate", learning_rate, above=0.0)
     if schedule is not None and not callable(schedule):
         raise InputError(f"{owner}: schedule must be one of unrender.schedules.functions or None, got {schedule!r}")
 
 
-def per_parameter(owner: str, keys: Iterable[str], common: float, own: Mapping[str, float] | None) -> dict[str, float]:
-    """{key: learning rate}: the parameter's own where it has one, else `common`.
+def per_parameter(
+    owner: str, keys: Iterable[str], common: float | Mapping[str, float], own: Mapping[str, float] | None
+) -> dict[str, float]:
+    """{key: learning rate}: the parameter's own where it has one, else `common`, which may be {key: rate, "*": of the others}.
 
     Raises `InputError` for a rate of an unknown parameter, or one that is not positive.
     """
     keys, own = list(keys), dict(own or {})
+    if isinstance(common, Mapping):
+        own, common = {key: rate for key, rate in common.items() if key != "*"} | own, common["*"]
     for key, rate in own.items():
         if key not in keys:
             hint = did_you_mean(key, keys)

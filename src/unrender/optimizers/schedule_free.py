@@ -163,11 +163,7 @@ class ScheduleFree:
     )
 
     def __post_init__(self):
-        given = self._given_rates
-        if "*" not in given:
-            raise InputError('ScheduleFree: learning_rate needs the rate of the others, {"*": rate}')
-        for rate in given.values():
-            rates.check("ScheduleFree", rate, self.schedule)
+        rates.check("ScheduleFree", self.learning_rate, self.schedule)
         for name in ("beta", "beta_2"):
             checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         checks.number("ScheduleFree", "epsilon", self.epsilon, above=0.0)
@@ -199,9 +195,7 @@ class ScheduleFree:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ScheduleFreeState:
         """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
-        given = self._given_rates
-        named = {key: rate for key, rate in given.items() if key != "*"}
-        own = rates.per_parameter("ScheduleFree", parameters, given["*"], {**named, **(learning_rates or {})})
+        own = rates.per_parameter("ScheduleFree", parameters, self.learning_rate, learning_rates)
         for key in self.preconditioned:
             if key not in parameters:
                 raise InputError(f'ScheduleFree: preconditioned: unknown parameter "{key}"')
@@ -286,11 +280,6 @@ class ScheduleFree:
         changed = (f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items() if state.step > state.begun)
         lines = {"smoothing, as a share of the strongest": fitted, "learning rate, over the first": changed}
         return tuple(f"{what}: {found}" for what, parts in lines.items() if (found := ", ".join(parts)))
-
-    @property
-    def _given_rates(self) -> Mapping[str, float]:
-        """`learning_rate` as {key: rate, "*": of the others}."""
-        return self.learning_rate if isinstance(self.learning_rate, Mapping) else {"*": self.learning_rate}
 
     def _rates(
         self, state: ScheduleFreeState, gradient: Tree, parameters: Tree, strengths: Mapping[str, StrengthFit]

@@ -184,6 +184,12 @@ class Problem:
         found.gatherer = gatherer
         return found
 
+    def rendered_by(self, renderer: Renderer) -> Problem:
+        """The same problem, its scene rendered by another renderer of the same arrays."""
+        found = copy.copy(self)
+        found.renderer = renderer
+        return found
+
     def __repr__(self) -> str:
         return notebook.line(self)
 

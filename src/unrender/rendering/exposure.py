@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +22,7 @@ from unrender.rendering.renderer import (
     RenderSession,
     SampleRequest,
     Space,
+    differentiated,
 )
 
 __all__ = ["EXPOSURE", "ExposedPaths", "ExposedRenderer", "ExposedSession", "gains", "without_exposure"]
@@ -86,10 +88,12 @@ class ExposedRenderer:
         """See `Renderer.array`."""
         return self.inner.array(values)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> RenderSession:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
         """See `Renderer.prepare`."""
         own = [key for key in keys if key != EXPOSURE]
-        session = self.inner.prepare(own, space, derivatives and bool(own))
+        session = self.inner.prepare(own, space, differentiated(own, derivatives))
         return session if len(own) == len(keys) else ExposedSession(self, session)
 
     def rows_of(self, request: SampleRequest) -> Array:

@@ -6,7 +6,8 @@ own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -26,6 +27,7 @@ __all__ = [
     "Space",
     "StockLoop",
     "StockRenderer",
+    "differentiated",
 ]
 
 Space = Literal["path", "primary"]
@@ -109,6 +111,13 @@ class Rendering:
     paths: Any
 
 
+def differentiated(keys: Iterable[str], derivatives: bool | AbstractSet[str]) -> frozenset[str]:
+    """The keys with respect to which `Renderer.prepare` is asked for derivatives."""
+    if isinstance(derivatives, bool):
+        return frozenset(keys) if derivatives else frozenset()
+    return frozenset(keys) & frozenset(derivatives)
+
+
 class RenderSession(Protocol):
     """Images and derivatives with respect to the parameters that it was prepared for, from `Renderer.prepare`.
 
@@ -123,7 +132,8 @@ class RenderSession(Protocol):
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         """Render many states with the same random numbers: {key: (B, *shape)}, NumPy, to images (B, H, W, 3), all pixels
-        in one group. Unbiased each."""
+        in one group. Unbiased each. An array that is broadcast along its first axis (`numpy.broadcast_to`) tells that all states share
+        the value: a renderer may then do with fewer launches."""
         ...
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
@@ -186,7 +196,9 @@ class Renderer(Protocol):
         """This renderer's array with these values."""
         ...
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> RenderSession:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
         """What renders the scene at other values of these parameters. Cheap when asked again with the same arguments.
 
         `space` is only checked: the paths of a rendering may be replayed by any session for the same parameters with derivatives.
@@ -194,9 +206,10 @@ class Renderer(Protocol):
         Args:
             keys: the parameters that will change.
             space: where two states will share samples; None if they will not.
-            derivatives: whether derivatives will be asked for.
+            derivatives: whether derivatives will be asked for, or with respect to which of the keys. What `adjoint` returns for the
+                others is of no account, and they may be left out.
 
-        Raises `InputError` for a parameter that is unknown, not differentiable where `derivatives` are asked for, or not perturbable;
+        Raises `InputError` for a parameter that is unknown, not differentiable where its derivative is asked for, or not perturbable;
         with `space="path"` for one whose values cannot share paths.
         """
         ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from unrender.optimizers import rates
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
@@ -21,8 +22,11 @@ def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
     if not isinstance(optimizer, (Adam, MetaAdam)):
         return []
     found = []
+    each = rates.per_parameter(
+        type(optimizer).__name__, problem.bounds, optimizer.learning_rate, problem.learning_rates
+    )
     for key, (low, high) in problem.bounds.items():
-        rate = problem.learning_rates.get(key, optimizer.learning_rate)
+        rate = each[key]
         natural = key not in problem.coordinates.transforms
         if natural and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
             found.append(

@@ -24,7 +24,7 @@ from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 
-__all__ = ["LoadedScene", "loaded_scenes"]
+__all__ = ["LoadedScene", "detach_all", "loaded_scenes"]
 
 
 class _Registry:
@@ -32,12 +32,14 @@ class _Registry:
 
     Attributes:
         any_died: whether one died since the last `collect`: its Mitsuba objects may live on in reference cycles.
+        any_tangents: whether any has ever had tangents.
     """
 
     def __init__(self) -> None:
         self._scenes: dict[int, weakref.ref[LoadedScene]] = {}
         self._serial = itertools.count()
         self.any_died = False
+        self.any_tangents = False
 
     def add(self, scene: LoadedScene) -> None:
         number = next(self._serial)
@@ -65,6 +67,13 @@ _registry = _Registry()
 def loaded_scenes() -> list[LoadedScene]:
     """All of this process, in the order of loading."""
     return _registry.scenes()
+
+
+def detach_all() -> None:
+    """Keep the values of all scenes, and cut them from the derivative graph, if any has ever had tangents."""
+    if _registry.any_tangents:
+        for scene in loaded_scenes():
+            scene.detach()
 
 
 @dataclass(frozen=True)
@@ -126,15 +135,15 @@ class LoadedScene:
         """Of the parameters that are set."""
         return tuple(tuple(setting.value.shape) for setting in self._settings.values())
 
-    def set_parameters(self, values: Tree, attached: bool) -> None:
+    def set_parameters(self, values: Tree, attached: AbstractSet[str] = frozenset()) -> None:
         """Give these parameters these values and all others the scene's own. Nothing happens where that is so already.
 
         Args:
             values: {key: `mi.TensorXf`}.
-            attached: whether they are leaves of the derivative graph.
+            attached: those that are leaves of the derivative graph.
         """
         self._restore([key for key in self._settings if key not in values])
-        changed = [key for key, value in values.items() if not self._is_set(key, value, attached)]
+        changed = [key for key, value in values.items() if not self._is_set(key, value, key in attached)]
         # Where others change the scene between two passes, leaves are made anew within the backward pass of an operation of theirs:
         # then all of them, since Dr.Jit (1.5) loses the gradients of leaves of which some were made within it and some before.
         for key in values if self._shared and attached and changed else changed:
@@ -142,10 +151,10 @@ class LoadedScene:
             # What the scene holds already, Mitsuba would not set again: a copy.
             leaf = from_tensor(value if key in changed else _copy(value), self._own[key])
             self.leaves.pop(key, None)
-            if attached:
+            if key in attached:
                 dr.enable_grad(leaf)
                 self.leaves[key] = leaf
-            self._settings[key] = _Setting(mi.TensorXf(value), attached)
+            self._settings[key] = _Setting(mi.TensorXf(value), key in attached)
             if key in self.poses:
                 self._posed[key] = leaf
             else:
@@ -190,7 +199,7 @@ class LoadedScene:
     def detach(self) -> None:
         """Keep the values, and cut them from the derivative graph."""
         if self.leaves:
-            self.set_parameters({key: setting.value for key, setting in self._settings.items()}, attached=False)
+            self.set_parameters({key: setting.value for key, setting in self._settings.items()})
 
     def clear_gradients(self) -> None:
         """Forget the gradients of all leaves."""
@@ -201,17 +210,18 @@ class LoadedScene:
         """The gradients of all leaves, as tensors."""
         return {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
 
-    def set_tangents(self, values: Tree, tangents: Tree) -> None:
-        """Give these parameters these values, and carry their tangents to all that the scene computes from them.
+    def set_tangents(self, values: Tree, tangents: Tree, attached: AbstractSet[str]) -> None:
+        """Give these parameters these values, and carry the tangents of those `attached` to all that the scene computes from them.
 
         Afterwards what the scene holds has tangents, no way leads back to the leaves, and every other scene of the process is detached.
         """
         _registry.collect()
+        _registry.any_tangents = True
         for other in loaded_scenes():
             if other is not self:
                 other.detach()
         self._spend()
-        self.set_parameters(values, attached=True)
+        self.set_parameters(values, attached)
         for key, leaf in self.leaves.items():
             if key not in tangents:
                 raise InputError(f"parameter {key}: its tangent is missing")

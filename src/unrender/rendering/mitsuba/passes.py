@@ -18,7 +18,7 @@ from unrender.rendering.mitsuba.integrators.base import ReplayState
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
-from unrender.rendering.mitsuba.poses import PosedScene
+from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
 __all__ = [
@@ -78,22 +78,34 @@ class Pass(ABC):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {"delta": delta}
 
-    def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
+    def function(
+        self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
+    ) -> Callable[..., Any]:
         """What is recorded: of the scene, all loaded scenes, tables, the seed with each pixel's position or None, pixels or None, the
-        films and each pixel's sensor or None, and the pass's own arrays."""
+        films and each pixel's sensor or None, and the pass's own arrays.
+
+        With `posed`, what is handed as the scene is its `scenes()` and its `numbers()` of one pose, raveled.
+        """
 
         def launch(scene, loaded, tables, seeds, pixels, sensors, *own):
             del loaded  # read through pointers, if at all
+            assembly = None
+            if posed is not None:
+                scenes, numbers_of_pose = scene
+                assembly = posed.at(scenes, numbers_of_pose, mi.UInt32(0))
+                scene = assembly.static
             # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
             seed, positions = seeds
             whole = positions is None
             numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
             with dr.suspend_grad():
                 ray, ray_weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
+                if assembly is not None:
+                    ray = _posed_rays(assembly, ray, size, sensors)
                 if sensors is not None and "camera" in tables:
                     of_lane = film.per_sample(sensors[1], size.spp, size.pixels)
                     tables = {**tables, "camera": dr.gather(mi.UInt32, tables["camera"], of_lane)}
-                paths = CameraPaths(kernel, scene, tables, numbers, ray, ray_weight, self.pair)
+                paths = CameraPaths(kernel, scene, tables, numbers, ray, ray_weight, self.pair, assembly)
                 return self.trace(paths, size, *own)
 
         return launch
@@ -115,15 +127,23 @@ class CameraPaths:
 
     Args:
         kernel: what traces them.
-        scene, tables, sampler, ray, pair: of `PathKernel.sample`.
+        scene, tables, sampler, ray, pair, geometry: of `PathKernel.sample`.
         weight: the sensor's, per ray and channel.
     """
 
     def __init__(
-        self, kernel: Kernel, scene: mi.Scene, tables: Tables, sampler: Any, ray: Any, weight: mi.Spectrum, pair: bool
+        self,
+        kernel: Kernel,
+        scene: mi.Scene,
+        tables: Tables,
+        sampler: Any,
+        ray: Any,
+        weight: mi.Spectrum,
+        pair: bool,
+        geometry: Any = None,
     ):
         self._kernel, self._scene, self._tables, self._sampler = kernel, scene, tables, sampler
-        self._ray, self._weight, self._pair = ray, weight, pair
+        self._ray, self._weight, self._pair, self._geometry = ray, weight, pair, geometry
 
     def radiance(self) -> tuple[Any, Any]:
         """The weighted radiance per lane of the current and, for a pair, of the previous state, else None."""
@@ -146,14 +166,15 @@ class CameraPaths:
 
     def vertices(self) -> Any:
         """The number of vertices of each lane's path."""
-        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray)
+        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray, self._geometry)
 
     def _replayed(self, radiance: Any) -> Any:
         """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay."""
         return dr.select(self._weight != 0, radiance / self._weight, 0)
 
     def _sample(self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = ()) -> tuple[Any, Any]:
-        return self._kernel.sample(mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair)
+        arguments = mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair
+        return self._kernel.sample(*arguments, geometry=self._geometry)
 
 
 @dataclass(frozen=True)
@@ -261,8 +282,11 @@ class PosesPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
-    def function(self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize) -> Callable[..., Any]:
-        """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled."""
+    def function(
+        self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
+    ) -> Callable[..., Any]:
+        """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled. `posed` is its own."""
+        del posed
 
         def launch(scenes, loaded, tables, seeds, pixels, sensors, numbers):
             del loaded, tables, sensors
@@ -298,3 +322,16 @@ def _camera_rays(
         return film.rays(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
     films, which = sensors
     return film.rays_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
+
+
+def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, sensors: tuple[film.Films, mi.UInt32] | None) -> Any:
+    """The rays of posed sensors where these stand; all others as they are."""
+    for index, sensor in enumerate(assembly.static.sensors()):
+        if sensor.id() not in assembly.poses or (sensors is None and index != size.sensor):
+            continue
+        moved = assembly.poses[sensor.id()].ray_outside(ray)
+        if sensors is None:
+            return moved
+        mine = film.per_sample(sensors[1], size.spp, size.pixels) == index
+        ray.o, ray.d = dr.select(mine, moved.o, ray.o), dr.select(mine, moved.d, ray.d)
+    return ray

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 
 import mitsuba as mi
 import numpy as np
@@ -19,7 +20,7 @@ from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import ParameterInfo, Space
+from unrender.rendering.renderer import ParameterInfo, Space, differentiated
 
 __all__ = ["MitsubaRenderer"]
 
@@ -60,9 +61,9 @@ class MitsubaRenderer:
             key: poses.info(pose, found[pose.target], pose.target in sensors) for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
-        self._sessions: dict[tuple[tuple[str, ...], bool], MitsubaSession] = {}
+        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}
         self._stock: StockSession | None = None
-        self._checked: set[tuple[tuple[str, ...], bool, Space | None]] = set()
+        self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
         """Every parameter of the scene by its `mitsuba.traverse` key."""
@@ -83,24 +84,27 @@ class MitsubaRenderer:
         """`mi.TensorXf` with these values, in memory of its own."""
         return tensor(values)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> MitsubaSession:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> MitsubaSession:
         """The session for these parameters: see `Renderer.prepare`. Sessions are kept, so that asking again costs nothing.
 
         Poses and other parameters that move geometry cannot be prepared together: the scenes that posed shapes live in are not rebuilt.
         """
-        names = tuple(keys)
-        if (names, derivatives, space) not in self._checked:
+        names, wanted = tuple(keys), differentiated(keys, derivatives)
+        if (names, wanted, space) not in self._checked:
             for key in keys:
-                self._check(key, space, derivatives)
+                self._check(key, space, key in wanted)
             if space is not None:
                 self.pair.check_separate([key for key in keys if key not in self._poses])
-            self._checked.add((names, derivatives, space))
-        if (names, derivatives) not in self._sessions:
+            self._checked.add((names, wanted, space))
+        if (names, wanted) not in self._sessions:
             chosen = {key: self._poses[key] for key in keys if key in self._poses}
             rest = [key for key in keys if key not in self._poses]
-            session = MitsubaSession(self.pair, rest, chosen, derivatives, self.max_depth, self._sampler)
-            self._sessions[names, derivatives] = session
-        return self._sessions[names, derivatives]
+            self._sessions[names, wanted] = MitsubaSession(
+                self.pair, rest, chosen, wanted, self.max_depth, self._sampler
+            )
+        return self._sessions[names, wanted]
 
     def stock(self) -> StockSession:
         """See `StockRenderer.stock`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +21,7 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
-from unrender.rendering.mitsuba.loaded_scene import loaded_scenes
+from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
@@ -73,13 +74,13 @@ class MitsubaSession:
         pair: both loads of the scene, which sessions share.
         keys: the parameters, poses left out.
         poses: {key: what it stands for} of those that are poses.
-        derivatives: whether parameters are leaves of the derivative graph: for all of a session or never, since recorded kernels
-            would be recorded anew if that changed between the primal and the adjoint pass.
+        derivatives: the parameters that are leaves of the derivative graph: for all of a session or never, since recorded kernels
+            would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
         max_depth: longest path in segments.
         sampler: is cloned.
 
-    Raises `InputError` where poses and other parameters that move geometry come together: the scenes that posed shapes live in are
-    not rebuilt.
+    Raises `InputError` where poses and other parameters that move geometry come together, or poses with a derivative and poses without:
+    the scenes that posed shapes live in are not rebuilt.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class MitsubaSession:
         pair: ScenePair,
         keys: list[str],
         poses: dict[str, PoseKey],
-        derivatives: bool,
+        derivatives: AbstractSet[str],
         max_depth: int,
         sampler: mi.Sampler,
     ):
@@ -99,20 +100,29 @@ class MitsubaSession:
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
+        fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
             # Path gradients move the shapes and sensors of the scene itself.
             slots(poses)
-            everything = [*keys, *poses]
+            everything = [key for key in (*keys, *poses) if key in derivatives]
+            cameras = [key for key in cameras if key in derivatives]
+            if fixed and (moved := next((key for key in everything if key in poses or key in cameras), None)):
+                raise InputError(
+                    f"parameter {moved}: path gradients move it in the scene itself, which cannot go with the pose "
+                    f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
+                )
             shapes = {moved_shape(pair.loaded(), key) for key in everything if key not in cameras} - {""}
             self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
             self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
             self._replays = len(cameras) < len(everything)
-            keys, poses = everything, {}
-        self._pair, self._keys, self._poses, self._attached = pair, keys, poses, derivatives
-        self._posed = PosedScene(pair.current, poses) if poses else None
+            keys = [*keys, *(key for key in poses if key in derivatives)]
+        self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
+        self._posed = PosedScene(pair.current, fixed) if fixed else None
+        self._posed_previous: PosedScene | None = None
+        self._at: dict[bool, mi.Float] = {}
         self._max_depth, self._sampler = max_depth, sampler
-        self._traits = list(traits.values()) if derivatives else []
+        self._traits = [of for key, of in traits.items() if key in derivatives]
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
         self._delta_table = pair.delta_table(self._traits)
@@ -135,8 +145,8 @@ class MitsubaSession:
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render. Unbiased; box filter. Posed shapes are in one group only."""
-        if self._posed is not None:
+        """Render. Unbiased; box filter."""
+        if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
         self._set_parameters(parameters)
@@ -147,11 +157,13 @@ class MitsubaSession:
     def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """Render many states with the same random numbers. See `RenderSession.image_batch`.
 
-        Poses alone: one launch for as many as fit the memory. Otherwise one replay of the recorded kernel for each.
+        Where states differ by poses alone: one launch for as many as fit the memory. Otherwise one replay of the recorded kernel for each.
         """
         count = len(next(iter(parameters.values())))
         shape = (*self._pair.resolutions[request.sensor], 3)
-        size = 1 if self._keys else max(1, _LANES // (self._count(request) * request.spp))
+        shared = all(_is_broadcast(parameters[key]) for key in self._keys if key in parameters)
+        together = self._posed is not None and shared
+        size = max(1, _LANES // (self._count(request) * request.spp)) if together else 1
         images = []
         for start in range(0, count, size):
             part = {key: value[start : start + size] for key, value in parameters.items()}
@@ -162,10 +174,13 @@ class MitsubaSession:
     def _batch(self, parameters: Tree, request: SampleRequest) -> mi.Float:
         """The pixels of states that share all but their poses, one behind the other."""
         count = len(next(iter(parameters.values())))
-        self._set_parameters({key: tensor(parameters[key][0]) for key in self._keys if key in parameters})
-        if self._posed is None:
+        at = {key: tensor(values[0]) for key, values in parameters.items()}
+        if self._posed is None or self._attached:
+            self._set_parameters(at)
             radiance = self._run(ImagePass(), request)
         else:
+            detach_all()  # where scenes have tangents now and then, Dr.Jit would record many a step anew
+            self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
             radiance = self._run(PosesPass(self._posed, count), request, tensor(numbers).array)
         dr.eval(radiance)
@@ -226,7 +241,9 @@ class MitsubaSession:
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
             paths = self.image(parameters, paths.request).paths
-        self._pair.loaded().set_tangents(parameters, tangents)
+        rest = {key: value for key, value in parameters.items() if key not in self._poses}
+        self._pair.loaded().set_tangents(rest, tangents, self._attached)
+        self._set_poses(parameters)
         squares = self._run(TangentPass(), paths.request, paths.radiance)
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
@@ -253,11 +270,29 @@ class MitsubaSession:
 
     def _set_parameters(self, parameters: Tree, previous: bool = False) -> None:
         self._check_keys(parameters)
-        self._pair.loaded(previous).set_parameters(parameters, self._attached)
+        rest = {key: value for key, value in parameters.items() if key not in self._poses}
+        self._pair.loaded(previous).set_parameters(rest, self._attached)
+        self._set_poses(parameters, previous)
+
+    def _set_poses(self, parameters: Tree, previous: bool = False) -> None:
+        """Of the passes to come, in one of the two scenes."""
+        if self._posed is None:
+            return
+        loaded = {key: pose.loaded() for key, pose in self._poses.items()}
+        given = {key: parameters[key].numpy() for key in self._poses if key in parameters}
+        self._at[previous] = tensor(self._posed.numbers({k: x[None] for k, x in (loaded | given).items()})).array
+
+    def _posed_scene(self, previous: bool) -> PosedScene | None:
+        """One of the two scenes with posed shapes; None where none is posed."""
+        if self._posed is None or not previous:
+            return self._posed
+        if self._posed_previous is None:
+            self._posed_previous = PosedScene(self._pair.previous, self._poses)
+        return self._posed_previous
 
     def _check_keys(self, parameters: Tree) -> None:
         for key in parameters:
-            if key not in self._keys:
+            if key not in self._keys and key not in self._poses:
                 raise InputError(f"parameter {key}: the renderer was not prepared for it")
 
     def _count(self, request: SampleRequest) -> int:
@@ -278,15 +313,17 @@ class MitsubaSession:
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
         key = (task, size, request.groups, request.pixels is None, several, request.positions is None, shapes)
+        posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
-            traced = task.function(self._kernel_of(task), self._sampler, size)
+            traced = task.function(self._kernel_of(task), self._sampler, size, posed)
             self._functions[key] = FrozenFunction(traced, self._recordable)
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
         seeds = mi.UInt32(request.seed), request.positions
         before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
-        return self._functions[key](before, task.scene(pair), scenes, tables, seeds, request.pixels, sensors, *own)
+        scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
+        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
@@ -294,3 +331,8 @@ class MitsubaSession:
 
 def _nothing() -> None:
     return None
+
+
+def _is_broadcast(values: np.ndarray) -> bool:
+    """Whether all states share a value: see `RenderSession.image_batch`."""
+    return len(values) == 1 or np.asarray(values).strides[0] == 0

@@ -37,7 +37,7 @@ class StockSession:
         """See `StockLoop.gradient`."""
         scene = self._loaded
         scene.detach()  # of leaves that were differentiated before, the derivative graph is gone
-        scene.set_parameters(parameters, attached=True)
+        scene.set_parameters(parameters, parameters.keys())
         image = mi.render(
             scene.scene,
             scene.parameters,

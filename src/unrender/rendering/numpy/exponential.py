@@ -7,6 +7,7 @@ are equal.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +56,9 @@ class ExponentialRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> ExponentialRenderer:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> ExponentialRenderer:
         """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del space, derivatives
         for key in keys:

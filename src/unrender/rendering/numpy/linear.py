@@ -11,6 +11,7 @@ does not (h) are shared or not between two states exactly as a path tracer's are
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -90,7 +91,9 @@ class AnalyticRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> AnalyticRenderer:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> AnalyticRenderer:
         """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del derivatives
         for key in keys:

@@ -7,6 +7,7 @@ the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A, and smoothing by
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,9 @@ class QuadraticRenderer:
         """A NumPy array in double precision."""
         return np.array(values, np.float64)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> QuadraticRenderer:
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> QuadraticRenderer:
         """See `Renderer.prepare`. It holds no state, so it is a session itself."""
         del space, derivatives
         for key in keys:

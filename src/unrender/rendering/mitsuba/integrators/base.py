@@ -68,7 +68,14 @@ class PathKernel(Protocol):
         """
         ...
 
-    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+    def vertices(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        geometry: Any = None,
+    ) -> Float:
         """How many vertices each lane's path has, the camera's not counted: what it costs to trace. Arguments as for `sample`."""
         ...
 

@@ -112,9 +112,16 @@ class PathPair:
         path = self._trace(context, self._begin(context, ray), sampler)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
-    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+    def vertices(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        geometry: Any = None,
+    ) -> Float:
         """See `PathKernel.vertices`."""
-        context = PathContext(dr.ADMode.Primal, scene, tables, (), False, None)
+        context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
         return mi.Float(self._trace(context, self._begin(context, ray), sampler).depth)
 
     def _begin(self, context: PathContext, ray: mi.RayDifferential3f) -> PathState:

@@ -41,6 +41,13 @@ class PrbKernel:
         δL, state_in = (replay[0].δL, replay[0].radiance) if replay else (None, None)
         return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(True))[0], None
 
-    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+    def vertices(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        geometry: Any = None,
+    ) -> Float:
         """See `PathKernel.vertices`: of paths of the same distribution."""
-        return PathPair(self._max_depth).vertices(scene, tables, sampler, ray)
+        return PathPair(self._max_depth).vertices(scene, tables, sampler, ray, geometry)

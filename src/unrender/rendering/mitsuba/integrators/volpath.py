@@ -107,8 +107,16 @@ class VolumePair:
             path.δL += self._in_scattering(context, path.reservoir, noise)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
-    def vertices(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f) -> Float:
+    def vertices(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        geometry: Any = None,
+    ) -> Float:
         """See `PathKernel.vertices`. Borders that let light pass unchanged do not count."""
+        del geometry
         camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
         start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
         context = VolumeContext(start, dr.ADMode.Primal, scene, tables, (), False)

@@ -1,0 +1,211 @@
+"""Path gradients of most parameters, and smoothed derivatives, from perturbed renders, of those that these do not reach."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.registry import register
+from unrender.core.suggestions import did_you_mean
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.capabilities import Capabilities, Capability, FreshGradient, Gradient, Variance
+from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
+from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.rendering.partial import HeldParameters, PartialDerivatives
+from unrender.rendering.renderer import ParameterInfo, Renderer
+
+__all__ = ["HybridGradient", "HybridState", "beyond_paths"]
+
+_PERTURBED = 1 << 33
+"""The stream of a step's key that draws the perturbed renders; path gradients have those below."""
+
+
+def beyond_paths(known: Mapping[str, ParameterInfo], keys: Sequence[str]) -> tuple[str, ...]:
+    """Those of the keys that path gradients do not serve: without a path gradient, or poses, whose loss has plateaus.
+
+    Args:
+        known: of `Renderer.parameters`.
+        keys: in any order.
+    """
+    return tuple(key for key in keys if known[key].rigid or not known[key].differentiable)
+
+
+@dataclass(frozen=True)
+class HybridState:
+    """State between steps: of both estimators.
+
+    Attributes:
+        path: of the path gradients.
+        perturbed: of the smoothed derivatives.
+    """
+
+    path: Any
+    perturbed: SmoothedState
+
+    def upsampled(self, upsampler: Upsampler) -> HybridState:
+        """See `Upsamplable`."""
+        return HybridState(upsampled(self.path, upsampler), self.perturbed.upsampled(upsampler))
+
+    def restarted(self, fresh: HybridState) -> HybridState:
+        """See `Restartable`."""
+        return HybridState(restarted(self.path, fresh.path), self.perturbed.restarted(fresh.perturbed))
+
+
+@register
+@dataclass(frozen=True)
+class HybridGradient:
+    """Two gradients in one: by path replay for the parameters that it suits, and smoothed ones for the others alone.
+
+    The others are poses, whose loss has plateaus and edges, and whatever has no path gradient. Each step renders the scene at its present
+    parameters for the first, with all that `path` has: control variates, memories of gradients, mini-batches of pixels; and, with the
+    first kept as they are, at perturbed values of the second for `perturbed`. Perturbations of a few numbers take a few renders, whatever
+    the number of texels beside them.
+
+    The gradient by the first is exactly that of `path` at these values of the second, from the same random numbers. Where two states
+    share samples, the previous one is rendered with its own values of the second; as paths of one pose are not valid in another, that
+    takes space="primary" where poses are among them. The gradient by the second is that of `perturbed`: of the loss smoothed over these
+    alone. So each has the bias that its estimator states, and no more: the two gradients are of one loss, but of a smoothed one for the
+    second, whose minimum moves to that of the loss itself as σ falls.
+
+    Let `perturbed` be `debiased`: the noise of a few samples a pixel adds to the loss of each perturbed render, and less where the second
+    parameters make for darker images; the first, which do not see that, would follow the second away.
+
+    The two kinds of steps have no common scale: give the second learning rates of their own.
+
+    Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
+    gradient, which is what a meta-estimate has of as many samples. By the variance alone, which is small where perturbations agree,
+    `MetaAdam` would take steps many times as long as its learning rate. The loss is that of `path`.
+
+    Args:
+        path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
+        perturbed: of order "gradient"; its `sigma` is for the second parameters alone.
+        keys: the second parameters; None for all poses, and all that have no path gradient.
+    """
+
+    path: Estimator = field(default_factory=PathGradient)
+    perturbed: SmoothedDerivatives = field(
+        default_factory=lambda: SmoothedDerivatives(0.2, samples=16, spp=2, debiased=True)
+    )
+    keys: tuple[str, ...] | None = None
+
+    def __post_init__(self):
+        if isinstance(self.path, type) or not hasattr(self.path, "provides"):
+            raise InputError(
+                f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}"
+            )
+        if isinstance(self.path, (SmoothedDerivatives, HybridGradient)) or Gradient.name not in self.path.provides:
+            raise InputError(
+                f"HybridGradient: path must be an estimator of path gradients, such as PathGradient(), got "
+                f"{type(self.path).__name__}"
+            )
+        if not isinstance(self.perturbed, SmoothedDerivatives) or self.perturbed.order != "gradient":
+            raise InputError(
+                'HybridGradient: perturbed must be SmoothedDerivatives with order="gradient", since path gradients have no '
+                f"curvature, got {self.perturbed!r:.80}"
+            )
+        if self.keys is not None:
+            if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
+                raise InputError(f"HybridGradient: keys must be a list of parameters' keys, got {self.keys!r:.80}")
+            object.__setattr__(self, "keys", tuple(self.keys))
+
+    @property
+    def provides(self) -> Capabilities:
+        """A gradient, and its variance where `path` has one."""
+        return Capabilities(Gradient, Variance) if Variance.name in self.path.provides else Capabilities(Gradient)
+
+    def init(self, problem: Problem, parameters: Tree) -> HybridState:
+        """See `Estimator.init`. Raises `InputError` where one of the two estimators would have no parameter, or refuses its own."""
+        own = self._perturbed(problem.renderer, parameters)
+        path, perturbed = self._problems(problem, parameters, own)
+        return HybridState(
+            self.path.init(path, parameters),
+            self.perturbed.init(perturbed, {key: parameters[key] for key in own}),
+        )
+
+    def estimate(
+        self, problem: Problem, parameters: Tree, state: HybridState, key: Key
+    ) -> tuple[Estimate, HybridState]:
+        """See `Estimator.estimate`. `info`: that of `path`, with "samples" of both, and "perturbed_loss", at the parameters, of the
+        perturbed renders' noise."""
+        own = self._perturbed(problem.renderer, parameters)
+        path, perturbed = self._problems(problem, parameters, own)
+        found, path_state = self.path.estimate(path, parameters, state.path, key)
+        part = {name: parameters[name] for name in own}
+        moved, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, key.fold(_PERTURBED))
+        if found.preconditioned:
+            moved = by_coordinates(moved, _of(problem, own), part)
+        gradient = {name: moved.gradient[name] if name in own else g for name, g in found.gradient.items()}
+        info = {
+            **found.info,
+            "samples": int(found.info.get("samples", 0)) + int(moved.info.get("samples", 0)),
+            "perturbed_loss": moved.loss,
+        }
+        whole = replace(found, gradient=gradient, capabilities=_merged(found, moved, own), info=info)
+        return whole, HybridState(path_state, perturbed_state)
+
+    def _problems(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> tuple[Problem, Problem]:
+        """As each of the two estimators sees it."""
+        held = {key: x for key, x in parameters.items() if key not in own}
+        return (
+            problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(own))),
+            problem.rendered_by(HeldParameters(problem.renderer, held)),
+        )
+
+    def _perturbed(self, renderer: Renderer, parameters: Tree) -> tuple[str, ...]:
+        """The second parameters, in the order of all."""
+        if self.keys is None:
+            own = beyond_paths(renderer.parameters(), list(parameters))
+            if not own:
+                raise InputError(
+                    "HybridGradient: path gradients reach all parameters; name those to be perturbed (keys; of method hybrid, perturbed), "
+                    "or use PathGradient"
+                )
+        else:
+            for key in self.keys:
+                if key not in parameters:
+                    hint = did_you_mean(key, parameters)
+                    raise InputError(f"HybridGradient: keys names {key}, which is none of the parameters{hint}")
+            own = tuple(key for key in parameters if key in self.keys)
+            if not own:
+                raise InputError("HybridGradient: keys must name at least one parameter; without any, use PathGradient")
+        if len(own) == len(parameters):
+            raise InputError(
+                "HybridGradient: all parameters are perturbed, none is left to path gradients; use SmoothedDerivatives"
+            )
+        return own
+
+
+def _of(problem: Problem, keys: Sequence[str]) -> Problem:
+    """The problem with the coordinates of these parameters alone."""
+    coordinates = problem.coordinates
+    found = problem.rendered_by(problem.renderer)
+    found.coordinates = replace(
+        coordinates,
+        transforms={k: φ for k, φ in coordinates.transforms.items() if k in keys},
+        preconditioners={k: S for k, S in coordinates.preconditioners.items() if k in keys},
+    )
+    return found
+
+
+def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Capability, ...]:
+    """What both tell: the variance of both, and the fresh gradient, which the perturbed one always is."""
+    found: list[Capability] = []
+    for capability in path.capabilities:
+        match capability:
+            case Variance(values):
+                other = perturbed.require("HybridGradient", Variance).values
+                squares = {key: other[key] + perturbed.gradient[key] * perturbed.gradient[key] for key in own}
+                found.append(Variance({key: squares.get(key, v) for key, v in values.items()}))
+            case FreshGradient(values):
+                fresh = {key: perturbed.gradient[key] if key in own else g for key, g in values.items()}
+                found.append(FreshGradient(fresh))
+            case _:
+                pass
+    return tuple(found)

@@ -1,0 +1,105 @@
+"""`hybrid`: path gradients beside perturbed renders, with what the other methods have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+
+from unrender import pixels
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimator
+from unrender.estimators.hybrid import HybridGradient, beyond_paths
+from unrender.estimators.meta import MetaEstimator
+from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives
+from unrender.images.base import ImageEstimator
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.methods.adam_options import AdamOptions
+from unrender.methods.base import Choice, parse_schedule
+from unrender.methods.smoothed import parse_widths
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.meta_adam import MetaAdam
+from unrender.pixels.base import PixelSampler
+from unrender.problem.problem import Problem
+
+__all__ = ["HybridMethod"]
+
+
+@register(name="hybrid", position=7)
+class HybridMethod(AdamOptions):
+    """path gradients, with memories and pixel mini-batches as asked for; perturbed renders of poses and the like; Adam"""
+
+    spp: PositiveInt = Field(4, description="samples per pixel of path gradients")
+    image: Literal["plain", "rcv"] = Field("plain", description="what the loss sees: a fresh rendering, or rcv's")
+    gradient: Literal["plain", "coupled"] = Field(
+        "plain", description="a fresh gradient at each step, or coupled's, which remembers; that takes MetaAdam"
+    )
+    space: Literal["path", "primary"] | None = Field(
+        None, description="what two steps share: paths, or random numbers; none for paths where all parameters allow it"
+    )
+    pixels: NonNegativeInt = Field(0, description="pixels a step, drawn from all views where they tell most; 0 for all")
+    sigma: PositiveFloat | str = Field(
+        0.2,
+        description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
+    )
+    sigma_schedule: str | None = Field(
+        "exponential(25, 0.1)", description="factor of sigma by step, such as cosine(300)"
+    )
+    step: PositiveFloat = Field(0.2, description="learning rate of what is perturbed, as a share of its sigma")
+    samples: int = Field(16, ge=4, description="perturbed renders per view and step")
+    perturbed_spp: PositiveInt = Field(2, description="samples per pixel of a perturbed render")
+    perturbed: str | None = Field(
+        None,
+        description="the parameters to be perturbed, with commas between; none for poses, and all without path gradients",
+    )
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        """See `Options.build`: without rates of its own for what is perturbed, which a problem has to tell."""
+        return self._parts("path" if self.space is None else self.space, {})
+
+    def choose(self, problem: Problem) -> Choice:
+        """See `Options.choose`."""
+        known, keys = problem.renderer.parameters(), list(problem.shapes())
+        own = beyond_paths(known, keys) if self._keys is None else self._keys
+        space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
+        widths = parse_widths(self.sigma)
+        each = widths if isinstance(widths, dict) else {"*": widths}
+        rates = {key: self.step * each.get(key, each["*"]) for key in own if key in keys}
+        reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
+        return Choice(*self._parts(space, rates), (reason,) if own else ())
+
+    @property
+    def _keys(self) -> tuple[str, ...] | None:
+        return None if self.perturbed is None else tuple(key.strip() for key in self.perturbed.split(","))
+
+    def _parts(self, space: Literal["path", "primary"], rates: Tree) -> tuple[Estimator, Optimizer]:
+        image = Plain() if self.image == "plain" else RecursiveControlVariate(space)
+        widths = parse_widths(self.sigma)
+        smoothing = SmoothedDerivatives(
+            widths,
+            self.samples,
+            spp=self.perturbed_spp,
+            schedule=parse_schedule(self.sigma_schedule),
+            debiased=self.perturbed_spp > 1,
+        )
+        path, optimizer = self._path(image, space), self.optimizer()
+        if rates and isinstance(optimizer, (Adam, MetaAdam)):
+            optimizer = replace(optimizer, learning_rate={"*": self.learning_rate, **rates})
+        return HybridGradient(path, smoothing, self._keys), optimizer
+
+    def _path(self, image: ImageEstimator, space: Literal["path", "primary"]) -> Estimator:
+        sampler: PixelSampler = pixels.Adaptive(self.pixels) if self.pixels else pixels.All()
+        if self.gradient == "coupled":
+            return MetaEstimator(coupled=True, spp=self.spp, image=image, space=space, pixels=sampler)
+        return PathGradient(image, sampler, self.spp)
+
+    def optimizer(self) -> Optimizer:
+        """Adam or, for a gradient that remembers, MetaAdam."""
+        if self.gradient == "coupled":
+            return MetaAdam(self.learning_rate, schedule=parse_schedule(self.schedule))
+        return super().optimizer()

@@ -1,0 +1,234 @@
+"""Path gradients of some parameters and perturbed renders for the others, in one estimate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core.random import Key
+from unrender.images.base import PairRequest
+from unrender.methods import method
+from unrender.problem.batches import PixelBatch
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.renderer import ParameterInfo
+
+CV = ur.images.RecursiveControlVariate
+SHAPE = (4, 4)
+TRUTH = {"map": np.random.default_rng(0).uniform(0.3, 0.9, (2, 2, 1)), "pose": np.array([0.4, 0.7])}
+
+
+class PosedRenderer(AnalyticRenderer):
+    """One of whose parameters has no path gradient, and shares no paths."""
+
+    def parameters(self) -> dict[str, ParameterInfo]:
+        known = {"pose": ParameterInfo((2,), differentiable=False, shares_paths=False, reason="it moves", rigid=True)}
+        return {**super().parameters(), **known}
+
+    def prepare(self, keys: list[str], space: Any, derivatives: Any = True) -> Any:
+        if "pose" in keys and (derivatives is True or (derivatives and "pose" in derivatives)):
+            raise ur.InputError("parameter pose: no path gradient")
+        if "pose" in keys and space == "path":
+            raise ur.InputError("parameter pose: no paths shared")
+        return super().prepare(keys, space, derivatives)
+
+
+def problem(noise: float = 0.5, views: int = 2, keys: tuple[str, ...] = ("map", "pose")) -> ur.Problem:
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 6))
+    renderer = PosedRenderer(TRUTH, matrix, 0.1, noise, shape=SHAPE, sensors=views)
+    views_ = [ur.View(renderer.exact(TRUTH), sensor=view) for view in range(views)]
+    return ur.Problem(
+        renderer, [ur.Parameter(key, 0.5, (0, 1)) for key in keys], views_, truth={k: TRUTH[k] for k in keys}
+    )
+
+
+def smoothed(**options: Any) -> ur.SmoothedDerivatives:
+    return ur.SmoothedDerivatives(0.05, **{"samples": 16, "spp": 2, "debiased": True} | options)
+
+
+def exact(asked: ur.Problem, at: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    flat = sum(
+        asked.loss_derivative(view, renderer.exact(at)).reshape(-1) @ renderer.matrix
+        for view in range(len(asked.views))
+    )
+    assert isinstance(flat, np.ndarray)
+    return {"map": flat[:4].reshape(2, 2, 1), "pose": flat[4:]}
+
+
+def all_four(whole_views: int = 3) -> ur.HybridGradient:
+    adaptive = ur.pixels.Adaptive(16, denoiser="none")
+    path = ur.MetaEstimator(coupled=True, spp=2, image=CV("primary", whole_views=whole_views), pixels=adaptive)
+    return ur.HybridGradient(path, smoothed())
+
+
+@pytest.mark.parametrize("pixels", [ur.pixels.All(), ur.pixels.Uniform(16)])
+def test_the_path_s_part_is_that_of_its_estimator_to_the_bit(pixels: Any) -> None:
+    """For a remembering estimator, over steps at which both groups move."""
+    both, alone = problem(), problem(keys=("map",))
+    path = ur.PathGradient(CV("primary", whole_views=2), pixels, spp=4)
+    hybrid = ur.HybridGradient(path, smoothed())
+    state, own = hybrid.init(both, both.initial()), path.init(alone, alone.initial())
+    for step in range(5):
+        at = {"map": both.initial()["map"] + 0.02 * step, "pose": both.initial()["pose"]}
+        found, state = hybrid.estimate(both, at, state, Key(3, step))
+        # The renderer without the pose has its own: the same image where these are equal.
+        renderer = alone.renderer
+        assert isinstance(renderer, AnalyticRenderer)
+        renderer._values["pose"] = at["pose"]
+        expected, own = path.estimate(alone, {"map": at["map"]}, own, Key(3, step))
+        np.testing.assert_array_equal(found.gradient["map"], expected.gradient["map"])
+        assert found.loss == expected.loss
+        assert found.info["samples"] > expected.info["samples"]
+
+
+def worst(rows: np.ndarray, mean: np.ndarray) -> float:
+    return float(np.abs((rows.mean(0) - mean) / (rows.std(0, ddof=1) / np.sqrt(len(rows)))).max())
+
+
+def test_both_parts_are_unbiased() -> None:
+    """Loss and image are quadratic and linear, so the smoothed gradient is the gradient; with the loss of noisy images it is not."""
+    asked, at = problem(), problem().initial()
+    expected = exact(asked, at)
+    rows: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for debiased, found in rows.items():
+        estimator = ur.HybridGradient(ur.PathGradient(spp=2), smoothed(debiased=debiased))
+        state = estimator.init(asked, at)
+        for seed in range(300):
+            gradient = estimator.estimate(asked, at, state, Key(seed))[0].gradient
+            found.append(np.concatenate([gradient["map"].ravel(), gradient["pose"]]))
+    mean = np.concatenate([expected["map"].ravel(), expected["pose"]])
+    assert worst(np.array(rows[True]), mean) < 3.9
+    assert worst(np.array(rows[True]) * 1.1, mean) > 3.9, "a planted bias of 10 % went unseen"
+    assert worst(np.array(rows[False])[:, 4:], mean[4:]) > 3.9, "the noise of the images adds to the loss"
+
+
+@pytest.mark.parametrize("first", [1, 2, 3])
+def test_a_debiased_loss_is_unbiased_for_any_number_of_samples(first: int) -> None:
+    from unrender.estimators.loss_values import BlackBox
+
+    asked = problem(noise=0.9, views=1)
+    at = asked.initial()
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    expected = float(asked.loss_value(0, renderer.exact(at)))
+    found = [[BlackBox(asked, at, first + 1, Key(seed), on).center() for seed in range(300)] for on in (True, False)]
+    assert worst(np.array(found[0])[:, None], np.array([expected])) < 3.3
+    assert worst(np.array(found[1])[:, None], np.array([expected])) > 3.3
+
+
+def test_a_snapshot_s_image_of_a_state_in_between_is_unbiased() -> None:
+    """What the gradient's memory needs of a control variate with mini-batches: the image of the last step, not of the snapshot's."""
+    asked = problem(keys=("map",), views=1)
+    image, pixels = CV("primary"), ur.pixels.Uniform(16)
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    at = [{"map": asked.initial()["map"] + 0.1 * step} for step in range(3)]
+    rows, told = [], []
+    for seed in range(300):
+        path = ur.PathGradient(image, pixels, spp=2)
+        _, state = path.estimate(asked, at[0], path.init(asked, at[0]), Key(seed))
+        batch, _ = pixels.draw(asked, at[2], state.pixels, Key(0))
+        assert batch.sample is not None
+        request = PairRequest(at[1], "primary", 1, 1)
+        frame = PixelBatch(asked, batch.sample)
+        found, _ = image.estimate(asked, at[2], state.image, frame, 2, 2, Key(seed, 7), request)
+        assert found.previous is not None
+        rows.append(found.previous.mean(axis=0).ravel())
+        told = renderer.exact(at[1]).reshape(-1, 3)[batch.sample.pixels].ravel()
+        other = renderer.exact(at[0]).reshape(-1, 3)[batch.sample.pixels].ravel()
+    assert worst(np.array(rows), np.array(told)) < 4.2
+    assert worst(np.array(rows), np.array(other)) > 4.2, "the snapshot's own image would have passed"
+
+
+@pytest.mark.mitsuba  # a run folder asks for it
+def test_all_four_recover_both_and_resume_to_the_bit(tmp_path: Path) -> None:
+    rates = {"*": 0.01, "pose": 0.01}
+    optimizer = ur.optimizers.MetaAdam(rates, schedule=ur.schedules.Exponential(60))
+    whole = ur.optimize(problem(), all_four(), optimizer, steps=150, run_directory=tmp_path / "whole")
+    error = problem().parameter_error(whole.parameters)
+    before = problem().parameter_error(whole.initial)
+    assert all(error[key] < 0.4 * before[key] for key in error), (before, error)
+    ur.optimize(problem(), all_four(), optimizer, steps=67, run_directory=tmp_path / "part")
+    ended = ur.resume(tmp_path / "part", problem(), steps=150)
+    for key, value in whole.parameters.items():
+        np.testing.assert_array_equal(ended.parameters[key], value)
+
+
+def test_the_variance_of_what_is_perturbed_is_a_mean_square() -> None:
+    """So that MetaAdam's steps are no longer than its learning rate."""
+    asked = problem(noise=0.0)
+    estimator = ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(samples=64))
+    found = ur.estimate(asked, estimator)
+    assert found.variance is not None
+    assert (found.variance["pose"] > found.gradient["pose"] ** 2).all()
+    state = (optimizer := ur.optimizers.MetaAdam(0.1)).init(asked.initial())
+    steps, _ = optimizer.update(found, state, asked.initial())
+    assert (np.abs(steps["pose"]) < 0.1).all()
+
+
+def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> None:
+    asked = problem()
+    choice = method("auto").choose(asked, {"sigma": "0.3, pose=0.4"})
+    assert isinstance(choice.estimator, ur.HybridGradient)
+    assert choice.estimator.keys == ("pose",)
+    assert isinstance(choice.estimator.path, ur.PathGradient)
+    assert choice.estimator.path.image == CV("primary")
+    assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
+    assert dict(choice.optimizer.learning_rate)["pose"] == pytest.approx(0.2)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    assert choice.reasons[0] == "perturbed renders of pose: it moves"
+    settings = {"sigma": "0.3", "step": 0.1, "gradient": "coupled", "image": "rcv", "pixels": 16, "spp": 2}
+    choice = method("hybrid").choose(asked, settings)
+    estimator, optimizer = choice.estimator, choice.optimizer
+    assert isinstance(estimator, ur.HybridGradient)
+    assert estimator.path == ur.MetaEstimator(
+        coupled=True, spp=2, image=CV("primary"), space="primary", pixels=ur.pixels.Adaptive(16)
+    )
+    assert isinstance(optimizer, ur.optimizers.MetaAdam)
+    assert optimizer.learning_rate == pytest.approx({"*": 0.01, "pose": 0.03})
+    assert ur.optimize(asked, estimator, optimizer, steps=2).skipped == 0
+    assert isinstance(method("auto").choose(problem(keys=("pose",))).estimator, ur.SmoothedDerivatives)
+    assert isinstance(method("auto").choose(problem(keys=("map",))).estimator, ur.PathGradient)
+
+
+def wrong(given: Any) -> Any:
+    """An argument of the wrong type."""
+    return given
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: ur.HybridGradient(wrong(ur.PathGradient)), "path must be an estimator"),
+        (lambda: ur.HybridGradient(ur.SmoothedDerivatives(0.1)), "of path gradients"),
+        (lambda: ur.HybridGradient(ur.LossValues()), "of path gradients"),
+        (lambda: ur.HybridGradient(perturbed=ur.SmoothedDerivatives(0.1, order="hvp")), "no curvature"),
+        (lambda: ur.HybridGradient(keys=wrong("pose")), "keys must be a list"),
+        (lambda: ur.SmoothedDerivatives(0.1, spp=1, debiased=True), "spp must be"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_at_once(made: Any, said: str) -> None:
+    with pytest.raises(ur.InputError, match=said):
+        made()
+
+
+@pytest.mark.parametrize(
+    ("options", "keys", "said"),
+    [
+        ({"keys": ("pole",)}, ("map", "pose"), "pole, which is none of the parameters; did you mean pose"),
+        ({"keys": ()}, ("map", "pose"), "at least one"),
+        ({"keys": ("map", "pose")}, ("map", "pose"), "use SmoothedDerivatives"),
+        ({}, ("map",), "path gradients reach all"),
+        ({"path": ur.PathGradient(CV())}, ("map", "pose"), "no paths shared"),
+        ({"keys": ("map",)}, ("map", "pose"), "no path gradient"),
+        ({"perturbed": ur.SmoothedDerivatives({"map": 0.1, "*": 0.1})}, ("map", "pose"), "sigma names map"),
+    ],
+)
+def test_what_does_not_suit_a_problem_is_refused_before_the_first_step(options: Any, keys: Any, said: str) -> None:
+    asked = problem(keys=keys)
+    with pytest.raises(ur.InputError, match=said):
+        ur.HybridGradient(**options).init(asked, asked.initial())
