@@ -17,6 +17,7 @@ from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler, RepeatableSampler, learned
 from unrender.problem.problem import Problem
@@ -169,8 +170,9 @@ class MetaEstimator:
             raise InputError(
                 'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
             )
-        check_pixels("MetaEstimator", self.pixels, self.image)
-        if not isinstance(self.pixels, All) and not isinstance(self.image, Plain):
+        fewest = min(n for n in (self.proportional_spp, self.difference_spp, self.spp) if n is not None)
+        check_pixels("MetaEstimator", self.pixels, self.image, fewest)
+        if not isinstance(self.pixels, (All, AdaptiveCounts)) and not isinstance(self.image, Plain):
             raise InputError(
                 "MetaEstimator: pixel mini-batches go with plain images; a control variate's snapshot is of another step"
             )
