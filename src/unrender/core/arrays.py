@@ -269,8 +269,9 @@ def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
     def add(k: Array, sums: Array) -> tuple[Array, Array]:
         return k + 1, sums + dr.gather(dr.array_t(x), values, first + k * width)
 
-    empty = dr.zeros(kind, dr.width(element)), dr.zeros(dr.array_t(x), dr.width(element))
-    _, sums = dr.while_loop(empty, lambda k, sums: k < count, add)
+    empty: Any = dr.zeros(kind, dr.width(element)), dr.zeros(dr.array_t(x), dr.width(element))
+    loop: Any = dr.while_loop
+    _, sums = loop(empty, lambda k, sums: k < count, add)
     return type(x)(sums, (dr.width(starts), width))
 
 

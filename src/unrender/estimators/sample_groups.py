@@ -102,7 +102,8 @@ class GatherRequest:
 
     @property
     def tangents(self) -> Tree:
-        """Along which the squared derivatives of the pixels are wanted; {} for none. Of a mini-batch's pair of states they are not known."""
+        """Along which the squared derivatives of the pixels are wanted; {} for none. Of pairs of mini-batches they are not
+        known."""
         if self.batch is None or (self.pair_request is not None and self.batch.shares is None):
             return {}
         return self.batch.tangents

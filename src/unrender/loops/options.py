@@ -58,7 +58,8 @@ class Options:
         check_pixels(owner, self.pixels, self.image, self.spp)
         if isinstance(self.pixels, AdaptiveCounts):
             raise InputError(
-                f"{owner}: AdaptiveCounts needs the loss derivative of each sample, which only optimize() knows; use pixels=unrender.pixels.All()"
+                f"{owner}: AdaptiveCounts needs the loss derivative of each sample, which only optimize() knows; "
+                "use pixels=unrender.pixels.All()"
             )
         if self.spp % self.groups:
             raise InputError(f"{owner}: groups must divide spp, {self.spp}, got {self.groups}")

@@ -153,9 +153,7 @@ class AdaptiveCounts:
         pixels = [_of_pixels(part, grid.side, film) for part, grid, film in zip(maps, tiles.grids, films, strict=True)]
         offsets = np.random.default_rng(key.fold(1).uint32()).random(len(pixels))
         shares = SampleShares(self.least, tuple(pixels), tuple(offsets.tolist()))
-        return MiniBatch(
-            None, probability=dict(enumerate(part.astype(np.float32) for part in maps)), shares=shares
-        )
+        return MiniBatch(None, probability=dict(enumerate(part.astype(np.float32) for part in maps)), shares=shares)
 
     def learn(
         self, problem: Problem, state: AdaptiveCountsState, sample: PixelSample | None, draws: DrawStatistics
@@ -193,7 +191,8 @@ class AdaptiveCounts:
         """The state with numbers of samples by its maps and its evidence."""
         pooled = tuple(pool(tiles, values, state.counts, _PRIOR) for values in state.maps)
         density = np.sqrt((pooled[0] * pooled[1]).sum(axis=1) / state.costs)
-        means = [np.average(part, weights=size) for part, size in zip(tiles.split(density), tiles.split(tiles.sizes))]
+        parts = zip(tiles.split(density), tiles.split(tiles.sizes), strict=True)
+        means = [np.average(part, weights=size) for part, size in parts]
         mean = np.repeat(means, [grid.rows * grid.columns for grid in tiles.grids])
         known = (mean > 0) & np.isfinite(mean)
         density = np.where(known, density, 1.0) / np.where(known, mean, 1.0)

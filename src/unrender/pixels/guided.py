@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from unrender.core import arrays, checks, trees
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree

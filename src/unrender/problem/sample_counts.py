@@ -38,7 +38,8 @@ class SampleCounts:
         flat = numbers.ravel()
         divisors = array(numbers[..., None].astype(np.float64))
         pixels, starts = np.repeat(np.arange(flat.size), flat), np.concatenate([[0], np.cumsum(flat)[:-1]])
-        return cls(shape, *(arrays.like_integers(x, divisors) for x in (pixels, starts, flat)), divisors)
+        pixels, starts, flat = (arrays.like_integers(x, divisors) for x in (pixels, starts, flat))
+        return cls(shape, pixels, starts, flat, divisors)
 
     def means(self, samples: Array) -> Array:
         """The mean of each pixel's samples: (1, N, 3) to (height, width, 3)."""
@@ -86,7 +87,8 @@ class SampleShares:
 
 
 def rounded(shares: np.ndarray, spp: int, least: int, offset: float) -> np.ndarray:
-    """Whole numbers of samples, of the shape of `shares`: ⌊C_p + u⌋ − ⌊C_{p−1} + u⌋ beyond `least`, with the cumulative shares C and one u."""
+    """Whole numbers of samples, of the shape of `shares`: beyond `least`, ⌊C_p + u⌋ − ⌊C_{p−1} + u⌋ with the cumulative shares C and one u
+    for all pixels, `offset`."""
     rest = (spp - least) * shares.size
     sums = np.cumsum(shares.ravel(), dtype=np.float64)
     if not (sums[-1] > 0 and np.isfinite(sums[-1])):
