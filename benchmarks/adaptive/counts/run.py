@@ -1,9 +1,9 @@
 """More samples in the pixels where the gradient's variance is, with and without a control variate.
 
-`--part variance`: Adam descends with equal and with adaptive numbers of samples, as many in all. At some steps the
-parameters and the state are kept; then the variance of many gradients of that state, summed over all elements, is
-compared, each at its own descent's parameters: plain, and relative to each element's mean square, which is what Adam's
-steps see. The cost of a path is counted: 1 + v / 2 for v vertices. None of this depends on the machine's load.
+`--part variance`: Adam descends with adaptive numbers of samples. At some steps the parameters and the state, with what
+images it remembers, are kept; then the variance of many gradients from them, summed over all elements, is compared with
+that of as many with equal numbers, as many samples in all: plain, and relative to each element's mean square, which is
+what Adam's steps see. The cost of a path is counted: 1 + v / 2 for v vertices. None of this depends on the machine's load.
 
 `--part race`: descents with a control variate, equal and adaptive numbers at several samples per pixel, the learning
 rate of each tuned on a seed of its own, all with as many paths; the error along them by the processor time of a path,
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ MERGE = ("variance.*", "races.*", "seconds_per_path.*")
 QUICK = {
     "problem": ("mirror-trio",),
     "spp": 4,
-    "at": (2,),
+    "at": (5,),
     "runs": 16,
     "paths": 1 << 16,
     "seeds": 1,
@@ -73,15 +73,11 @@ class Kept:
         return self.inner.estimate(problem, parameters, state, key)
 
 
-def estimators(image: str, spp: int) -> dict[str, ur.PathGradient]:
-    """With equal and with adaptive numbers of samples."""
-    samplers = {"equal": ur.pixels.All(), "adaptive": ur.pixels.AdaptiveCounts()}
-    return {name: ur.PathGradient(IMAGES[image](), sampler, spp=spp) for name, sampler in samplers.items()}
-
-
-def rows(problem: ur.Problem, kept: Kept, step: int, runs: int) -> np.ndarray:
-    """(runs, n) gradients of a state that was kept, in the coordinates of the descent."""
+def rows(problem: ur.Problem, kept: Kept, step: int, runs: int, equal: bool) -> np.ndarray:
+    """(runs, n) gradients of a state that was kept, in the coordinates of the descent; with equal numbers of samples or its own."""
     at, state = kept.before[step]
+    if equal:
+        state = replace(state, pixels=replace(state.pixels, uniform=1.0))
     found = []
     for run in range(runs):
         estimate, _ = kept.inner.estimate(problem, at, state, Key(step + 1, run))
@@ -112,21 +108,19 @@ def variances(
     problem: ur.Problem, image: str, spp: int, steps: tuple[int, ...], runs: int, seed: int
 ) -> list[dict[str, Any]]:
     """At each step: ratios of variances [plain, relative] with their errors, and of the cost."""
-    kept = {name: Kept(estimator, steps) for name, estimator in estimators(image, spp).items()}
-    for one in kept.values():
-        ur.optimize(problem, one, ur.optimizers.Adam(0.01), steps=max(steps) + 1, seed=seed)
+    sampler = ur.pixels.AdaptiveCounts()
+    kept = Kept(ur.PathGradient(IMAGES[image](), sampler, spp=spp), steps)
+    ur.optimize(problem, kept, ur.optimizers.Adam(0.01), steps=max(steps) + 1, seed=seed)
     found = []
     for step in steps:
-        both = {name: rows(problem, one, step, runs) for name, one in kept.items()}
-        at, state = kept["adaptive"].before[step]
+        both = {name: rows(problem, kept, step, runs, name == "equal") for name in ("equal", "adaptive")}
+        at, state = kept.before[step]
         scales = element_scales(at, np.square(np.concatenate(list(both.values()))).mean(axis=0, dtype=np.float64))
         point: dict[str, Any] = {"step": step, "uniform": state.pixels.uniform, "ratio": [], "error": []}
         for weights in (np.ones(len(scales)), np.square(scales)):
             (a, error_a), (e, error_e) = spread(both["adaptive"], weights), spread(both["equal"], weights)
             point["ratio"].append(a / e)
             point["error"].append(a / e * float(np.hypot(error_a, error_e)))
-        sampler = kept["adaptive"].inner.pixels
-        assert isinstance(sampler, ur.pixels.AdaptiveCounts)
         point["cost"] = cost(problem, sampler, state.pixels, spp)
         found.append(point)
     return found
@@ -218,7 +212,7 @@ def run(
     part: tuple[str, ...] = ("variance", "race"),
     image: tuple[str, ...] = tuple(IMAGES),
     spp: int = 4,
-    at: tuple[int, ...] = (4, 20, 60),
+    at: tuple[int, ...] = (5, 61),
     runs: int = 64,
     paths: int = 6 << 20,
     seeds: int = 3,
