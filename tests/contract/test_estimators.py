@@ -54,6 +54,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "control variate, adaptive pixels": lambda: ur.PathGradient(
         CV(whole_views=3), ur.pixels.Adaptive(24, denoiser="none"), spp=2
     ),
+    "control variate, adaptive counts": lambda: ur.PathGradient(CV(), ur.pixels.AdaptiveCounts(refresh=2), spp=3),
     "meta, adaptive pixels": lambda: ur.MetaEstimator(pixels=ur.pixels.Adaptive(24, denoiser="none")),
     "meta, adaptive pixels, other statistics": lambda: ur.MetaEstimator(
         pixels=ur.pixels.Adaptive(24, denoiser="none"), statistics="independent"

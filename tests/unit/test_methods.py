@@ -41,6 +41,8 @@ def test_rcv_takes_its_options():
     estimator, optimizer = method("rcv").start(options)
     assert estimator == PathGradient(RecursiveControlVariate("primary", 0.5, 0.75), spp=3, adjoint_spp=1)
     assert optimizer == Adam(beta_1=0.8)
+    estimator, _ = method("rcv").start({"spp": 4, "counts": "adaptive"})
+    assert estimator == PathGradient(RecursiveControlVariate(), pixels.AdaptiveCounts(), spp=4)
 
 
 def test_meta_and_coupled_take_their_options():

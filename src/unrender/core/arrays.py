@@ -46,6 +46,7 @@ __all__ = [
     "rows",
     "scalar",
     "searchsorted",
+    "segment_sums",
     "shape",
     "sign",
     "sqrt",
@@ -247,6 +248,31 @@ def add_rows(x: Array, index: Array, count: int) -> Array:
     flat = dr.zeros(dr.array_t(x), count * width)
     dr.scatter_add(flat, x.array, dr.gather(kind, index, row) * width + (element - row * width))
     return type(x)(flat, (count, width))
+
+
+def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
+    """Sums of runs of consecutive rows of `x` (N, C), in a fixed order: (P, C).
+
+    Args:
+        x: of which every row is in one run.
+        starts: the first row of each run, (P,), ascending integers.
+        numbers: of rows in each, (P,), >= 1.
+    """
+    if not is_drjit(x):
+        return np.add.reduceat(x, starts, axis=0)
+    width, kind, values = x.shape[1], type(starts), x.array
+    dr.eval(values)
+    element = dr.arange(kind, dr.width(starts) * width)
+    row = element // width
+    first, count = dr.gather(kind, starts, row) * width + (element - row * width), dr.gather(kind, numbers, row)
+
+    def add(k: Array, sums: Array) -> tuple[Array, Array]:
+        return k + 1, sums + dr.gather(dr.array_t(x), values, first + k * width)
+
+    empty: Any = dr.zeros(kind, dr.width(element)), dr.zeros(dr.array_t(x), dr.width(element))
+    loop: Any = dr.while_loop
+    _, sums = loop(empty, lambda k, sums: k < count, add)
+    return type(x)(sums, (dr.width(starts), width))
 
 
 def sum_over_rows(x: Array) -> Array:

@@ -171,7 +171,8 @@ class MetaEstimator:
             raise InputError(
                 'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
             )
-        check_pixels("MetaEstimator", self.pixels, self.image)
+        fewest = min(n for n in (self.proportional_spp, self.difference_spp, self.spp) if n is not None)
+        check_pixels("MetaEstimator", self.pixels, self.image, fewest)
         if self.image.space is not None and self.space not in ("auto", self.image.space):
             raise InputError(
                 f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'

@@ -16,6 +16,7 @@ from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leav
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, learned
 from unrender.problem.problem import Problem
@@ -95,7 +96,7 @@ class PathGradient:
         checks.integer("PathGradient", "fresh_from", self.fresh_from, at_least=0)
         if 0 < self.fresh_from < _WINDOW:
             raise InputError(f"PathGradient: fresh_from must be 0, or at least {_WINDOW}, got {self.fresh_from}")
-        check_pixels("PathGradient", self.pixels, self.image)
+        check_pixels("PathGradient", self.pixels, self.image, self.spp, self.adjoint_spp)
 
     @property
     def provides(self) -> Capabilities:
@@ -129,7 +130,8 @@ class PathGradient:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
         the info of the image estimator, per view that was rendered whole, "pixel_probability" per view of a mini-batch."""
         batch, pixels = MiniBatch(None), state.pixels
-        if not self.image.needs_whole_views(parameters, state.image, state.batches):
+        whole_views = isinstance(self.pixels, (All, AdaptiveCounts))
+        if whole_views or not self.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         step = gather(
             problem,
@@ -146,7 +148,7 @@ class PathGradient:
         pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
         pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         whole, image = batch.sample is None, step.image
-        if whole and not isinstance(self.pixels, All):
+        if whole and not whole_views:
             image = prepared(problem, self.image, image)
         next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1)
         arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)

@@ -16,10 +16,12 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.damping import damping, smoothed_variance
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
 from unrender.problem.problem import Problem
+from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import RenderSession, SampleRequest
 
 __all__ = [
@@ -100,8 +102,11 @@ class GatherRequest:
 
     @property
     def tangents(self) -> Tree:
-        """Along which the squared derivatives of the drawn pixels are wanted; {} for none. Of a pair of states they are not known."""
-        return self.batch.tangents if self.batch is not None and self.pair_request is None else {}
+        """Along which the squared derivatives of the pixels are wanted; {} for none. Of pairs of mini-batches they are not
+        known."""
+        if self.batch is None or (self.pair_request is not None and self.batch.shares is None):
+            return {}
+        return self.batch.tangents
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
@@ -109,12 +114,30 @@ def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
     return 1 if adjoint_spp is not None else max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
 
 
-def check_pixels(owner: str, pixels: Any, image: ImageEstimator) -> None:
-    """Raise `InputError` for what is no pixel sampler, or for mini-batches where the image estimator needs whole views."""
+def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, adjoint_spp: int | None = None) -> None:
+    """Raise `InputError` for what is no pixel sampler, for mini-batches or counts where the image estimator needs whole views of equal
+    counts, or where the samples are too few to be counted out.
+
+    Args:
+        owner: for messages.
+        pixels: the sampler.
+        image: the image estimator.
+        fewest: the samples per pixel, the fewest of any gradient of a step.
+        adjoint_spp: see `PathGradient`.
+    """
     if isinstance(pixels, type) or not isinstance(pixels, _PixelSampler):
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
         raise InputError(f"{owner}: {type(image).__name__} needs whole views; use pixels=unrender.pixels.All()")
+    if not isinstance(pixels, AdaptiveCounts):
+        return
+    if adjoint_spp is not None:
+        raise InputError(f"{owner}: AdaptiveCounts has its adjoint on the image's paths; leave adjoint_spp out")
+    if fewest <= pixels.least:
+        raise InputError(
+            f"{owner}: AdaptiveCounts has {pixels.least} samples in each pixel and more in some, so spp must be {pixels.least + 1} "
+            f"or more, got {fewest}"
+        )
 
 
 def gather(
@@ -143,7 +166,8 @@ def gather(
     if problem.gatherer is not None:
         return problem.gatherer.gather(request)
     sample = batch.sample if batch else None
-    frames = whole_views(problem) if sample is None else [PixelBatch(problem, sample)]
+    shares = batch.shares if batch else None
+    frames = [PixelBatch(problem, sample)] if sample is not None else whole_views(problem, shares, spp)
     parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
@@ -161,8 +185,16 @@ def gather(
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
         info=info,
         image=image.advance(parameters, state, tuple(part.kept for part in parts)) if sample is None else state,
-        draws=parts[0].draws if sample is not None else None,
+        draws=_joined([part.draws for part in parts if part.draws is not None]),
     )
+
+
+def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:
+    """Of all frames, one after the other."""
+    if len(draws) <= 1:
+        return draws[0] if draws else None
+    squares, moments = (np.concatenate([getattr(part, name) for part in draws]) for name in ("squares", "moments"))
+    return DrawStatistics(squares, moments, np.concatenate([part.counts for part in draws if part.counts is not None]))
 
 
 def prepared(problem: Problem, image: ImageEstimator, state: Any) -> Any:
@@ -206,7 +238,8 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
     mean = found.mean()
     loss = frame.loss_value(mean)
     paths, traced = found.paths, spp
-    if groups == 1:
+    counts = frame.counts if isinstance(frame, WholeView) else None
+    if groups == 1 and counts is None:
         samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
         paths = _paths(session, parameters, samples, pair_request)
         traced += samples.spp
@@ -225,6 +258,8 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
     draws = None
     if request.tangents and isinstance(frame, PixelBatch):
         draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, request.tangents))
+    elif request.tangents and counts is not None:
+        draws = _view_statistics(counts, weights, session.tangent_moment(parameters, paths, request.tangents))
     return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws)
 
 
@@ -240,12 +275,21 @@ def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawS
     return DrawStatistics(squares, arrays.numpy(moments).astype(np.float64).reshape(-1, *squares.shape).mean(axis=0))
 
 
+def _view_statistics(counts: SampleCounts, weights: Array, moments: Array) -> DrawStatistics:
+    """Likewise of a whole view: from the weights of its samples (1, N, 3), and their squared derivatives (N, 3)."""
+    derivative = weights * counts.spread(counts.divisors)
+    means = [arrays.rows(counts.means(x)) for x in (derivative * derivative, moments)]
+    arrays.evaluate(means)
+    squares, moments = (arrays.numpy(x).astype(np.float64) for x in means)
+    return DrawStatistics(squares, moments, arrays.numpy(counts.numbers).astype(np.float64))
+
+
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:
     """The loss derivative of a frame's images; damped where the variance of its image is known, and the loss biased by it."""
     loss = problem.loss
     if not isinstance(frame, WholeView) or variance is None or not tolerance or loss.linear or not loss.pixelwise:
         return frame.loss_derivative
-    around, reference = smoothed_variance(variance), problem.reference(frame.view)
+    around, reference = (frame.laid(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
 
 
@@ -262,7 +306,7 @@ def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: 
     fresh = found.fresh_others()
     if problem.loss.linear or not isinstance(frame, WholeView):
         return frame.loss_derivative(fresh)
-    reference = problem.reference(frame.view)
+    reference = frame.laid(problem.reference(frame.view))
     residual = others - reference
     square = residual * residual
     return weights * residual * (fresh - reference) / (square + 1e-12)

@@ -12,6 +12,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.problem.batches import Frame
 from unrender.problem.problem import Problem
+from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import Space
 
 __all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "variance_of_mean"]
@@ -29,6 +30,7 @@ class ImageEstimate:
         variance: of `mean()`, (H, W, 3), as far as it is known; None where it is not.
         filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
         fresh: the same as `images`, from this step's samples alone; None where `images` are.
+        counts: how many samples each pixel has, where these differ: `images`, `previous` and `fresh` are the samples then, (1, N, 3).
     """
 
     images: Array
@@ -38,23 +40,28 @@ class ImageEstimate:
     variance: Array | None = None
     filter: Callable[[Array], Array] | None = None
     fresh: Array | None = None
+    counts: SampleCounts | None = None
 
     def mean(self) -> Array:
         """The image of all samples together, (H, W, 3) or (N, 3)."""
-        whole = arrays.mean_over_first(self.images)
+        whole = arrays.mean_over_first(self.images) if self.counts is None else self.counts.means(self.images)
         return whole if self.filter is None else self.filter(whole)
 
     def others(self) -> Array:
-        """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group."""
-        return self._filtered(_leave_one_out(self.images))
+        """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group. With
+        `counts`, for each sample that of its pixel's others."""
+        return self._left_out(self.images)
 
     def fresh_others(self) -> Array:
         """`others()` of this step's samples alone."""
-        return self._filtered(_leave_one_out(self.images if self.fresh is None else self.fresh))
+        return self._left_out(self.images if self.fresh is None else self.fresh)
 
     def previous_others(self) -> Array:
         """`others()` of the previous step's parameters."""
-        return self._filtered(_leave_one_out(self.previous))
+        return self._left_out(self.previous)
+
+    def _left_out(self, images: Array) -> Array:
+        return self._filtered(_leave_one_out(images)) if self.counts is None else self.counts.others(images)
 
     def _filtered(self, images: Array) -> Array:
         if self.filter is None:
@@ -63,8 +70,11 @@ class ImageEstimate:
         return arrays.concatenate([arrays.add_first_axis(image) for image in filtered])
 
 
-def variance_of_mean(images: Array) -> Array | None:
-    """The variance of the mean of independent images (groups, H, W, 3), from what they differ by; None for a single one."""
+def variance_of_mean(images: Array, counts: SampleCounts | None = None) -> Array | None:
+    """The variance of the mean of independent images (groups, H, W, 3), from what they differ by; None for a single one. With `counts`,
+    of the mean of each pixel's samples."""
+    if counts is not None:
+        return counts.variance_of_mean(images)
     groups = images.shape[0]
     if groups == 1:
         return None

@@ -9,7 +9,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
-from unrender.problem.batches import Frame
+from unrender.problem.batches import Frame, WholeView
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
@@ -66,8 +66,9 @@ class Plain:
         else:
             session = problem.renderer.prepare(list(parameters), pair_request.space)
             rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
-        variance = variance_of_mean(rendering.images)
-        return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance), None
+        counts = frame.counts if isinstance(frame, WholeView) else None
+        variance = variance_of_mean(rendering.images, counts)
+        return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
 
     def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Never."""

@@ -18,6 +18,7 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
 from unrender.problem.batches import Frame, PixelBatch, WholeView
 from unrender.problem.problem import Problem
+from unrender.problem.sample_counts import SampleCounts
 from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Rendering, Space
 from unrender.statistics import welford
@@ -32,8 +33,9 @@ class ViewMemory:
 
     Attributes:
         image: the control variate ⟨F_n⟩_CV.
-        relative_variance: of `image`, in units of one step's ⟨F_n⟩_n, by the recurrence (10).
-        current, previous, joint: running statistics of ⟨F_n⟩_n, of ⟨F_{n-1}⟩_n, and of both.
+        relative_variance: of `image`, in units of one step's ⟨F_n⟩_n, by the recurrence (10); in units of one sample's, where pixels
+            have different numbers of samples.
+        current, previous, joint: running statistics of ⟨F_n⟩_n, of ⟨F_{n-1}⟩_n, and of both; of one sample's, likewise.
     """
 
     image: Array
@@ -183,10 +185,11 @@ class RecursiveControlVariate:
                 return self._combine_pixels(problem, state.snapshot, frame, rendering, asked), None
             case WholeView():
                 if first:
-                    variance = variance_of_mean(rendering.images)
-                    estimate = ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance)
-                    return estimate, self._start(estimate.mean())
-                return self._combine_view(state.views[frame.view], rendering, asked)
+                    images, previous_images, counts = rendering.images, rendering.previous, frame.counts
+                    variance = variance_of_mean(images, counts)
+                    estimate = ImageEstimate(images, rendering.paths, {}, previous_images, variance, counts=counts)
+                    return estimate, self._start(estimate.mean(), counts)
+                return self._combine_view(state.views[frame.view], rendering, asked, frame)
         raise InputError(f"RecursiveControlVariate: expected a whole view or a pixel mini-batch, got {frame!r}")
 
     @staticmethod
@@ -201,24 +204,31 @@ class RecursiveControlVariate:
         return ImageEstimate(current, asked.paths, previous=previous)
 
     def _combine_view(
-        self, memory: ViewMemory, rendering: Rendering, asked: Rendering
+        self, memory: ViewMemory, rendering: Rendering, asked: Rendering, frame: WholeView
     ) -> tuple[ImageEstimate, ViewMemory]:
-        """Both images of a view, (groups, H, W, 3), and the view's memory after the step; the previous image is that of `asked`."""
-        F, H = arrays.mean_over_first(rendering.images), arrays.mean_over_first(rendering.previous)
-        used = self._observe(memory, F, H) if self.update_before_use else memory
-        past, weight = memory.relative_variance, self._weight(used)
-        current = advance(memory.image, rendering.images, rendering.previous, weight)
-        observed = used if self.update_before_use else self._observe(memory, F, H)
+        """Both images of a view, (groups, H, W, 3) or samples (1, N, 3), and the view's memory after the step; the previous image is that
+        of `asked`."""
+        counts = frame.counts
+        number: Array | float = 1.0 if counts is None else counts.divisors
+        mean = arrays.mean_over_first if counts is None else counts.means
+        F, H = mean(rendering.images), mean(rendering.previous)
+        used = self._observe(memory, F, H, number) if self.update_before_use else memory
+        past, weight = memory.relative_variance, self._weight(used, number)
+        image, of_each = frame.laid(memory.image), frame.laid(weight)
+        current = advance(image, rendering.images, rendering.previous, of_each)
+        observed = used if self.update_before_use else self._observe(memory, F, H, number)
         var_current, var_previous = welford.covariance(observed.current), welford.covariance(observed.previous)
         cov = welford.covariance(observed.joint)
-        variance = statistics.control_variate_variance(weight, var_current, var_previous, cov, past * var_previous)
+        variance = statistics.control_variate_variance(
+            weight, var_current / number, var_previous / number, cov / number, past * var_previous
+        )
         known = var_current > 0
-        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past))
+        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past * number))
         info = {"control_weight": weight, "variance": variance}
-        previous = advance(memory.image, asked.previous, rendering.previous, weight)
-        if (within := variance_of_mean(rendering.images)) is not None:
-            variance = arrays.where(known, variance, relative * within)
-        estimate = ImageEstimate(current, asked.paths, info, previous, variance, fresh=rendering.images)
+        previous = advance(image, asked.previous, rendering.previous, of_each)
+        if (within := variance_of_mean(rendering.images, counts)) is not None:
+            variance = arrays.where(known, variance, relative * number * within)
+        estimate = ImageEstimate(current, asked.paths, info, previous, variance, fresh=rendering.images, counts=counts)
         return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
 
     def advance(
@@ -230,23 +240,25 @@ class RecursiveControlVariate:
     def _is_first(self, parameters: Tree, state: RecursiveControlVariateState) -> bool:
         return state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
 
-    def _weight(self, memory: ViewMemory) -> Array:
-        var_previous, past = welford.covariance(memory.previous), memory.relative_variance
+    def _weight(self, memory: ViewMemory, number: Array | float = 1.0) -> Array:
+        """Where one step has so many samples of those that the statistics are of."""
+        var_previous, past = welford.covariance(memory.previous), memory.relative_variance * number
         return arrays.where(
             var_previous > 0,
             statistics.control_weight(welford.covariance(memory.joint), var_previous, past * var_previous),
             1.0 / (1.0 + past),
         )
 
-    def _start(self, image: Array) -> ViewMemory:
+    def _start(self, image: Array, counts: SampleCounts | None) -> ViewMemory:
         """Eq. 7: the first image is its own control variate."""
         empty = welford.init(image)
-        return ViewMemory(image, image * 0.0 + 1.0, empty, empty, empty)
+        relative = image * 0.0 + 1.0
+        return ViewMemory(image, relative if counts is None else relative / counts.divisors, empty, empty, empty)
 
-    def _observe(self, memory: ViewMemory, F: Array, H: Array) -> ViewMemory:
+    def _observe(self, memory: ViewMemory, F: Array, H: Array, number: Array | float) -> ViewMemory:
         return replace(
             memory,
-            current=welford.update(memory.current, F, F, self.alpha, self.beta),
-            previous=welford.update(memory.previous, H, H, self.alpha, self.beta),
-            joint=welford.update(memory.joint, F, H, self.alpha, self.beta),
+            current=welford.update(memory.current, F, F, self.alpha, self.beta, number),
+            previous=welford.update(memory.previous, H, H, self.alpha, self.beta, number),
+            joint=welford.update(memory.joint, F, H, self.alpha, self.beta, number),
         )

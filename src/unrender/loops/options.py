@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.sample_groups import check_pixels
 from unrender.images.base import ImageEstimator
 from unrender.losses import L2
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.pixels.uniform import Uniform
@@ -54,7 +55,12 @@ class Options:
         checks.integer(owner, "seed", self.seed, at_least=0)
         if isinstance(self.image, type) or not callable(getattr(self.image, "estimate", None)):
             raise InputError(f"{owner}: image must be one of unrender.images, such as Plain(), got {self.image!r}")
-        check_pixels(owner, self.pixels, self.image)
+        check_pixels(owner, self.pixels, self.image, self.spp)
+        if isinstance(self.pixels, AdaptiveCounts):
+            raise InputError(
+                f"{owner}: AdaptiveCounts needs the loss derivative of each sample, which only optimize() knows; "
+                "use pixels=unrender.pixels.All()"
+            )
         if self.spp % self.groups:
             raise InputError(f"{owner}: groups must divide spp, {self.spp}, got {self.groups}")
         if self.groups > 1 and self.adjoint_spp is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
 
 from unrender.estimators.base import Estimator
@@ -11,6 +13,8 @@ from unrender.images.denoised import Denoised
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.pixels.adaptive_counts import AdaptiveCounts
+from unrender.pixels.all import All
 
 __all__ = ["AdamOptions", "PathOptions"]
 
@@ -35,8 +39,12 @@ class PathOptions(AdamOptions):
 
     spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
     adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
+    counts: Literal["equal", "adaptive"] = Field(
+        "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
+    )
     denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
-        return PathGradient(Denoised(image) if self.denoise else image, spp=self.spp, adjoint_spp=self.adjoint_spp)
+        sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
+        return PathGradient(Denoised(image) if self.denoise else image, sampler, self.spp, self.adjoint_spp)

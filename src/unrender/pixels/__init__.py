@@ -1,8 +1,9 @@
 """Which pixels a step renders: all, or a mini-batch."""
 
 from unrender.pixels.adaptive import Adaptive
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.loss_proportional import LossProportional
 from unrender.pixels.uniform import Uniform
 
-__all__ = ["Adaptive", "All", "LossProportional", "Uniform"]
+__all__ = ["Adaptive", "AdaptiveCounts", "All", "LossProportional", "Uniform"]

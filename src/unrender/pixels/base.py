@@ -12,6 +12,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.problem.batches import PixelSample
 from unrender.problem.problem import Problem
+from unrender.problem.sample_counts import SampleShares
 
 __all__ = [
     "DrawStatistics",
@@ -39,25 +40,30 @@ class MiniBatch:
             the film; empty where it is uniform.
         tangents: of the parameters, along which the squared derivatives of the drawn pixels are asked for (`DrawStatistics`); {} where
             they are not.
+        shares: of the samples of whole views; None where all pixels have as many.
     """
 
     sample: PixelSample | None
     samples: int = 0
     probability: dict[int, np.ndarray] = field(default_factory=dict)
     tangents: Tree = field(default_factory=dict)
+    shares: SampleShares | None = None
 
 
 @dataclass(frozen=True)
 class DrawStatistics:
-    """What the samples of a mini-batch tell of the second moment of its pixels' gradients, on the host.
+    """What the samples of a mini-batch, or of whole views, tell of the second moment of their pixels' gradients, on the host.
 
     Attributes:
-        squares: (∂L/∂I)² of each drawn pixel, without the pixel's weight: the mean over its sample groups, (N, 3).
+        squares: (∂L/∂I)² of each drawn pixel, without the pixel's weight: the mean over its sample groups, (N, 3). Of whole views: of
+            the pixels of all views, concatenated, the mean over its samples.
         moments: (Σ_k v_k ∂I/∂θ_k)² along the tangents v of the mini-batch, likewise.
+        counts: samples behind each, (N,); None where all are of as many.
     """
 
     squares: np.ndarray
     moments: np.ndarray
+    counts: np.ndarray | None = None
 
 
 class PixelSampler(Protocol):
@@ -99,8 +105,8 @@ class LearningSampler(PixelSampler, Protocol):
     An estimator that cannot tell does not call `learn`.
     """
 
-    def learn(self, problem: Problem, state: Any, sample: PixelSample, draws: DrawStatistics) -> Any:
-        """The state after the step that `draw` returned `state` for, with what its samples tell."""
+    def learn(self, problem: Problem, state: Any, sample: PixelSample | None, draws: DrawStatistics) -> Any:
+        """The state after the step that `draw` returned `state` for, with what its samples tell; `sample`: None for whole views."""
         ...
 
 
@@ -108,7 +114,7 @@ def learned(
     sampler: PixelSampler, problem: Problem, state: Any, sample: PixelSample | None, draws: DrawStatistics | None
 ) -> Any:
     """The state of a sampler with what a step's samples tell, where it learns from them and they were asked for."""
-    if sample is None or draws is None or not isinstance(sampler, LearningSampler):
+    if draws is None or not isinstance(sampler, LearningSampler):
         return state
     return sampler.learn(problem, state, sample, draws)
 

@@ -8,13 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
-from unrender.core import arrays, checks, trees
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, check_batch
 from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_map
+from unrender.pixels.tile_samples import FACTORS, Maps, TileSamples, finite
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.pixels.uniform_share import ShareEvidence
 from unrender.problem.batches import PixelSample
@@ -27,8 +28,8 @@ _FEWEST_PATHS, _FIRST_PATHS = 4096, 8
 """The default of `samples` at least: fewer do not resolve where in the images the importance is. Of small mini-batches, for each pixel of
 one: updates are then the rarer."""
 
-_OBSERVED, _DECAY = 4, 0.9
-"""Steps between updates of the gradient's second moment, and the decay of its running mean."""
+_OBSERVED = 4
+"""Steps between updates of the gradient's second moment."""
 
 _MEMORY = 0.8 ** (1 / 20)
 """Weight, after each further step, of what was learnt before. The scene changes little from step to step, so averaging reduces noise."""
@@ -39,12 +40,6 @@ learnt from, and the next update is by them, too: to tell costs a pass over thei
 
 _COUNTED = 8
 """Updates after which the vertices of paths are counted again."""
-
-_FACTORS = 2
-"""The maps of which the samples of a step tell: second moments of the parameter derivatives, and of the loss derivative."""
-
-Maps = tuple[np.ndarray, ...]
-"""Statistics of each tile and channel, (tiles, 3) each."""
 
 
 @dataclass(frozen=True)
@@ -219,14 +214,7 @@ class GuidedSampler:
         """
         if state.second_moment and state.age % _OBSERVED:
             return state
-        pulled = problem.coordinates.pull_back(gradient, {})
-        squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)
-        if not state.second_moment or trees.shapes(state.second_moment) != trees.shapes(squares):
-            return replace(state, second_moment=squares)
-        return replace(
-            state,
-            second_moment=trees.map(lambda old, new: old * _DECAY + new * (1 - _DECAY), state.second_moment, squares),
-        )
+        return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
     def _tiles(self, problem: Problem) -> Tiles:
         most = self._paths()
@@ -263,9 +251,9 @@ class GuidedSampler:
         statistics = pixel_statistics.estimate_statistics(
             problem, parameters, tiles, state.uniform_table, spp, key, references, scales
         )
-        found = tuple(_finite(values) for values in self.rule.maps(statistics))
+        found = tuple(finite(values) for values in self.rule.maps(statistics))
         every = np.arange(len(tiles.views))
-        updated = self._added(state, tiles, _Samples(every, found, tiles.sizes.astype(np.float64), float(spp)))
+        updated = self._added(state, tiles, TileSamples(every, found, tiles.sizes.astype(np.float64), float(spp)))
         updated = self._mapped(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
         return updated, statistics.samples + counted
 
@@ -275,12 +263,12 @@ class GuidedSampler:
         """See `LearningSampler.learn`."""
         tiles = self._tiles(problem)
         tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
-        found = _finite(draws.moments), _finite(draws.squares)
-        learnt = self._added(state, tiles, _Samples(tile, found, 1 / state.shares[tile]))
+        found = finite(draws.moments), finite(draws.squares)
+        learnt = self._added(state, tiles, TileSamples(tile, found, 1 / state.shares[tile]))
         early = state.refreshes == 1 and state.age <= _FIRST
         return self._mapped(problem, tiles, learnt) if early else learnt
 
-    def _added(self, state: GuidedSamplerState, tiles: Tiles, samples: _Samples) -> GuidedSamplerState:
+    def _added(self, state: GuidedSamplerState, tiles: Tiles, samples: TileSamples) -> GuidedSamplerState:
         """The state with what samples tell of its maps and, where there were some before, of the share of uniform draws."""
         decay, evidence = _MEMORY**state.since, state.evidence
         values = samples.normalised()
@@ -300,7 +288,7 @@ class GuidedSampler:
         """The state with probabilities by its maps and its evidence."""
         denoised = tuple(
             np.maximum(denoise_map(tiles, values, self.options.denoiser, counts), 0.0)
-            for values, counts in zip(state.maps[:_FACTORS], state.counts[:_FACTORS], strict=True)
+            for values, counts in zip(state.maps[:FACTORS], state.counts[:FACTORS], strict=True)
         )
         density = self.rule.density(tiles, state.maps, denoised) / np.sqrt(state.costs)
         total = float((density * tiles.sizes).sum())
@@ -315,43 +303,3 @@ class GuidedSampler:
         shares = (1 - uniform) * density + uniform
         table = InverseCdfTable.of(tiles, shares * tiles.sizes, problem.renderer.array)
         return replace(state, table=table, shares=shares, denoised=denoised, density=density, uniform=uniform)
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """What some paths tell.
-
-    Attributes:
-        tile: of each sample, (N,).
-        values: per map, (N, 3).
-        weights: one over the probability of each sample's pixel relative to that of the others, (N,).
-        paths: behind each sample.
-    """
-
-    tile: np.ndarray
-    values: Maps
-    weights: np.ndarray
-    paths: float = 1.0
-
-    def normalised(self) -> Maps:
-        """The values over their mean over all pixels, so that samples count alike whatever the loss or the units of its variance have
-        become in between."""
-        means = [float(np.average(value.mean(axis=1), weights=self.weights)) for value in self.values]
-        return tuple(value / (mean or 1.0) for value, mean in zip(self.values, means, strict=True))
-
-    def summed(self, values: np.ndarray, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-        """Sums and numbers of paths per tile, (tiles, 3) and (tiles,)."""
-        sums = [np.bincount(self.tile, value, tiles) for value in values.T]
-        return np.stack(sums, axis=1) * self.paths, np.bincount(self.tile, minlength=tiles) * self.paths
-
-    def judged(self, values: Maps, denoised: Maps) -> np.ndarray:
-        """`uniform_share.observed`'s samples: each factor of Eq. 12 by the samples, times the other by the map, (2, N)."""
-        factors = [
-            (values[index] * denoised[1 - index][self.tile]).sum(axis=1) * self.weights for index in range(_FACTORS)
-        ]
-        return np.stack(factors) / self.weights.sum()
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    """Values that are not finite count as zeros."""
-    return np.where(np.isfinite(values), values, 0.0)

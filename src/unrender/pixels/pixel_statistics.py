@@ -24,6 +24,7 @@ __all__ = [
     "PixelStatistics",
     "costs",
     "estimate_statistics",
+    "observed",
     "pilot",
     "random_signs",
     "random_tangents",
@@ -34,6 +35,9 @@ __all__ = [
 ROUNDS = 16
 """Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
 
+
+_DECAY = 0.9
+"""Of the running mean of the gradient's squares."""
 
 _FLOOR, _LEAST = 0.1, 1e-30
 """Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
@@ -214,6 +218,16 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
     """±1 for every element of every parameter, all independent."""
     rng = np.random.default_rng(key.uint32())
     return {name: rng.choice(np.array([-1.0, 1.0]), size=shape) for name, shape in trees.shapes(like).items()}
+
+
+def observed(problem: Problem, second_moment: Tree, gradient: Tree) -> Tree:
+    """The running mean square of the gradient, in the coordinates of the descent, with one more gradient by u; elements that are not finite
+    count as zeros."""
+    pulled = problem.coordinates.pull_back(gradient, {})
+    squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)
+    if not second_moment or trees.shapes(second_moment) != trees.shapes(squares):
+        return squares
+    return trees.map(lambda old, new: old * _DECAY + new * (1 - _DECAY), second_moment, squares)
 
 
 def scales(parameters: Tree, second_moment: Tree) -> Tree:

@@ -9,6 +9,7 @@ from typing import Protocol
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.problem.problem import Problem
+from unrender.problem.sample_counts import SampleCounts, SampleShares
 from unrender.rendering.renderer import SampleRequest
 
 __all__ = ["Frame", "PixelBatch", "PixelSample", "WholeView", "whole_views"]
@@ -54,10 +55,15 @@ class Frame(Protocol):
 
 @dataclass(frozen=True)
 class WholeView:
-    """All pixels of one view: images (H, W, 3)."""
+    """All pixels of one view: images (H, W, 3).
+
+    With `counts` each pixel has a number of samples of its own. These are images of one group then, (1, N, 3), and so are the
+    derivatives, each divided by its pixel's number of samples.
+    """
 
     problem: Problem
     view: int
+    counts: SampleCounts | None = None
 
     @property
     def pixels(self) -> int:
@@ -67,15 +73,26 @@ class WholeView:
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
         """See `Frame.request`."""
-        return SampleRequest(self.problem.views[self.view].sensor, spp, seed, groups)
+        sensor = self.problem.views[self.view].sensor
+        if self.counts is not None:
+            return SampleRequest(sensor, 1, seed, 1, self.counts.pixels)
+        return SampleRequest(sensor, spp, seed, groups)
 
     def loss_value(self, image: Array) -> Array:
         """The view's part of the loss, exactly."""
         return self.problem.loss_value(self.view, image)
 
     def loss_derivative(self, image: Array) -> Array:
-        """See `Frame.loss_derivative`."""
-        return self.problem.loss_derivative(self.view, image)
+        """See `Frame.loss_derivative`; with `counts`, of (1, N, 3)."""
+        if self.counts is None:
+            return self.problem.loss_derivative(self.view, image)
+        pixels = self.counts.pixels
+        reference, factor = self.problem.references.at(pixels * 0 + self.view, pixels)
+        return self.problem.loss.derivative(image, reference) * (factor / self.counts.spread(self.counts.divisors))
+
+    def laid(self, image: Array) -> Array:
+        """An image (H, W, C) as the loss derivative takes it; with `counts`, the pixel of each sample, (1, N, C)."""
+        return image if self.counts is None else self.counts.spread(image)
 
 
 @dataclass(frozen=True)
@@ -114,6 +131,9 @@ class PixelBatch:
         return self.problem.loss.derivative(image, reference) * (factor * self.sample.weights)
 
 
-def whole_views(problem: Problem) -> list[Frame]:
-    """One frame per view."""
-    return [WholeView(problem, view) for view in range(len(problem.views))]
+def whole_views(problem: Problem, shares: SampleShares | None = None, spp: int = 1) -> list[Frame]:
+    """One frame per view; with `shares`, each pixel has a number of samples of its own, `spp` on average."""
+    if shares is None:
+        return [WholeView(problem, view) for view in range(len(problem.views))]
+    array = problem.renderer.array
+    return [WholeView(problem, view, shares.counts(view, spp, array)) for view in range(len(problem.views))]

@@ -65,7 +65,9 @@ def init(like: Array) -> State:
     return State(zeros, zeros, zeros, zero, zero, zero)
 
 
-def update(state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0.999) -> State:
+def update(
+    state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0.999, count: Array | float = 1.0
+) -> State:
     """The state after one more pair.
 
     Args:
@@ -73,6 +75,7 @@ def update(state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0
         x, y: one sample each, of the shape given to `init`; the same array twice gives a variance.
         alpha: decay of the means, in [0, 1).
         beta: decay of the covariance, in [0, 1).
+        count: of how many samples each is the mean, where the covariance of a single one is wanted; exact where it stays the same.
     """
     seen = state.mean_weight > 0
     inflation = 1.0 + state.mean_weight_squares / arrays.where(seen, state.mean_weight * state.mean_weight, 1.0)
@@ -83,7 +86,7 @@ def update(state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0
     return State(
         mean_x=state.mean_x + step * dx,
         mean_y=state.mean_y + step * dy,
-        moment=beta * state.moment + gain * (dx * dy),
+        moment=beta * state.moment + gain * (dx * dy) * count,
         mean_weight=mean_weight,
         mean_weight_squares=alpha * alpha * state.mean_weight_squares + (1.0 - alpha) * (1.0 - alpha),
         moment_weight=beta * state.moment_weight + arrays.where(seen, 1.0 - beta, 0.0),
