@@ -8,8 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
+from unrender.preconditioners.base import Preconditioner
 
-__all__ = ["Choosing", "Optimizer", "Reparameterising"]
+__all__ = ["Choosing", "Optimizer", "Preconditioning", "Reparameterising"]
 
 
 class Optimizer(Protocol):
@@ -39,6 +40,16 @@ class Reparameterising(Protocol):
     @property
     def parameterisations(self) -> Mapping[str, Any]:
         """{key: parameterisation, or its name}; keys that the problem does not have, or that have their own, are left out."""
+        ...
+
+
+@runtime_checkable
+class Preconditioning(Protocol):
+    """An optimizer that has preconditioners for parameters without one of their own."""
+
+    @property
+    def preconditioners(self) -> Mapping[str, Preconditioner]:
+        """{key: preconditioner}; keys of parameters that have their own are left out."""
         ...
 
 

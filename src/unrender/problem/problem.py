@@ -15,7 +15,9 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
+from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.losses import L2, Loss
+from unrender.preconditioners.base import Preconditioner
 from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
@@ -30,9 +32,12 @@ from unrender.problem.validation import (
     check_max_depth,
     check_parameter,
     check_parameterisation,
+    check_preconditioner,
     check_sequence,
+    check_surfaces,
     check_truth,
     check_view,
+    faces_of,
     open_renderer,
     renderer_notices,
 )
@@ -61,6 +66,7 @@ class Problem:
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
         name: for people; None takes the scene file's.
+        surfaces: {key: `evaluation.surfaces.Surface`} of vertex positions whose true surface is known, but not where on it a vertex belongs.
 
     Attributes:
         parameters: tuple of `Parameter`, as given.
@@ -79,6 +85,8 @@ class Problem:
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
+        surfaces: as given.
+        faces: {key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh.
         gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
 
     Raises:
@@ -96,6 +104,7 @@ class Problem:
         *,
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
+        surfaces: Mapping[str, Surface] | None = None,
     ):
         self.max_depth = check_max_depth(max_depth)
         self.loss = check_loss(L2() if loss is None else loss)
@@ -125,6 +134,7 @@ class Problem:
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
         self.coordinates = Coordinates(transforms, self.preconditioners)
         self._initial = {key: found.initial for key, found in checked.items()}
+        self.faces = {key: faces_of(known[key], self._initial[key]) for key in checked if known[key].mesh is not None}
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
@@ -135,6 +145,8 @@ class Problem:
         for key, value in (truth or {}).items():
             self.truth[key], notice = check_truth(key, value, self.shapes())
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        self.surfaces = dict(surfaces or {})
+        check_surfaces(self.surfaces, self.faces)
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
@@ -170,6 +182,22 @@ class Problem:
         found.parameterisations = self.parameterisations | {key: one for key, (one, _) in made.items()}
         transforms = {key: transform for key, (_, transform) in made.items() if transform is not None}
         found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
+        return found
+
+    def preconditioned(self, given: Mapping[str, Preconditioner]) -> Problem:
+        """The same problem with these preconditioners for the parameters that have none of their own. Raises `InputError` for one that does
+        not suit."""
+        missing = {p.key: given[p.key] for p in self.parameters if p.key in given and p.preconditioner is None}
+        if not missing:
+            return self
+        found = copy.copy(self)
+        found._as_given = self.as_given
+        known = self.renderer.parameters()
+        found.preconditioners = self.preconditioners | {k: check_preconditioner(k, p, known[k]) for k, p in missing.items()}
+        found.parameters = tuple(
+            replace(p, preconditioner=missing[p.key]) if p.key in missing else p for p in self.parameters
+        )
+        found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
         return found
 
     def gathered_by(self, gatherer: Gatherer | None) -> Problem:
@@ -255,10 +283,19 @@ class Problem:
         """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether any parameter's true value, or surface, is known."""
+        return bool(self.truth or self.surfaces)
+
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""
-        found = self.full({key: parameters[key] for key in self.truth})
-        return {
+        """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root mean square
+        distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
+        found = self.full({key: parameters[key] for key in (*self.truth, *self.surfaces)})
+        errors = {
             key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))
             for key, truth in self.truth.items()
         }
+        for key, surface in self.surfaces.items():
+            errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)
+        return errors

@@ -14,6 +14,7 @@ from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
+from unrender.evaluation.surfaces import Surface
 from unrender.io import bounded_files, images, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
@@ -36,9 +37,12 @@ __all__ = [
     "check_max_depth",
     "check_parameter",
     "check_parameterisation",
+    "check_preconditioner",
     "check_sequence",
+    "check_surfaces",
     "check_truth",
     "check_view",
+    "faces_of",
     "open_renderer",
     "renderer_notices",
 ]
@@ -160,7 +164,8 @@ def check_parameter(
     if rate is not None and (not _is_number(rate) or rate <= 0):
         raise wrong("learning_rate", f"expected a number above 0, got {rate!r}")
     try:
-        preconditioner = _preconditioner(parameter, info)
+        given = parameter.preconditioner
+        preconditioner = None if given is None else check_preconditioner(key, given, info)
     except InputError as error:
         raise wrong("preconditioner", error) from error
     try:
@@ -206,18 +211,16 @@ def check_parameterisation(
     return made, made.transform(bounds, initial)
 
 
-def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner | None:
-    preconditioner = parameter.preconditioner
-    if preconditioner is None:
-        return None
+def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
+    """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     if info.mesh is not None and isinstance(preconditioner, MeshPreconditioner):
         preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh()))
     try:
-        preconditioner.check(parameter.key, info.shape)
+        preconditioner.check(key, info.shape)
     except InputError as error:
-        raise InputError(str(error).removeprefix(f"{parameter.key}: preconditioner ")) from error
+        raise InputError(str(error).removeprefix(f"{key}: preconditioner ")) from error
     return preconditioner
 
 
@@ -301,6 +304,23 @@ def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> 
         return parameter_values.fill(value, shapes[key])
     except InputError as error:
         raise FieldError(("truth", key), str(error)) from error
+
+
+def faces_of(info: ParameterInfo, positions: np.ndarray) -> np.ndarray:
+    """(F, 3) of the mesh whose vertex positions (3 V,) a parameter holds."""
+    assert info.mesh is not None
+    faces = np.asarray(info.mesh()[1]).astype(np.int64).reshape(-1, 3)
+    assert not len(faces) or faces.max() < positions.size // 3
+    return faces
+
+
+def check_surfaces(surfaces: Mapping[str, Surface], faces: Mapping[str, np.ndarray]) -> None:
+    """Raise `FieldError` for a surface of what is no mesh among the parameters."""
+    for key, surface in surfaces.items():
+        if not isinstance(surface, Surface):
+            raise FieldError(("surfaces", key), f"expected an unrender.evaluation.surfaces.Surface, got {type(surface).__name__}")
+        if key not in faces:
+            raise FieldError(("surfaces", key), f"no vertex positions among the parameters{did_you_mean(key, faces)}")
 
 
 def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Renderer:

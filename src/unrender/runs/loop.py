@@ -14,7 +14,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.coordinates import by_coordinates
-from unrender.optimizers.base import Choosing, Optimizer, Reparameterising
+from unrender.optimizers.base import Choosing, Optimizer, Preconditioning, Reparameterising
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
@@ -27,6 +27,8 @@ from unrender.runs.run import Run, RunState, interruptible, snapshot
 __all__ = ["Descent", "descend", "initialize", "prepare"]
 
 _ERRORS_PER_SECOND = 10.0
+_ERROR_PAUSE = 20.0
+"""Times what it took, before the parameters' error is measured again."""
 
 
 @dataclass
@@ -85,6 +87,8 @@ def prepare(
         problem.gatherer.check(estimator)
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
+    if isinstance(optimizer, Preconditioning):
+        problem = problem.preconditioned(optimizer.preconditioners)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)
@@ -170,9 +174,10 @@ def _step(
         "samples": state.samples,
         "gradient_noise": state.noise.update(estimate.gradient, estimate.variance) if finite else None,
     }
-    if problem.truth and (run.stopped or run.clock >= state.next_error):
+    if problem.has_truth and (run.stopped or run.clock >= state.next_error):
+        measured = time.perf_counter()
         record["parameter_error"] = problem.parameter_error(run.parameters)
-        state.next_error = run.clock + 1 / _ERRORS_PER_SECOND
+        state.next_error = run.clock + max(1 / _ERRORS_PER_SECOND, _ERROR_PAUSE * (time.perf_counter() - measured))
     return record
 
 
