@@ -68,11 +68,11 @@ class Surface:
     @cached_property
     def _tree(self) -> tuple[Any, np.ndarray]:
         """Of the points and of the middles of all faces, and which face each belongs to."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         points, of = self._samples
         middles = self.vertices[self.faces].mean(axis=1)
-        return cKDTree(np.concatenate([points, middles])), np.concatenate([of, np.arange(len(self.faces))])
+        return KDTree(np.concatenate([points, middles])), np.concatenate([of, np.arange(len(self.faces))])
 
     def distances_from(self, other: Surface) -> np.ndarray:
         """Of points on another surface, even by area, to this one: (N,), exact to the triangles of this one's points that are nearest,

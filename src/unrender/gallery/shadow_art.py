@@ -95,6 +95,9 @@ def _heart(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _fir(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Three tiers on a trunk, y from -1 to 1."""
-    tiers = [np.minimum((top - y) * slope - np.abs(x), y - foot) for top, foot, slope in ((1.0, 0.3, 0.75), (0.6, -0.2, 0.8), (0.2, -0.7, 0.8))]
+    tiers = [
+        np.minimum((top - y) * slope - np.abs(x), y - foot)
+        for top, foot, slope in ((1.0, 0.3, 0.75), (0.6, -0.2, 0.8), (0.2, -0.7, 0.8))
+    ]
     trunk = np.minimum(np.minimum(0.16 - np.abs(x), y + 1.0), -0.6 - y)
     return np.maximum.reduce([*tiers, trunk]) * 0.8

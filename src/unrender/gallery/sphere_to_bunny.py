@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.evaluation.surfaces import Surface
 from unrender.gallery import blobs, fields, mesh_files, meshes, parts, staging
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
@@ -84,7 +83,9 @@ class SphereToBunny:
         return {
             "type": "scene",
             **{
-                f"camera_{number}": parts.camera((3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 36.0, self.resolution)
+                f"camera_{number}": parts.camera(
+                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 36.0, self.resolution
+                )
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
             "sky": {"type": "constant", "radiance": parts.colour(0.25, 0.3, 0.4)},

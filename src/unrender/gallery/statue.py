@@ -21,6 +21,11 @@ __all__ = ["Statue"]
 _RADIUS = 0.68
 _FINE = 5
 """Subdivisions of the true mesh."""
+_PROFILE = (
+    *((-1.0, 0.0), (-0.97, 0.4), (-0.6, 0.66), (-0.38, 0.68), (-0.2, 0.34), (-0.05, 0.21)),
+    *((0.1, 0.24), (0.3, 0.35), (0.55, 0.38), (0.78, 0.31), (0.95, 0.14), (1.0, 0.0)),
+)
+"""Heights and radii, from the foot to the crown."""
 
 
 @register(name="statue", position=30)
@@ -36,7 +41,9 @@ class Statue:
     resolution: int = fields.resolution(64)
     texture_resolution: int = fields.texture_resolution(32)
     views: int = fields.integer(6, "cameras, around the bust, by turns lower and higher", at_least=1, at_most=64)
-    subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices, without those doubled at its seam", at_least=1, at_most=7)
+    subdivisions: int = fields.integer(
+        4, "s: the sphere has 10 · 4^s + 2 vertices, without those doubled at its seam", at_least=1, at_most=7
+    )
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(2, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
@@ -68,7 +75,9 @@ class Statue:
         return {
             "type": "scene",
             **{
-                f"camera_{number}": parts.camera((3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 34.0, self.resolution)
+                f"camera_{number}": parts.camera(
+                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 34.0, self.resolution
+                )
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
             "sky": {"type": "constant", "radiance": parts.colour(0.3, 0.33, 0.4)},
@@ -85,14 +94,18 @@ def _body(place: Any, subdivisions: int, texture: np.ndarray) -> Any:
 
 def _bust(directions: np.ndarray) -> np.ndarray:
     """Head, neck and shoulders, with a nose, from the unit sphere: (V, 3)."""
+    from scipy.interpolate import PchipInterpolator
+
     x, y, z = directions.T
     height = np.arcsin(np.clip(y, -1, 1)) / (np.pi / 2)
-    shoulders = 0.62 * textures.ramp(-height, -0.1, 0.45)
-    head = 0.4 - 0.19 * np.exp(-(((height + 0.12) / 0.16) ** 2))
-    level = np.sqrt(np.maximum(1 - y * y, 1e-12))
-    nose = 0.13 * np.exp(-((x / 0.16) ** 2) - ((height - 0.3) / 0.11) ** 2) * (z > 0)
-    radius = (head + shoulders) * np.maximum(level, 1e-6) ** 0.6 / np.maximum(level, 1e-6)
-    return np.stack([radius * x * 1.05, 0.95 * height - 0.05, radius * z * (0.95 - 0.3 * shoulders) + nose + 0.08 * height], -1)
+    radius = PchipInterpolator(*np.transpose(_PROFILE))(height)
+    shoulders = textures.ramp(-height, 0.0, 0.3)
+    level = np.maximum(np.sqrt(np.maximum(1 - y * y, 0)), 1e-9)
+    across, along = radius * x / level, radius * z / level
+    nose = 0.14 * np.exp(-((x / 0.2) ** 2) - ((height - 0.38) / 0.09) ** 2) * (z > 0)
+    return np.stack(
+        [across, 0.95 * height, along * (1 - 0.42 * shoulders) + nose + 0.1 * textures.ramp(height, 0.0, 0.3)], -1
+    )
 
 
 def _stone(rows: int) -> np.ndarray:

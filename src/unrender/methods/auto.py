@@ -77,7 +77,8 @@ class AutoMethod(Options):
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
     memory, each step has its own rendering. Textures and grids move along Sobolev gradients, vertices of meshes along large steps at one
-    rate for all, parameters by steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it is `smoothed`; cameras move along path gradients. Every choice
+    rate for all, other parameters by steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it
+    is `smoothed`; cameras move along path gradients. Every choice
     can be set.
     """
 

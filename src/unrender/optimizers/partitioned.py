@@ -60,7 +60,9 @@ class Partitioned:
         for name in ("optimizer", "others"):
             if getattr(self, name).requires != Capabilities(Gradient):
                 kind = type(getattr(self, name)).__name__
-                raise InputError(f"Partitioned: {name}: expected one that requires the gradient alone, such as Adam, got {kind}")
+                raise InputError(
+                    f"Partitioned: {name}: expected one that requires the gradient alone, such as Adam, got {kind}"
+                )
 
     @property
     def requires(self) -> Capabilities:
@@ -75,8 +77,17 @@ class Partitioned:
     @property
     def parameterisations(self) -> Mapping[str, Any]:
         """See `Reparameterising`."""
-        pairs = ((part, part.parameterisations) for part in (self.optimizer, self.others) if isinstance(part, Reparameterising))
-        return {k: given for part, found in pairs for k, given in found.items() if (k in self.keys) == (part is self.optimizer)}
+        pairs = (
+            (part, part.parameterisations)
+            for part in (self.optimizer, self.others)
+            if isinstance(part, Reparameterising)
+        )
+        return {
+            k: given
+            for part, found in pairs
+            for k, given in found.items()
+            if (k in self.keys) == (part is self.optimizer)
+        }
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> PartitionedState:
         """See `Optimizer.init`. Raises `InputError` for a key that is no parameter."""

@@ -22,6 +22,7 @@ from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
+from unrender.problem.mesh_checks import check_surfaces, faces_of
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.validation import (
@@ -34,10 +35,8 @@ from unrender.problem.validation import (
     check_parameterisation,
     check_preconditioner,
     check_sequence,
-    check_surfaces,
     check_truth,
     check_view,
-    faces_of,
     open_renderer,
     renderer_notices,
 )
@@ -66,7 +65,8 @@ class Problem:
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
         name: for people; None takes the scene file's.
-        surfaces: {key: `evaluation.surfaces.Surface`} of vertex positions whose true surface is known, but not where on it a vertex belongs.
+        surfaces: {key: `evaluation.surfaces.Surface`} of vertex positions whose true surface is known,
+            but not where on it a vertex belongs.
 
     Attributes:
         parameters: tuple of `Parameter`, as given.
@@ -82,6 +82,7 @@ class Problem:
         preconditioners: {key: preconditioner} of the parameters that have one.
         coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
         parameterisations: {key: parameterisation} of the parameters that were given one.
+        regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
@@ -131,10 +132,11 @@ class Problem:
         self.preconditioners = {k: p for k, found in checked.items() if (p := found.preconditioner) is not None}
         self.coarse_to_fine = {k: c for k, found in checked.items() if (c := found.coarse_to_fine) is not None}
         self.parameterisations = {k: p for k, found in checked.items() if (p := found.parameterisation) is not None}
+        self.regularizers = {k: r for k, found in checked.items() if (r := found.regularizer) is not None}
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
         self.coordinates = Coordinates(transforms, self.preconditioners)
         self._initial = {key: found.initial for key, found in checked.items()}
-        self.faces = {key: faces_of(known[key], self._initial[key]) for key in checked if known[key].mesh is not None}
+        self.faces = {key: faces_of(known[key]) for key in checked if known[key].mesh is not None}
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
@@ -193,7 +195,9 @@ class Problem:
         found = copy.copy(self)
         found._as_given = self.as_given
         known = self.renderer.parameters()
-        found.preconditioners = self.preconditioners | {k: check_preconditioner(k, p, known[k]) for k, p in missing.items()}
+        found.preconditioners = self.preconditioners | {
+            k: check_preconditioner(k, p, known[k]) for k, p in missing.items()
+        }
         found.parameters = tuple(
             replace(p, preconditioner=missing[p.key]) if p.key in missing else p for p in self.parameters
         )
@@ -289,8 +293,8 @@ class Problem:
         return bool(self.truth or self.surfaces)
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root mean square
-        distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
+        """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root
+        mean square distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
         found = self.full({key: parameters[key] for key in (*self.truth, *self.surfaces)})
         errors = {
             key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))

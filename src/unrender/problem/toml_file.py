@@ -64,6 +64,9 @@ class _Parameter(Table):
         None,
         description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
     )
+    regularizer: dict[str, Any] | None = Field(
+        None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
+    )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
@@ -141,7 +144,8 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
-    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, model.parameterisation)
+    rate, regularizer = model.learning_rate, model.regularizer
+    return Parameter(model.key, start, model.bounds, rate, preconditioner, way, model.parameterisation, regularizer)
 
 
 def _value(value: Any, folder: Path) -> Any:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -14,7 +15,6 @@ from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
-from unrender.evaluation.surfaces import Surface
 from unrender.io import bounded_files, images, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
@@ -25,6 +25,8 @@ from unrender.problem.bounds import project
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.errors import FieldError
 from unrender.problem.key_hints import instead_of, near_key
+from unrender.problem.mesh_checks import check_regularizer
+from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.parameter import Parameter
 from unrender.problem.view import View
 from unrender.rendering.renderer import ParameterInfo, Renderer
@@ -39,10 +41,8 @@ __all__ = [
     "check_parameterisation",
     "check_preconditioner",
     "check_sequence",
-    "check_surfaces",
     "check_truth",
     "check_view",
-    "faces_of",
     "open_renderer",
     "renderer_notices",
 ]
@@ -86,6 +86,7 @@ class CheckedParameter:
         coarse_to_fine: None where its resolution is constant.
         parameterisation: None where none was given.
         transform: of that; None for the identity.
+        regularizer: bound to the mesh; None for none.
         initial: float32, inside the bounds, of the scene's shape.
         notices: one line for each change made to the input.
     """
@@ -97,6 +98,7 @@ class CheckedParameter:
     coarse_to_fine: CoarseToFine | None
     parameterisation: Parameterisation | None
     transform: Transform | None
+    regularizer: MeshRegularizer | None
     initial: np.ndarray
     notices: tuple[str, ...]
 
@@ -140,7 +142,55 @@ def check_parameter(
         known: the scene's parameters.
         renderer: gives the scene's own value where there is no initial one.
     """
-    key = parameter.key
+    key, info = parameter.key, _known(index, parameter.key, known)
+
+    @contextmanager
+    def checking(field: str) -> Iterator[None]:
+        try:
+            yield
+        except InputError as error:
+            raise FieldError(("parameters", index, field), str(error), f"parameter {key}: {field}") from error
+
+    with checking("bounds"):
+        bounds = _bounds(parameter.bounds, info)
+    rate = parameter.learning_rate
+    with checking("learning_rate"):
+        if rate is not None and (not _is_number(rate) or rate <= 0):
+            raise InputError(f"expected a number above 0, got {rate!r}")
+    preconditioner, parameterisation, transform, regularizer = None, None, None, None
+    with checking("preconditioner"):
+        if parameter.preconditioner is not None:
+            preconditioner = check_preconditioner(key, parameter.preconditioner, info)
+    with checking("coarse_to_fine"):
+        schedule = _coarse_to_fine(parameter, info)
+    with checking("initial"):
+        start, notice = _initial(parameter, info, renderer)
+    initial, clipped = _clip_to_bounds(start, bounds)
+    with checking("parameterisation"):
+        if parameter.parameterisation is not None:
+            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
+    with checking("regularizer"):
+        if parameter.regularizer is not None:
+            regularizer = check_regularizer(parameter.regularizer, info)
+    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
+    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
+    own_rate = None if rate is None else float(rate)
+    return CheckedParameter(
+        key,
+        bounds,
+        own_rate,
+        preconditioner,
+        schedule,
+        parameterisation,
+        transform,
+        regularizer,
+        initial,
+        tuple(notices),
+    )
+
+
+def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
+    """What the renderer says of a parameter. Raises `FieldError` for a key that it does not have, or cannot recover."""
     if not isinstance(key, str) or key not in known:
         raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
     if len(key) > _LONGEST_KEY:  # files are named by it
@@ -152,43 +202,7 @@ def check_parameter(
         raise FieldError(
             ("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}{instead_of(key, known)}"
         )
-
-    def wrong(field: str, what: str | Exception) -> FieldError:
-        return FieldError(("parameters", index, field), str(what), f"parameter {key}: {field}")
-
-    try:
-        bounds = _bounds(parameter.bounds, info)
-    except InputError as error:
-        raise wrong("bounds", error) from error
-    rate = parameter.learning_rate
-    if rate is not None and (not _is_number(rate) or rate <= 0):
-        raise wrong("learning_rate", f"expected a number above 0, got {rate!r}")
-    try:
-        given = parameter.preconditioner
-        preconditioner = None if given is None else check_preconditioner(key, given, info)
-    except InputError as error:
-        raise wrong("preconditioner", error) from error
-    try:
-        schedule = _coarse_to_fine(parameter, info)
-    except InputError as error:
-        raise wrong("coarse_to_fine", error) from error
-    try:
-        start, notice = _initial(parameter, info, renderer)
-    except InputError as error:
-        raise wrong("initial", error) from error
-    initial, clipped = _clip_to_bounds(start, bounds)
-    try:
-        parameterisation, transform = None, None
-        if parameter.parameterisation is not None:
-            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
-    except InputError as error:
-        raise wrong("parameterisation", error) from error
-    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
-    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
-    own_rate = None if rate is None else float(rate)
-    return CheckedParameter(
-        key, bounds, own_rate, preconditioner, schedule, parameterisation, transform, initial, tuple(notices)
-    )
+    return info
 
 
 def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
@@ -304,23 +318,6 @@ def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> 
         return parameter_values.fill(value, shapes[key])
     except InputError as error:
         raise FieldError(("truth", key), str(error)) from error
-
-
-def faces_of(info: ParameterInfo, positions: np.ndarray) -> np.ndarray:
-    """(F, 3) of the mesh whose vertex positions (3 V,) a parameter holds."""
-    assert info.mesh is not None
-    faces = np.asarray(info.mesh()[1]).astype(np.int64).reshape(-1, 3)
-    assert not len(faces) or faces.max() < positions.size // 3
-    return faces
-
-
-def check_surfaces(surfaces: Mapping[str, Surface], faces: Mapping[str, np.ndarray]) -> None:
-    """Raise `FieldError` for a surface of what is no mesh among the parameters."""
-    for key, surface in surfaces.items():
-        if not isinstance(surface, Surface):
-            raise FieldError(("surfaces", key), f"expected an unrender.evaluation.surfaces.Surface, got {type(surface).__name__}")
-        if key not in faces:
-            raise FieldError(("surfaces", key), f"no vertex positions among the parameters{did_you_mean(key, faces)}")
 
 
 def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Renderer:

@@ -13,11 +13,12 @@ from unrender.core import arrays, phases
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.coordinates import by_coordinates, regularized
 from unrender.optimizers.base import Choosing, Optimizer, Preconditioning, Reparameterising
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
+from unrender.runs.mesh_guard import guarded
 from unrender.runs.metadata import RunMetadata
 from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
@@ -68,6 +69,7 @@ class Descent:
         for _ in range(2):
             key = Key(run.seed, 0, stream=1)
             found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
+            found = regularized(found, run.problem, run.parameters)
             update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
             run.parameters, state.optimizer = update.parameters, update.state
             state.noise.update(found.gradient, found.variance)
@@ -150,11 +152,13 @@ def _step(
     problem = run.problem
     started = time.perf_counter()
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
+    estimate = regularized(estimate, problem, run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:
         update = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
         culprit = update.not_finite
         if not culprit:
+            _warn_of_shortened(run, update.shortened)
             run.parameters, state.optimizer, state.estimator = update.parameters, update.state, after
     finite = not culprit
     if culprit:
@@ -199,11 +203,20 @@ def _warn_of_skipping(run: Run, culprit: str) -> None:
         run.warnings.append(f"step {run.step}: {line}")
 
 
+def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
+    """Warn of steps of meshes that are shortened, once for each."""
+    for key in keys:
+        line = f"{key}: triangles would have turned over; such steps are shortened"
+        if not any(known.endswith(line) for known in run.warnings):
+            run.warnings.append(f"step {run.step}: {line}")
+
+
 @dataclass(frozen=True)
 class _Update:
     """What an optimizer makes of an estimate.
 
     Attributes:
+        shortened: meshes whose triangles would have turned over.
         parameters, state: after it.
         not_finite: what of it is not finite, "" for nothing; it is then not to be applied.
     """
@@ -211,6 +224,7 @@ class _Update:
     parameters: Tree
     state: Any
     not_finite: str
+    shortened: tuple[str, ...] = ()
 
 
 def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
@@ -224,4 +238,13 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     # Before they are bounded: the nearest point to what is no number may be a bound.
     broken = next((key for key, value in moved.items() if not arrays.all_finite(value)), "")
     culprit = f"the optimizer's step for {broken} (from its own state, or the preconditioner)" if broken else ""
-    return _Update(bounded, state, culprit)
+    if culprit:
+        return _Update(bounded, state, culprit)
+    shortened = []
+    for key, faces in problem.faces.items():
+        wanted = arrays.numpy(bounded[key])
+        allowed = guarded(arrays.numpy(parameters[key]), wanted, faces)
+        if allowed is not wanted:
+            bounded[key] = arrays.like(allowed, bounded[key])
+            shortened.append(key)
+    return _Update(bounded, state, "", tuple(shortened))
