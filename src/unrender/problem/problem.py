@@ -287,6 +287,14 @@ class Problem:
         """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
 
+    def texture_coordinates(self, key: str) -> np.ndarray | None:
+        """(V, 2) of a mesh whose vertex positions are the parameter `key`; None where it has none."""
+        name = f"{key.rpartition('.')[0]}.vertex_texcoords"
+        if name not in self.renderer.parameters():
+            return None
+        found = arrays.numpy(self.renderer.values([name])[name]).reshape(-1, 2)
+        return found if len(found) == self._initial[key].size // 3 else None
+
     @property
     def has_truth(self) -> bool:
         """Whether any parameter's true value, or surface, is known."""
