@@ -49,6 +49,9 @@ class SphereToBunny:
     views: int = fields.integer(6, "cameras, around the animal, by turns lower and higher", at_least=1, at_most=64)
     subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
     mesh: str = mesh_files.option("PLY or OBJ file of a body, in place of the one made by code")
+    remesh_at: int = fields.integer(
+        0, "step before which the mesh gets even triangles of half the edge (unrender[remesh]); 0 for never", at_least=0
+    )
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(2, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
@@ -66,7 +69,7 @@ class SphereToBunny:
 
     def parameters(self) -> tuple[Parameter, ...]:
         """The vertices, where the sphere has them."""
-        return (Parameter("sphere.vertex_positions"),)
+        return (Parameter("sphere.vertex_positions", remeshing=(self.remesh_at,) if self.remesh_at else None),)
 
     def problem(self, name: str) -> Problem:
         """The problem: the sphere's scene, the animal's pictures by Mitsuba's own `path` integrator, and its surface."""

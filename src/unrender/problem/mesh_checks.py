@@ -10,12 +10,13 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.evaluation.surfaces import Surface
-from unrender.problem import mesh_regularizer
+from unrender.problem import mesh_regularizer, remeshing
 from unrender.problem.errors import FieldError
 from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.remeshing import Remeshing
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["check_regularizer", "check_surfaces", "faces_of"]
+__all__ = ["check_regularizer", "check_remeshing", "check_surfaces", "faces_of"]
 
 
 def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
@@ -24,6 +25,15 @@ def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
     if info.mesh is None:
         raise InputError("expected none: it is of the vertex positions of a mesh")
     return regularizer.on_mesh(*info.mesh())
+
+
+def check_remeshing(given: Any, info: ParameterInfo, uv: np.ndarray | None) -> Remeshing:
+    """When a mesh gets other triangles, of what was given. Raises `InputError` where it does not suit the mesh."""
+    found = remeshing.of(given)
+    if info.mesh is None:
+        raise InputError("expected none: it is of the vertex positions of a mesh")
+    found.check(*info.mesh(), uv)
+    return found
 
 
 def faces_of(info: ParameterInfo) -> np.ndarray:

@@ -13,6 +13,7 @@ from unrender.parameterisations.base import Parameterisation
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.remeshing import Remeshing
 
 __all__ = ["Parameter"]
 
@@ -36,6 +37,8 @@ class Parameter:
             bounds and results are the parameter's own. None for the identity.
         regularizer: of the vertex positions of a mesh, what is added to the loss: `MeshRegularizer`, or a table of its options such as
             {"bilaplacian": 0.001}; None for nothing.
+        remeshing: of the vertex positions of a mesh, when it gets other triangles: `Remeshing`, its steps alone, or a table of its options
+            such as {"steps": [100], "method": "subdivide"}; None for never.
     """
 
     key: str
@@ -46,3 +49,4 @@ class Parameter:
     coarse_to_fine: CoarseToFine | Sequence[int] | None = None
     parameterisation: Parameterisation | str | Mapping[str, Any] | None = None
     regularizer: MeshRegularizer | Mapping[str, Any] | None = None
+    remeshing: Remeshing | Sequence[int] | Mapping[str, Any] | None = None

@@ -13,6 +13,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.evaluation.surfaces import Surface, surface_error
@@ -22,9 +23,10 @@ from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
-from unrender.problem.mesh_checks import check_surfaces, faces_of
+from unrender.problem.mesh_checks import check_remeshing, check_surfaces, faces_of
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
+from unrender.problem.remeshing import Remeshing
 from unrender.problem.validation import (
     Bounds,
     CheckedParameter,
@@ -42,7 +44,7 @@ from unrender.problem.validation import (
 )
 from unrender.problem.view import View
 from unrender.rendering.exposure import EXPOSURE, ExposedRenderer, without_exposure
-from unrender.rendering.renderer import Renderer
+from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
 __all__ = ["Bounds", "Problem"]
 
@@ -82,12 +84,14 @@ class Problem:
         preconditioners: {key: preconditioner} of the parameters that have one.
         coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
         parameterisations: {key: parameterisation} of the parameters that were given one.
+        remeshings: {key: `Remeshing`} of the parameters that have one.
         regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
         surfaces: as given.
         faces: {key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh.
+        remeshed_from: the problem with the meshes that it began with, where it has others now; else None.
         gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
 
     Raises:
@@ -149,11 +153,22 @@ class Problem:
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
         self.surfaces = dict(surfaces or {})
         check_surfaces(self.surfaces, self.faces)
+        self.remeshings: dict[str, Remeshing] = {}
+        for index, parameter in enumerate(self.parameters):
+            if parameter.remeshing is not None:
+                key = parameter.key
+                uv = self.texture_coordinates(key) if key in self.faces else None
+                try:
+                    self.remeshings[key] = check_remeshing(parameter.remeshing, known[key], uv)
+                except InputError as error:
+                    place = ("parameters", index, "remeshing")
+                    raise FieldError(place, str(error), f"parameter {key}: remeshing") from error
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
         self._as_given: Problem | None = None
+        self.remeshed_from: Problem | None = None
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
@@ -203,6 +218,27 @@ class Problem:
         )
         found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
         return found
+
+    def remeshed(self, meshes: Mapping[str, ReplacedMesh]) -> Problem:
+        """The same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
+
+        Raises `InputError` where the renderer has no meshes to replace.
+        """
+        if not isinstance(self.renderer, Remeshable):
+            raise InputError(f"{', '.join(meshes)}: this renderer's meshes keep their triangles")
+        given = [
+            replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
+            for p in self.parameters
+        ]
+        shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
+        renderer = self.renderer.with_meshes(shapes, [p.key for p in given])
+        truth = {key: value for key, value in self.truth.items() if key not in meshes}
+        made = Problem(
+            renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
+        )
+        made.origin, made.gatherer, made._as_given = self.origin, self.gatherer, self.as_given
+        made.remeshed_from = self.remeshed_from or self
+        return made
 
     def gathered_by(self, gatherer: Gatherer | None) -> Problem:
         """The same problem, its gradients computed by workers that its views are dealt to."""
@@ -309,5 +345,6 @@ class Problem:
             for key, truth in self.truth.items()
         }
         for key, surface in self.surfaces.items():
-            errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)
+            if found[key].size == self._initial[key].size:
+                errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)
         return errors

@@ -67,6 +67,10 @@ class _Parameter(Table):
     regularizer: dict[str, Any] | None = Field(
         None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
     )
+    remeshing: list[StrictInt] | dict[str, Any] | None = Field(
+        None,
+        description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
+    )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
@@ -144,8 +148,8 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
-    rate, regularizer = model.learning_rate, model.regularizer
-    return Parameter(model.key, start, model.bounds, rate, preconditioner, way, model.parameterisation, regularizer)
+    given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
 
 
 def _value(value: Any, folder: Path) -> Any:

@@ -6,7 +6,7 @@ own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -19,9 +19,11 @@ __all__ = [
     "CountingSession",
     "LossWeights",
     "ParameterInfo",
+    "Remeshable",
     "RenderSession",
     "Renderer",
     "Rendering",
+    "ReplacedMesh",
     "SampleRequest",
     "Space",
     "StockLoop",
@@ -215,6 +217,30 @@ class StockLoop(Protocol):
             seeds: of the image and of the adjoint, in [0, 2**32).
             weigh: the derivative of the loss at the image.
         """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ReplacedMesh:
+    """What a shape is to be.
+
+    Attributes:
+        vertices: (V, 3).
+        faces: (F, 3), numbers of vertices.
+        uv: (V, 2) texture coordinates; None where the shape has none.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None = None
+
+
+@runtime_checkable
+class Remeshable(Protocol):
+    """A renderer whose meshes can be replaced."""
+
+    def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
+        """Another one, of the same scene with these meshes for shapes by their ids, for these keys of parameters."""
         ...
 
 

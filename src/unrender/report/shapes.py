@@ -61,7 +61,7 @@ class ShapePanel:
 def panel(run: RunFolder, key: str) -> ShapePanel:
     """Start, result and, where it is known, truth of the mesh whose vertex positions are a parameter."""
     mesh = run.meshes[key]
-    shown = {"Start": (run.initial[key], mesh.faces), "Recovered": (run.parameters[key], mesh.faces)}
+    shown = {"Start": (run.initial[key], mesh.first_faces), "Recovered": (run.parameters[key], mesh.faces)}
     if mesh.truth is not None:
         shown["Truth"] = (mesh.truth.vertices, mesh.truth.faces)
     solids = {label: (np.asarray(x, np.float64).reshape(-1, 3), faces) for label, (x, faces) in shown.items()}

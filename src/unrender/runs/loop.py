@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import arrays, phases
+from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
@@ -87,6 +88,10 @@ def prepare(
     """A run before its first step."""
     if problem.gatherer is not None:
         problem.gatherer.check(estimator)
+        if problem.remeshings:
+            raise InputError(
+                f"{next(iter(problem.remeshings))}: remeshing: meshes of dealt runs keep their triangles: leave it out"
+            )
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
     if isinstance(optimizer, Preconditioning):

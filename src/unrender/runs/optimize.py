@@ -32,6 +32,7 @@ from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, descri
 from unrender.runs.notebook_progress import NotebookProgress
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
+from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, terminate_if_told
 
@@ -147,6 +148,7 @@ def assemble_hooks(
         MeshWatch(),
         Budget(),
         Refinement(),
+        MeshRefinement(),
         *folder,
         CallbackHook(callbacks),
     ]

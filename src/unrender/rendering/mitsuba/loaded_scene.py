@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import itertools
 import weakref
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,10 +20,12 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
+from unrender.rendering.renderer import ReplacedMesh
 
 __all__ = ["LoadedScene", "loaded_scenes"]
 
@@ -88,6 +91,7 @@ class LoadedScene:
     Args:
         description: what to load.
         moving: ids of shapes that move; the spheres among them become meshes.
+        replaced: {id of a shape: what its mesh is to be}.
 
     Attributes:
         scene: as Mitsuba has it.
@@ -97,12 +101,18 @@ class LoadedScene:
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
 
-    def __init__(self, description: SceneDescription, moving: AbstractSet[str] = frozenset()):
+    def __init__(
+        self,
+        description: SceneDescription,
+        moving: AbstractSet[str] = frozenset(),
+        replaced: Mapping[str, ReplacedMesh] | None = None,
+    ):
         self.scene, self.source = load_resolved(description)
         self._shared = is_loaded(description)
         self.meshed: list[str] = []
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
+        replace_meshes(self.scene, replaced or {})
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}

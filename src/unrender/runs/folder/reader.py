@@ -106,9 +106,11 @@ def read(directory: str | Path) -> RunFolder:
         {k: e for k, wanted in known.items() if (e := root_mean_square(of[k], wanted)) is not None}
         for of in (initial, parameters)
     )
-    meshes = meshes_in(_optional(path / schema.MESHES, path), parameters, path / schema.MESHES)
-    for errors, of in ((before, initial), (after, parameters)):
-        errors.update({key: e for key, mesh in meshes.items() if (e := _surface_error(of[key], mesh)) is not None})
+    meshes = meshes_in(_optional(path / schema.MESHES, path), parameters, initial, path / schema.MESHES)
+    for key, mesh in meshes.items():
+        for errors, values, faces in ((before, initial, mesh.first_faces), (after, parameters, mesh.faces)):
+            if (error := _surface_error(values[key], faces, mesh.truth)) is not None:
+                errors[key] = error
     views = pictures_by_view(_optional(path / schema.PICTURES, path), path / schema.PICTURES)
     told = {
         k: x
@@ -151,12 +153,12 @@ def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
         return float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64)))
 
 
-def _surface_error(values: np.ndarray, mesh: RunMesh) -> float | None:
+def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None) -> float | None:
     """The distance of a mesh from its true surface; None where there is none, or the mesh is no surface."""
-    if mesh.truth is None:
+    if truth is None:
         return None
     try:
-        return surface_error(Surface(values.reshape(-1, 3), mesh.faces), mesh.truth)
+        return surface_error(Surface(values.reshape(-1, 3), faces), truth)
     except (InputError, ValueError):
         return None
 

@@ -162,7 +162,7 @@ class RunWriter(Hook):
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
-        self._guarded("meshes", lambda: write_files(self.folder, self.problem, result.parameters))
+        self._guarded("meshes", lambda: write_files(self.folder, descent.run.problem, result.parameters))
         return result
 
     def on_error(self, descent: Descent, error: BaseException) -> None:
@@ -195,6 +195,8 @@ class RunWriter(Hook):
     def write_checkpoint(self, descent: Descent, result: Result | None = None) -> None:
         """Write a checkpoint after the last step, and `result`, by default what has been reached so far; once per step."""
         result = result or descent.result()
+        if descent.run.problem.remeshed_from is not None:
+            return  # the last one is from before: a resumed run remeshes once more, to the same mesh
         if result.steps == self._written_step and not self._checkpoint_at_once:
             return
         started = time.perf_counter()
