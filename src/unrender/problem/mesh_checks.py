@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,11 @@ from unrender.evaluation.surfaces import Surface
 from unrender.problem import mesh_regularizer, remeshing
 from unrender.problem.errors import FieldError
 from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.parameter import Parameter
 from unrender.problem.remeshing import Remeshing
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["check_regularizer", "check_remeshing", "check_surfaces", "faces_of"]
+__all__ = ["check_regularizer", "check_remeshings", "check_surfaces", "faces_of"]
 
 
 def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
@@ -27,12 +28,31 @@ def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
     return regularizer.on_mesh(*info.mesh())
 
 
-def check_remeshing(given: Any, info: ParameterInfo, uv: np.ndarray | None) -> Remeshing:
-    """When a mesh gets other triangles, of what was given. Raises `InputError` where it does not suit the mesh."""
-    found = remeshing.of(given)
-    if info.mesh is None:
-        raise InputError("expected none: it is of the vertex positions of a mesh")
-    found.check(*info.mesh(), uv)
+def check_remeshings(
+    parameters: Sequence[Parameter],
+    known: Mapping[str, ParameterInfo],
+    texture_coordinates: Callable[[str], np.ndarray | None],
+) -> dict[str, Remeshing]:
+    """{key: when its mesh gets other triangles} of the parameters that say so. Raises `FieldError` where it does not suit the mesh.
+
+    Args:
+        parameters: of a problem.
+        known: what the renderer says of them.
+        texture_coordinates: of a mesh, by the key of its vertex positions; None where it has none.
+    """
+    found = {}
+    for index, parameter in enumerate(parameters):
+        if parameter.remeshing is None:
+            continue
+        key = parameter.key
+        try:
+            if (mesh := known[key].mesh) is None:
+                raise InputError("expected none: it is of the vertex positions of a mesh")
+            found[key] = remeshing.of(parameter.remeshing)
+            found[key].check(*mesh(), texture_coordinates(key))
+        except InputError as error:
+            place = ("parameters", index, "remeshing")
+            raise FieldError(place, str(error), f"parameter {key}: remeshing") from error
     return found
 
 

@@ -23,10 +23,9 @@ from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
-from unrender.problem.mesh_checks import check_remeshing, check_surfaces, faces_of
+from unrender.problem.mesh_checks import check_remeshings, check_surfaces, faces_of
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
-from unrender.problem.remeshing import Remeshing
 from unrender.problem.validation import (
     Bounds,
     CheckedParameter,
@@ -98,6 +97,8 @@ class Problem:
         InputError: in one line, which field is wrong and what was expected.
     """
 
+    remeshed_from: Problem | None = None
+
     @exclusive("Problem")
     def __init__(
         self,
@@ -153,22 +154,12 @@ class Problem:
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
         self.surfaces = dict(surfaces or {})
         check_surfaces(self.surfaces, self.faces)
-        self.remeshings: dict[str, Remeshing] = {}
-        for index, parameter in enumerate(self.parameters):
-            if parameter.remeshing is not None:
-                key = parameter.key
-                uv = self.texture_coordinates(key) if key in self.faces else None
-                try:
-                    self.remeshings[key] = check_remeshing(parameter.remeshing, known[key], uv)
-                except InputError as error:
-                    place = ("parameters", index, "remeshing")
-                    raise FieldError(place, str(error), f"parameter {key}: remeshing") from error
+        self.remeshings = check_remeshings(self.parameters, known, self.texture_coordinates)
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
         self._as_given: Problem | None = None
-        self.remeshed_from: Problem | None = None
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
