@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,9 +15,12 @@ from unrender.evaluation.surfaces import Surface, folds, surface_error
 from unrender.gallery import blobs, meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.preconditioners import LargeSteps, Sobolev
-from unrender.problem.mesh_checks import check_regularizer, check_surfaces
+from unrender.problem import remeshing
+from unrender.problem.mesh_checks import check_regularizer, check_surfaces, mesh_notices
 from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.remeshing import Remeshing
 from unrender.runs.mesh_guard import guarded
+from unrender.runs.mesh_watch import MeshWatch
 
 POINTS, FACES = meshes.icosphere(2)
 COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)
@@ -153,3 +157,89 @@ def test_blobs_are_closed_and_face_outward() -> None:
     assert 4 / 3 * np.pi * 0.06 < volume < 4 / 3 * np.pi * 0.068
     depth = parts[0].depth(np.array([[0, 0, 0.4], [0, 0, 0.41], [0.0, 0, 0.38]]))
     np.testing.assert_allclose(depth, [0, -0.01, 0.02], atol=1e-3)
+
+
+def test_subdivision_keeps_surface_seams_and_texture_coordinates() -> None:
+    found = Remeshing((5,), "subdivide").apply(POINTS[COPY], CUT, COORDINATES)
+    assert (len(found.faces), len(found.vertices)) == (4 * len(CUT), len(COPY) + len(_edges(CUT)))
+    assert found.uv is not None
+    np.testing.assert_array_equal(found.vertices[: len(COPY)], POINTS[COPY])
+    assert surface_error(Surface(found.vertices, found.faces), Surface(POINTS, FACES)) < 1e-7
+    volume = [
+        np.sum(v[f[:, 0]] * np.cross(v[f[:, 1]], v[f[:, 2]]))
+        for v, f in ((POINTS, FACES), (found.vertices, found.faces))
+    ]
+    assert volume[0] == pytest.approx(volume[1])  # and which side is out
+    corners = COORDINATES[CUT].mean(axis=1)  # of the triangle in the middle of each, which comes last
+    np.testing.assert_allclose(found.uv[found.faces[3 * len(CUT) :]].mean(axis=1), corners, atol=1e-12)
+    _, places = np.unique(found.vertices, axis=0, return_inverse=True)
+    uncut = Remeshing((5,), "subdivide").apply(POINTS, FACES, None)
+    assert places.max() + 1 == len(uncut.vertices)  # the seam stays closed
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    return np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+
+
+def test_even_triangles_on_the_same_surface() -> None:
+    pytest.importorskip("gpytoolbox", reason="needs gpytoolbox: pip install 'unrender[remesh]'")
+    stretched = POINTS * [1.0, 0.5, 1.7]
+    found = Remeshing((5,), edge=0.6).apply(stretched[COPY], CUT, None)
+    lengths = [
+        np.linalg.norm(np.diff(v[_edges(f)], axis=1)[:, 0], axis=1)
+        for v, f in ((stretched, FACES), (found.vertices, found.faces))
+    ]
+    assert lengths[1].mean() == pytest.approx(0.6 * lengths[0].mean(), rel=0.15)
+    assert np.std(lengths[1]) / lengths[1].mean() < 0.6 * np.std(lengths[0]) / lengths[0].mean()
+    assert surface_error(Surface(found.vertices, found.faces), Surface(stretched, FACES)) < 0.01
+    open_ = Remeshing((5,)).apply(POINTS, FACES[POINTS[FACES].mean(axis=1)[:, 1] > 0], None)
+    assert len(open_.faces) > 400
+
+
+def test_remeshing_that_does_not_suit_is_one_line() -> None:
+    fin = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], 80]]])
+    for faces, uv, message in ((fin, None, "no manifold: 1 of"), (CUT, COORDINATES, "subdivide. keeps them")):
+        with pytest.raises(ur.InputError, match=message):
+            Remeshing((5,)).check(POINTS[COPY] if uv is not None else POINTS, faces, uv)
+        Remeshing((5,), "subdivide").check(POINTS, faces, uv)
+    for wrong, message in (
+        ((0,), "at least 1"),
+        ((9, 3), "ascend"),
+        ({"steps": [3], "edge": 0}, "edge must be"),
+        ("3", "expected steps"),
+    ):
+        with pytest.raises(ur.InputError, match=message):
+            remeshing.of(wrong)
+    with pytest.raises(ur.InputError, match=r"would make \d+ faces"):
+        Remeshing((5,), edge=1e-5).apply(POINTS, FACES, None) if _has_gpytoolbox() else remeshing._check_size(1 << 22)
+
+
+def _has_gpytoolbox() -> bool:
+    return importlib.util.find_spec("gpytoolbox") is not None
+
+
+def test_unusual_meshes_have_a_line() -> None:
+    assert mesh_notices("ball.vertex_positions", POINTS[COPY], CUT) == []
+    assert mesh_notices("ball.vertex_positions", POINTS, FACES[:40]) == []  # open
+    fin = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], 80]], [[0, 0, 1], [3, 4, 3]]])
+    (line,) = mesh_notices("ball.vertex_positions", POINTS, fin)
+    assert line.endswith(
+        "its mesh has 1 edges of more than two faces and 2 triangles without area, which count as borders"
+    )
+
+
+def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
+    key = "ball.vertex_positions"
+    problem = SimpleNamespace(faces={key: FACES}, initial_values=lambda: {key: POINTS.reshape(-1)})
+    crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
+    run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
+    descent, watch = SimpleNamespace(run=run), MeshWatch()
+    for size in (0.0, 1.0, 0.0, 0.0):
+        watch.on_update(descent, Estimate(0.0, {key: np.full(POINTS.size, size)}), True)  # type: ignore
+    assert run.warnings == [
+        f"step 3: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"
+    ]
+    (line,) = watch.warnings(descent)  # type: ignore
+    assert "the mesh folds over at" in line
+    run.parameters[key] = 2 * POINTS.reshape(-1)
+    assert watch.warnings(descent) == []  # type: ignore

@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.evaluation.surfaces import Surface
+from unrender.evaluation.surfaces import Surface, area_normals
 from unrender.problem import mesh_regularizer, remeshing
 from unrender.problem.errors import FieldError
 from unrender.problem.mesh_regularizer import MeshRegularizer
@@ -17,7 +17,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.remeshing import Remeshing
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["check_regularizer", "check_remeshings", "check_surfaces", "faces_of"]
+__all__ = ["check_regularizer", "check_remeshings", "check_surfaces", "mesh_notices"]
 
 
 def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
@@ -56,10 +56,17 @@ def check_remeshings(
     return found
 
 
-def faces_of(info: ParameterInfo) -> np.ndarray:
-    """(F, 3) of the mesh whose vertex positions a parameter holds."""
-    assert info.mesh is not None
-    return np.asarray(info.mesh()[1]).astype(np.int64).reshape(-1, 3)
+def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str]:
+    """A line on what is unusual about the mesh of vertex positions: edges of more than two faces, and triangles without area; none where
+    nothing is. Positions as loaded, (V, 3), faces (F, 3)."""
+    _, places = np.unique(positions, axis=0, return_inverse=True)
+    joined = places.reshape(-1)[faces]
+    flat = np.linalg.norm(area_normals(positions.astype(np.float64), faces), axis=1) == 0
+    sides = np.sort(joined[~flat][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    crowded = int(np.sum(np.unique(sides, axis=0, return_counts=True)[1] > 2)) if len(sides) else 0
+    words = [f"{crowded} edges of more than two faces"] if crowded else []
+    words += [f"{int(flat.sum())} triangles without area"] if flat.any() else []
+    return [f"parameter {key}: its mesh has {' and '.join(words)}, which count as borders"] if words else []
 
 
 def check_surfaces(surfaces: Mapping[str, Surface], faces: Mapping[str, np.ndarray]) -> None:

@@ -23,7 +23,7 @@ from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
-from unrender.problem.mesh_checks import check_remeshings, check_surfaces, faces_of
+from unrender.problem.mesh_checks import check_remeshings, check_surfaces, mesh_notices
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.validation import (
@@ -141,17 +141,16 @@ class Problem:
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
         self.coordinates = Coordinates(transforms, self.preconditioners)
         self._initial = {key: found.initial for key, found in checked.items()}
-        self.faces = {key: faces_of(known[key]) for key in checked if known[key].mesh is not None}
+        meshes = {key: mesh() for key in checked if (mesh := known[key].mesh) is not None}
+        self.faces = {key: np.asarray(faces).astype(np.int64).reshape(-1, 3) for key, (_, faces) in meshes.items()}
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
+        self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
         self.views = tuple(view for view, _ in read)
         self.notices += [notice for _, notices in read for notice in notices]
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
-        self.truth: dict[str, np.ndarray] = {}
-        for key, value in (truth or {}).items():
-            self.truth[key], notice = check_truth(key, value, self.shapes())
-            self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        self.truth = self._checked_truth(truth or {})
         self.surfaces = dict(surfaces or {})
         check_surfaces(self.surfaces, self.faces)
         self.remeshings = check_remeshings(self.parameters, known, self.texture_coordinates)
@@ -160,6 +159,14 @@ class Problem:
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
         self._as_given: Problem | None = None
+
+    def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """True values as arrays; adds to the notices."""
+        found: dict[str, np.ndarray] = {}
+        for key, value in given.items():
+            found[key], notice = check_truth(key, value, self.shapes())
+            self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        return found
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:

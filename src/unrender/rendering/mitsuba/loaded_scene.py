@@ -6,10 +6,11 @@ every loaded scene, and forward differentiation must find no other one attached:
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import itertools
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
@@ -162,7 +163,8 @@ class LoadedScene:
         if any(key in self.poses for key in changed):
             self.poses.write(self.parameters, self._posed)
         elif changed:
-            self.parameters.update()
+            with _without_warnings():
+                self.parameters.update()
         if changed and self._shared:
             plain = [key for key in self._settings if key not in self.poses]
             self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
@@ -233,6 +235,17 @@ class LoadedScene:
 
     def _spend(self) -> None:
         self._settings = {key: replace(setting, spent=True) for key, setting in self._settings.items()}
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Mitsuba describes each mesh that is no manifold whenever its vertices are set; problems have a line for it."""
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _index(value: Any) -> tuple[int, ...]:
