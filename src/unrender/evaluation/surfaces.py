@@ -14,7 +14,7 @@ __all__ = ["Surface", "area_normals", "folds", "surface_error"]
 
 _SAMPLES = 2000
 """Points on each surface."""
-_NEAR = 4
+_NEAR = 8
 """Candidates for the nearest triangle."""
 _SHARP = -0.5
 """Cosine of the angle between the normals of two faces that share an edge, below which the surface folds over there."""
