@@ -36,8 +36,11 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
-_MESH_SHARE, _MESH_STRENGTH = 1.0, 19.0
-"""First steps of vertices, as a share of the mesh's radius, over `learning_rate`; and λ of their large steps, as in Nicolet et al. 2021."""
+_MESH_SHARE = 1.0
+"""First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
+_VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
+"""λ of the large steps of vertices is their number over 128, within limits: steps are smooth over the same share of any mesh, since √λ is a
+number of edges. 19 or so for some 2500, as in Nicolet et al. 2021."""
 _MESH_HALVING, _MESH_FLOOR = 200.0, 0.1
 """Steps after which the rate of vertices is half of what it was, and the least share of the first one."""
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
@@ -145,7 +148,7 @@ class AutoMethod(Options):
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             *parameterised(problem),
-            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_MESH_STRENGTH:g}" if meshes else "",
+            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}" if meshes else "",
             f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
@@ -154,7 +157,7 @@ class AutoMethod(Options):
         if meshes:
             rate = min(rates[key] for key in meshes)
             descent = Adam(rate, schedule=Exponential(_MESH_HALVING, _MESH_FLOOR), uniform=True)
-            optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_MESH_STRENGTH))
+            optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_strength(problem)))
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
     def _of_cameras(self, problem: Problem) -> Choice:
@@ -260,6 +263,12 @@ def _logarithms(problem: Problem) -> dict[str, str]:
         and (value.ndim == _TEXTURE or (value.ndim <= 1 and value.size <= _MOST_NUMBERS))
         and (value > low + _MOST_MARGINS * MARGIN).all()
     }
+
+
+def _strength(problem: Problem) -> float:
+    """λ of the large steps of the smallest mesh."""
+    fewest = min(problem.initial_values()[key].size // 3 for key in problem.faces)
+    return float(np.clip(fewest / _VERTICES_PER_STRENGTH, *_STRENGTHS))
 
 
 def _radius(positions: np.ndarray) -> float:

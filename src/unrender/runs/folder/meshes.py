@@ -42,8 +42,10 @@ class RunMesh:
 def arrays_of(problem: Problem, before: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """What meshes.npz holds: {"KEY/faces": (F, 3), "KEY/true_vertices": (W, 3), "KEY/true_faces": (G, 3)}; and "KEY/first_faces", those of
     `before`, of meshes that have other faces now, and "KEY/uv" (V, 2) where these have texture coordinates."""
-    found = {f"{key}/{_FACES}": faces.astype(np.int32) for key, faces in problem.faces.items()}
-    for key in problem.faces if before else ():
+    found: dict[str, np.ndarray] = {f"{key}/{_FACES}": x.astype(np.int32) for key, x in problem.faces.items()}
+    for key in problem.faces:
+        if before is None:
+            break
         first = before.get(f"{key}/{_FIRST}", before[f"{key}/{_FACES}"])
         if not np.array_equal(first, found[f"{key}/{_FACES}"]):
             found[f"{key}/{_FIRST}"] = first
