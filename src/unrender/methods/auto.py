@@ -148,7 +148,9 @@ class AutoMethod(Options):
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             *parameterised(problem),
-            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}" if meshes else "",
+            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}"
+            if meshes
+            else "",
             f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)

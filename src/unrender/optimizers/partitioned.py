@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from unrender.core.errors import InputError
@@ -11,6 +11,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
+from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Choosing, Optimizer, Reparameterising
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.upsampling import Upsampler, restarted, upsampled
@@ -48,9 +49,9 @@ class Partitioned:
         preconditioner: of those of `keys` that have none of their own; None for none.
     """
 
-    keys: tuple[str, ...]
-    optimizer: Optimizer
-    others: Optimizer
+    keys: tuple[str, ...] = ()
+    optimizer: Optimizer = field(default_factory=lambda: Adam(uniform=True))
+    others: Optimizer = field(default_factory=Adam)
     preconditioner: Preconditioner | None = None
 
     def __post_init__(self):
