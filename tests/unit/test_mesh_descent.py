@@ -10,10 +10,12 @@ import pytest
 
 import unrender as ur
 from unrender.core import tables
+from unrender.core.random import Key
 from unrender.estimators.base import Estimate
 from unrender.evaluation.surfaces import Surface, folds, surface_error
 from unrender.gallery import blobs, meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
+from unrender.pixels import Views
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.problem import remeshing
 from unrender.problem.mesh_checks import check_regularizer, check_surfaces, mesh_notices
@@ -243,3 +245,28 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     assert "the mesh folds over at" in line
     run.parameters[key] = 2 * POINTS.reshape(-1)
     assert watch.warnings(descent) == []  # type: ignore
+
+
+def test_whole_views_are_drawn_evenly() -> None:
+    shapes = [(2, 3), (4, 4), (1, 5), (3, 3), (2, 2)]
+    problem = SimpleNamespace(
+        views=[SimpleNamespace(reference=np.zeros((*shape, 3))) for shape in shapes],
+        renderer=SimpleNamespace(array=lambda values: values),
+    )
+    seen = np.zeros(5)
+    for step in range(400):
+        sample = Views(2).redraw(problem, None, Key(0, step)).sample  # type: ignore
+        assert sample is not None
+        chosen, counts = np.unique(sample.views, return_counts=True)
+        assert len(chosen) == 2
+        for view, count in zip(chosen, counts, strict=True):
+            assert count == np.prod(shapes[view])
+            np.testing.assert_array_equal(np.asarray(sample.pixels)[np.asarray(sample.views) == view], np.arange(count))
+        assert (np.asarray(sample.weights) == 2.5).all()  # 1 / probability
+        seen[chosen] += 1
+    error = np.sqrt(400 * 0.4 * 0.6)
+    assert np.abs(seen - 160).max() < 4 * error
+    whole = Views(9).redraw(problem, None, Key(0, 0)).sample  # type: ignore
+    assert whole is not None
+    assert len(np.unique(whole.views)) == 5
+    assert (np.asarray(whole.weights) == 1).all()

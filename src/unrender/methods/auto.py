@@ -43,6 +43,8 @@ _VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
 number of edges. 19 or so for some 2500, as in Nicolet et al. 2021."""
 _MESH_HALVING, _MESH_FLOOR = 200.0, 0.1
 """Steps after which the rate of vertices is half of what it was, and the least share of the first one."""
+_MANY_VIEWS, _MOST_VIEWS = 4, 8
+"""Of meshes: from how many views on a step takes half of them, and how many at most."""
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
 """An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
 product, and the extinction, whose range is open, has further to go."""
@@ -195,7 +197,10 @@ class AutoMethod(Options):
         """The pixels of a step, and why they are not all."""
         if self.pixels is not None:
             return pixels.Uniform(self.pixels), ""
-        count = problem.pixels
+        count, views = problem.pixels, len(problem.views)
+        if problem.faces and problem.loss.pixelwise and views >= _MANY_VIEWS and count <= _MOST_PIXELS:
+            taken = min(-(-views // 2), _MOST_VIEWS)
+            return pixels.Views(taken), f"{taken} of {views} views a step: moving borders cost each view alike"
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
         drawn = _MOST_PIXELS // 2

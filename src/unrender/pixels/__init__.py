@@ -4,5 +4,6 @@ from unrender.pixels.adaptive import Adaptive
 from unrender.pixels.all import All
 from unrender.pixels.loss_proportional import LossProportional
 from unrender.pixels.uniform import Uniform
+from unrender.pixels.views import Views
 
-__all__ = ["Adaptive", "All", "LossProportional", "Uniform"]
+__all__ = ["Adaptive", "All", "LossProportional", "Uniform", "Views"]
