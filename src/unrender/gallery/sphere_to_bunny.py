@@ -83,11 +83,12 @@ class SphereToBunny:
     def _stage(self) -> dict[str, Any]:
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
         heights = np.where(np.arange(self.views) % 2 == 0, 0.4, 2.0)
+        fov = 44.0 if self.mesh else 36.0  # a file may fill all of its box
         return {
             "type": "scene",
             **{
                 f"camera_{number}": parts.camera(
-                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 36.0, self.resolution
+                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), fov, self.resolution
                 )
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
