@@ -17,7 +17,15 @@ from unrender.gallery import meshes
 from unrender.problem.problem import Problem
 
 RUNS, SPP = 24, 32
-RENDERED = [name for name in ur.gallery.names() if name not in ("exponential", "quad", "nerf-volume")]
+LEFT_OUT = (
+    "exponential",
+    "quad",
+    "nerf-volume",
+    "sphere-to-bunny",
+    "shadow-art",
+    "statue",
+)  # the last three as sphere-to-mesh
+RENDERED = [name for name in ur.gallery.names() if name not in LEFT_OUT]
 
 
 def elsewhere(problem: Problem, share: float = 0.2) -> dict[str, np.ndarray]:

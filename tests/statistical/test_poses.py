@@ -99,7 +99,9 @@ def test_a_pose_beside_other_parameters() -> None:
     session = renderer.prepare(["ball.translation", key], None, derivatives=False)
     states = {"ball.translation": np.array([[0, 0, 0], [0, -0.5, 0.0]]), key: np.array([0.1, 0.5])}
     both = [session.image_batch(states, SampleRequest(0, SPP, run)).numpy() for run in range(RUNS)]
-    copied, shared = ({**states, key: of(np.array(0.3), 2)} for of in (np.repeat, lambda x, n: np.broadcast_to(x, (n,))))
+    copied, shared = (
+        {**states, key: of(np.array(0.3), 2)} for of in (np.repeat, lambda x, n: np.broadcast_to(x, (n,)))
+    )
     images = [session.image_batch(each, SampleRequest(0, SPP, 5)).numpy() for each in (copied, shared)]
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
     for index, (place, alpha) in enumerate((((-0.45, 0.3, 0.2), 0.1), ((-0.45, -0.2, 0.2), 0.5))):

@@ -105,7 +105,7 @@ def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
 
 
 def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
-    known: Any = SimpleNamespace(coordinates=SimpleNamespace(transforms={}))
+    known: Any = SimpleNamespace(coordinates=SimpleNamespace(transforms={}), faces={})
     fog, haze = "fog.interior_medium.{}.data", "haze.interior_medium.{}.data"
     found = {fog.format("albedo"): 0.6, fog.format("sigma_t"): 2.0, haze.format("albedo"): 0.6}
     known.initial_values = lambda: {key: np.full((2, 2, 2, 1), value) for key, value in found.items()}

@@ -124,7 +124,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         where = " where masks count" if any(view.mask is not None for view in problem.views) else ""
         table.add_row("image error", f"{first} before, {last} after (root mean square{where}, noise removed)")
     start = problem.parameter_error(result.initial)
-    for key, error in problem.parameter_error(result.parameters).items():
+    last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
+    for key, error in (last | problem.parameter_error(result.parameters)).items():
         table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")

@@ -21,7 +21,7 @@ from unrender.estimators.capabilities import (
 from unrender.parameterisations.base import Transform
 from unrender.problem.problem import Problem
 
-__all__ = ["by_coordinates"]
+__all__ = ["by_coordinates", "regularized"]
 
 
 def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
@@ -44,6 +44,20 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     gradient = coordinates.pull_back(estimate.gradient, slopes)
     capabilities = tuple(converted(capability) for capability in estimate.capabilities)
     return replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
+
+
+def regularized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
+    """The estimate of the loss with the terms of `Problem.regularizers` added, which have no noise; itself where there are none."""
+    if not problem.regularizers:
+        return estimate
+    loss, added = estimate.loss, {}
+    for key, regularizer in problem.regularizers.items():
+        value, gradient = regularizer.evaluate(arrays.numpy(parameters[key]))
+        loss, added[key] = loss + value, arrays.like(gradient.astype(np.float32), estimate.gradient[key])
+    if estimate.preconditioned:
+        added = problem.coordinates.pull_back(added, problem.coordinates.slopes(parameters))
+    total = {key: g + added[key] if key in added else g for key, g in estimate.gradient.items()}
+    return replace(estimate, loss=loss, gradient=total)
 
 
 def _second_order(

@@ -8,6 +8,7 @@ import numpy as np
 
 from unrender.exporting import textures
 from unrender.exporting.asset import Asset, Part
+from unrender.io import mesh_writing
 
 __all__ = ["write_obj", "write_ply"]
 
@@ -23,11 +24,11 @@ def write_obj(asset: Asset, folder: Path) -> None:
     for part in asset.parts:
         counts = [len(part.vertices), 0 if part.uv is None else len(part.uv)]
         counts.append(0 if part.normals is None else len(part.normals))
-        lines += [f"o {part.name}", *_rows("v", part.vertices)]
+        lines += [f"o {part.name}", *mesh_writing.rows("v", part.vertices)]
         if part.uv is not None:
-            lines += _rows("vt", _upwards(part.uv))
+            lines += mesh_writing.rows("vt", mesh_writing.upwards(part.uv))
         if part.normals is not None:
-            lines += _rows("vn", part.normals)
+            lines += mesh_writing.rows("vn", part.normals)
         lines += [f"usemtl {part.name}", *_faces(part, first)]
         first += counts
         materials += _material(part, folder)
@@ -38,26 +39,9 @@ def write_obj(asset: Asset, folder: Path) -> None:
 def write_ply(asset: Asset, folder: Path) -> None:
     """NAME.ply for each part, binary, with normals and s, t where it has them, and its maps as PNG files."""
     for part in asset.parts:
-        columns = [("xyz", part.vertices)]
-        columns += [] if part.normals is None else [(("nx", "ny", "nz"), part.normals)]
-        columns += [] if part.uv is None else [(("s", "t"), _upwards(part.uv))]
-        names = [name for group, _ in columns for name in group]
-        table = np.concatenate([values for _, values in columns], 1).astype("<f4")
-        faces = np.empty(len(part.faces), [("count", "u1"), ("corners", "<i4", 3)])
-        faces["count"], faces["corners"] = 3, part.faces
-        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-        lines += [f"property float {name}" for name in names]
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-        (folder / f"{part.name}.ply").write_bytes("\n".join(lines).encode() + table.tobytes() + faces.tobytes())
+        content = mesh_writing.ply(part.vertices, part.faces, part.normals, part.uv)
+        (folder / f"{part.name}.ply").write_bytes(content)
         _maps(part, folder)
-
-
-def _upwards(uv: np.ndarray) -> np.ndarray:
-    return np.stack([uv[:, 0], 1 - uv[:, 1]], 1)
-
-
-def _rows(kind: str, values: np.ndarray) -> list[str]:
-    return [f"{kind} " + " ".join(f"{x:.9g}" for x in row) for row in values.tolist()]
 
 
 def _faces(part: Part, first: np.ndarray) -> list[str]:

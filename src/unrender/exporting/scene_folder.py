@@ -29,6 +29,7 @@ from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
+from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
@@ -44,6 +45,7 @@ _FOLDERS = {
 _OF_SCENE = {SCENE, *_FOLDERS.values(), "files"}
 _OWN = {maps.RECORD, maps.TABLE, maps.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
+_POSITIONS = "vertex_positions"
 _ROUNDING = 1e-4
 
 
@@ -126,7 +128,13 @@ def _opened(
     if Path(what).suffix.lower() == ".toml":
         problem = Problem.from_file(what)
         return problem, problem.initial_values()
-    return reopen.problem_of(what), folders.read(what).parameters
+    problem, run = reopen.problem_of(what), folders.read(what)
+    remeshed = {
+        key: ReplacedMesh(run.parameters[key].reshape(-1, 3), mesh.faces, mesh.uv)
+        for key, mesh in run.meshes.items()
+        if key in problem.faces and not np.array_equal(mesh.faces, problem.faces[key])
+    }
+    return problem.remeshed(remeshed) if remeshed else problem, run.parameters
 
 
 def _write(
@@ -171,6 +179,11 @@ def _fill(
     if deformed := next((key for key in own if key not in places), None):
         raise InputError(f"parameter {deformed} cannot be exported: the scene has a sphere there, without vertices")
     for key, value in own.items():
+        if (mesh := renderer.pair.replaced.get(key.rpartition(".")[0])) is not None and key.endswith(_POSITIONS):
+            name = places[key].key.removesuffix(_POSITIONS)
+            graph.live[f"{name}faces"] = mi.UInt32(mesh.faces.ravel().astype(np.uint32))
+            if mesh.uv is not None:
+                graph.live[f"{name}vertex_texcoords"] = mi.Float(mesh.uv.ravel().astype(np.float32))
         live = graph.live[places[key].key]
         graph.live[places[key].key] = from_tensor(renderer.array(value), live)
     graph.live.update()

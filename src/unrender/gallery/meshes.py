@@ -9,9 +9,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.evaluation.surfaces import Surface
 from unrender.rendering.mitsuba.described import load_described
 
-__all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "sweep", "triangles"]
+__all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "surface", "sweep", "triangles", "unrolled"]
 
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
@@ -75,19 +76,29 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def triangles(name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any]) -> Any:
-    """A smooth mesh of triangles without texture coordinates, whose normals follow its vertices when these move.
+def triangles(
+    name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
+) -> Any:
+    """A smooth mesh of triangles, whose normals follow its vertices when these move.
 
     Args:
         name: the mesh's id.
         positions: (V, 3).
         faces: (F, 3), vertex numbers, counter-clockwise seen from outside.
         bsdf: its material.
+        coordinates: (V, 2), of a texture; None for none.
 
     Returns:
         `mitsuba.Mesh` with normals; an entry of a scene dictionary.
     """
-    return _mesh(name, positions, faces, bsdf)
+    return _mesh(name, positions, faces, bsdf, coordinates)
+
+
+def surface(mesh: Any) -> Surface:
+    """That of a loaded mesh."""
+    found: Any = mi.traverse(mesh)
+    vertices = np.array(found["vertex_positions"]).reshape(-1, 3)
+    return Surface(vertices, np.array(found["faces"]).reshape(-1, 3))
 
 
 def _mesh(
@@ -180,6 +191,30 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         a, b, c = faces.T
         faces = np.concatenate([np.stack(t, -1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     return points, faces
+
+
+def unrolled(directions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A sphere of triangles with texture coordinates by longitude and latitude, cut along the seam at -z and at the poles.
+
+    Args:
+        directions: (V, 3), unit, as of `icosphere`.
+        faces: (F, 3).
+
+    Returns:
+        of which direction each vertex is a copy (W,), faces (F, 3) of these vertices, and their coordinates (W, 2): u grows with the
+        longitude, past 1 at the seam, v with the latitude.
+    """
+    x, y, z = directions.T
+    u, v = np.arctan2(x, z) / (2 * np.pi) + 0.5, 0.5 + np.arcsin(np.clip(y, -1, 1)) / np.pi
+    corners = u[faces]
+    corners = np.where((np.ptp(corners, axis=1) > 0.5)[:, None] & (corners < 0.5), corners + 1, corners)
+    at_pole = np.abs(y[faces]) > 1 - 1e-9
+    beside = np.sum(np.where(at_pole, 0, corners), axis=1) / np.maximum(np.sum(~at_pole, axis=1), 1)
+    corners = np.where(at_pole, beside[:, None], corners)
+    table = np.concatenate([faces.reshape(-1, 1), np.round(corners.reshape(-1, 1), 9)], axis=1)
+    kept, which = np.unique(table, axis=0, return_inverse=True)
+    of = kept[:, 0].astype(np.int64)
+    return of, which.reshape(-1, 3), np.stack([kept[:, 1], v[of]], -1)
 
 
 def _normals(positions: np.ndarray, closed: bool) -> np.ndarray:

@@ -25,9 +25,10 @@ from unrender.methods.base import Choice, Options, method, parameterised
 from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
-from unrender.preconditioners import Sobolev, grid
+from unrender.preconditioners import LargeSteps, Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
@@ -40,8 +41,15 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
-_VERTICES, _VERTEX_SHARE = "vertex_positions", 0.03
-"""Positions are as large as the mesh, but a mesh does not survive steps of a tenth of that."""
+_MESH_SHARE = 1.0
+"""First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
+_VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
+"""λ of the large steps of vertices is their number over 128, within limits: steps are smooth over the same share of any mesh, since √λ is a
+number of edges. 19 or so for some 2500, as in Nicolet et al. 2021."""
+_MESH_HALVING, _MESH_FLOOR = 200.0, 0.1
+"""Steps after which the rate of vertices is half of what it was, and the least share of the first one."""
+_MANY_VIEWS, _MOST_VIEWS = 4, 8
+"""Of meshes: from how many views on a step takes half of them, and how many at most."""
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
 """An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
 product, and the extinction, whose range is open, has further to go."""
@@ -85,9 +93,9 @@ class AutoMethod(Options):
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
     memory, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the vertices of
-    meshes move along Sobolev gradients, parameters by steps in proportion to their range. Where path gradients do not reach a parameter,
-    as of a pose, it moves by perturbed renders, beside path gradients of the others (`hybrid`), or `smoothed` where there are no others;
-    cameras alone move along path gradients. Every choice can be set.
+    meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in proportion
+    to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path gradients of
+    the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -155,7 +163,8 @@ class AutoMethod(Options):
         """By path gradients; `given`: first rates that are known already."""
         given = given or {}
         sampler, drawn = self._sampler(problem)
-        image = self._image(problem, isinstance(sampler, pixels.All))
+        meshes = tuple(problem.faces)
+        image = self._image(problem, isinstance(sampler, pixels.All), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = _logarithms(problem) if self.parameterise else {}
         moved = {key: name for key, name in moved.items() if key not in given}
@@ -166,8 +175,8 @@ class AutoMethod(Options):
             if k in problem.coordinates.transforms
         }
         rates = {**_rates(problem, self.learning_rate), **given}
-        optimizer = ScheduleFree(
-            {"*": self.learning_rate, **rates},
+        optimizer: Optimizer = ScheduleFree(
+            {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
             preconditioner=Sobolev() if smoothed else None,
             preconditioned=smoothed,
             parameterisations=moved,
@@ -182,11 +191,18 @@ class AutoMethod(Options):
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
             *parameterised(problem),
-            f"schedule-free Adam, first rate {first}",
+            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}"
+            if meshes
+            else "",
+            f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
         fresh_from = _FRESH_FROM if smoothed and remembers else 0
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
+        if meshes:
+            rate = min(rates[key] for key in meshes)
+            descent = Adam(rate, schedule=Exponential(_MESH_HALVING, _MESH_FLOOR), uniform=True)
+            optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_strength(problem)))
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
     def _of_cameras(self, problem: Problem) -> Choice:
@@ -200,9 +216,11 @@ class AutoMethod(Options):
         descent = Adam(rate, beta_2=0.99, schedule=Exponential(30, 0.01))
         return Choice(PathGradient(image, sampler, spp), descent, tuple(filter(None, (reason, drawn))))
 
-    def _image(self, problem: Problem, whole: bool) -> _Image:
+    def _image(self, problem: Problem, whole: bool, deforms: bool) -> _Image:
         if self.image == "plain":
             return _Image("plain", Plain(), "as asked for")
+        if self.image is None and deforms:
+            return _Image("plain", Plain(), "a mesh moves, and no path serves two of its shapes")
         if self.image is None and not whole:
             return _Image("plain", Plain(), "control variates need whole views")
         if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:
@@ -218,7 +236,10 @@ class AutoMethod(Options):
         """The pixels of a step, and why they are not all."""
         if self.pixels is not None:
             return pixels.Uniform(self.pixels), ""
-        count = problem.pixels
+        count, views = problem.pixels, len(problem.views)
+        if problem.faces and problem.loss.pixelwise and views >= _MANY_VIEWS and count <= _MOST_PIXELS:
+            taken = min(-(-views // 2), _MOST_VIEWS)
+            return pixels.Views(taken), f"{taken} of {views} views a step: moving borders cost each view alike"
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
         drawn = _MOST_PIXELS // 2
@@ -312,6 +333,18 @@ def _logarithms(problem: Problem) -> dict[str, str]:
     }
 
 
+def _strength(problem: Problem) -> float:
+    """λ of the large steps of the smallest mesh."""
+    fewest = min(problem.initial_values()[key].size // 3 for key in problem.faces)
+    return float(np.clip(fewest / _VERTICES_PER_STRENGTH, *_STRENGTHS))
+
+
+def _radius(positions: np.ndarray) -> float:
+    """The root mean square distance of vertices (3 V,) from their mean, 1 where it is 0."""
+    vertices = positions.reshape(-1, 3).astype(np.float64)
+    return float(np.sqrt(np.mean(np.sum(np.square(vertices - vertices.mean(axis=0)), axis=1)))) or 1.0
+
+
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
     values, or the share itself where they are 0; over the number of unknown textures of its material, which all answer the same residuals
@@ -325,8 +358,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = high - low
         else:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
-        if key.endswith(_VERTICES):
-            size *= _VERTEX_SHARE
+        if key in problem.faces:
+            size = _MESH_SHARE * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
         size /= maps[_owner(key)] if key.endswith(_TEXELS) and value.ndim == _TEXTURE else 1

@@ -9,6 +9,7 @@ from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.optimizers.newton import Newton
 from unrender.optimizers.newton_cg import NewtonCG
+from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.prodigy import Prodigy
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.optimizers.sgd import SGD
@@ -23,6 +24,7 @@ __all__ = [
     "Newton",
     "NewtonCG",
     "Optimizer",
+    "Partitioned",
     "Prodigy",
     "ScheduleFree",
     "schedules",

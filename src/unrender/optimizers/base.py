@@ -8,9 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
+from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Choosing", "OnMeshes", "Optimizer", "Reparameterising"]
+__all__ = ["Choosing", "OnMeshes", "Optimizer", "Preconditioning", "Reparameterising"]
 
 
 class Optimizer(Protocol):
@@ -49,6 +50,16 @@ class OnMeshes(Protocol):
 
     def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Optimizer:
         """The same, given the mesh of a parameter's key; None for what has none."""
+        ...
+
+
+@runtime_checkable
+class Preconditioning(Protocol):
+    """An optimizer that has preconditioners for parameters without one of their own."""
+
+    @property
+    def preconditioners(self) -> Mapping[str, Preconditioner]:
+        """{key: preconditioner}; keys of parameters that have their own are left out."""
         ...
 
 

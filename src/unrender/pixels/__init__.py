@@ -5,5 +5,6 @@ from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.loss_proportional import LossProportional
 from unrender.pixels.uniform import Uniform
+from unrender.pixels.views import Views
 
-__all__ = ["Adaptive", "AdaptiveCounts", "All", "LossProportional", "Uniform"]
+__all__ = ["Adaptive", "AdaptiveCounts", "All", "LossProportional", "Uniform", "Views"]

@@ -12,7 +12,7 @@ from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.io import resampling
 
-__all__ = ["NEVER", "CoarseToFine", "of"]
+__all__ = ["NEVER", "CoarseToFine", "checked_steps", "of"]
 
 NEVER = 1 << 40
 """A step that no run comes to: `CoarseToFine((NEVER,), 4)` is four times as coarse throughout."""
@@ -45,13 +45,7 @@ class CoarseToFine:
     states: Literal["estimator", "carry", "reset"] = "estimator"
 
     def __post_init__(self):
-        steps = tuple(self.steps) if isinstance(self.steps, (list, tuple)) else ()
-        whole = all(type(step) is int and step >= 1 for step in steps)
-        if not steps or not whole or list(steps) != sorted(set(steps)):
-            raise InputError(
-                f"CoarseToFine: steps must be whole numbers of at least 1 that ascend, such as [200, 400], got {self.steps!r}"
-            )
-        object.__setattr__(self, "steps", steps)
+        object.__setattr__(self, "steps", checked_steps("CoarseToFine", self.steps))
         checks.integer("CoarseToFine", "factor", self.factor, at_least=2)
         wrap = tuple(self.wrap) if isinstance(self.wrap, (list, tuple)) else self.wrap
         object.__setattr__(self, "wrap", wrap)
@@ -86,6 +80,15 @@ class CoarseToFine:
         """Values at a coarser resolution, at that of `shape`. Linear in the values."""
         wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (values.ndim - 1)
         return resampling.upsample(values, shape[:-1], wrap)
+
+
+def checked_steps(owner: str, given: Any) -> tuple[int, ...]:
+    """Steps before which something changes. Raises `InputError` for what are none."""
+    steps = tuple(given) if isinstance(given, (list, tuple)) else ()
+    if not steps or not all(type(step) is int and step >= 1 for step in steps) or list(steps) != sorted(set(steps)):
+        what = "whole numbers of at least 1 that ascend, such as [200, 400]"
+        raise InputError(f"{owner}: steps must be {what}, got {given!r:.80}")
+    return steps
 
 
 def of(given: Any) -> CoarseToFine:

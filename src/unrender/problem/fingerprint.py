@@ -67,6 +67,10 @@ def _take(problem: Problem) -> dict[str, str]:
         found[f"parameter {key}: preconditioner"] = repr(problem.preconditioners.get(key))
         if key in problem.parameterisations:
             found[f"parameter {key}: parameterisation"] = repr(problem.parameterisations[key])
+        if key in problem.regularizers:
+            found[f"parameter {key}: regularizer"] = repr(problem.regularizers[key])
+        if key in problem.remeshings:
+            found[f"parameter {key}: remeshing"] = repr(problem.remeshings[key])
         if key in problem.coarse_to_fine:
             found[f"parameter {key}: coarse_to_fine"] = repr(problem.coarse_to_fine[key])
     for index, view in enumerate(problem.views):

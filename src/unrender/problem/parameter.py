@@ -12,6 +12,8 @@ import numpy as np
 from unrender.parameterisations.base import Parameterisation
 from unrender.preconditioners.base import Preconditioner
 from unrender.problem.coarse_to_fine import CoarseToFine
+from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.remeshing import Remeshing
 
 __all__ = ["Parameter"]
 
@@ -33,6 +35,10 @@ class Parameter:
         parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`: what the
             optimizer moves in place of the values, and what the learning rate is of. Preconditioner and optimizer act on that; values,
             bounds and results are the parameter's own. None for the identity.
+        regularizer: of the vertex positions of a mesh, what is added to the loss: `MeshRegularizer`, or a table of its options such as
+            {"bilaplacian": 0.001}; None for nothing.
+        remeshing: of the vertex positions of a mesh, when it gets other triangles: `Remeshing`, its steps alone, or a table of its options
+            such as {"steps": [100], "method": "subdivide"}; None for never.
     """
 
     key: str
@@ -42,3 +48,5 @@ class Parameter:
     preconditioner: Preconditioner | None = None
     coarse_to_fine: CoarseToFine | Sequence[int] | None = None
     parameterisation: Parameterisation | str | Mapping[str, Any] | None = None
+    regularizer: MeshRegularizer | Mapping[str, Any] | None = None
+    remeshing: Remeshing | Sequence[int] | Mapping[str, Any] | None = None

@@ -13,14 +13,18 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
+from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.losses import L2, Loss
+from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
+from unrender.problem.mesh_checks import check_remeshings, check_surfaces, mesh_notices
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.validation import (
@@ -31,6 +35,7 @@ from unrender.problem.validation import (
     check_max_depth,
     check_parameter,
     check_parameterisation,
+    check_preconditioner,
     check_sequence,
     check_truth,
     check_view,
@@ -39,7 +44,7 @@ from unrender.problem.validation import (
 )
 from unrender.problem.view import View
 from unrender.rendering.exposure import EXPOSURE, ExposedRenderer, without_exposure
-from unrender.rendering.renderer import Renderer
+from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
 __all__ = ["Bounds", "Problem"]
 
@@ -62,6 +67,8 @@ class Problem:
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
         name: for people; None takes the scene file's.
+        surfaces: {key: `evaluation.surfaces.Surface`} of vertex positions whose true surface is known,
+            but not where on it a vertex belongs.
 
     Attributes:
         parameters: tuple of `Parameter`, as given.
@@ -77,14 +84,21 @@ class Problem:
         preconditioners: {key: preconditioner} of the parameters that have one.
         coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
         parameterisations: {key: parameterisation} of the parameters that were given one.
+        remeshings: {key: `Remeshing`} of the parameters that have one.
+        regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
+        surfaces: as given.
+        faces: {key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh.
+        remeshed_from: the problem with the meshes that it began with, where it has others now; else None.
         gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
 
     Raises:
         InputError: in one line, which field is wrong and what was expected.
     """
+
+    remeshed_from: Problem | None = None
 
     @exclusive("Problem")
     def __init__(
@@ -97,6 +111,7 @@ class Problem:
         *,
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
+        surfaces: Mapping[str, Surface] | None = None,
     ):
         self.max_depth = check_max_depth(max_depth)
         self.loss = check_loss(L2() if loss is None else loss)
@@ -123,24 +138,36 @@ class Problem:
         self.preconditioners = {k: p for k, found in checked.items() if (p := found.preconditioner) is not None}
         self.coarse_to_fine = {k: c for k, found in checked.items() if (c := found.coarse_to_fine) is not None}
         self.parameterisations = {k: p for k, found in checked.items() if (p := found.parameterisation) is not None}
+        self.regularizers = {k: r for k, found in checked.items() if (r := found.regularizer) is not None}
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
         self.coordinates = Coordinates(transforms, self.preconditioners)
         self._initial = {key: found.initial for key, found in checked.items()}
+        meshes = {key: mesh() for key in checked if (mesh := known[key].moving_mesh) is not None}
+        self.faces = {key: np.asarray(faces).astype(np.int64).reshape(-1, 3) for key, (_, faces) in meshes.items()}
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
+        self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
         read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
         self.views = tuple(view for view, _ in read)
         self.notices += [notice for _, notices in read for notice in notices]
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
-        self.truth: dict[str, np.ndarray] = {}
-        for key, value in (truth or {}).items():
-            self.truth[key], notice = check_truth(key, value, self.shapes())
-            self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        self.truth = self._checked_truth(truth or {})
+        self.surfaces = dict(surfaces or {})
+        check_surfaces(self.surfaces, self.faces)
+        self.remeshings = check_remeshings(self.parameters, known, self.texture_coordinates)
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
         self._as_given: Problem | None = None
+
+    def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """True values as arrays; adds to the notices."""
+        found: dict[str, np.ndarray] = {}
+        for key, value in given.items():
+            found[key], notice = check_truth(key, value, self.shapes())
+            self.notices += [f"parameter {key}: truth {notice}"] if notice else []
+        return found
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
@@ -177,6 +204,45 @@ class Problem:
         """Of the mesh at whose vertices a parameter has values, (n V,); None for textures, grids and numbers."""
         info = self.renderer.parameters()[key]
         return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
+
+    def preconditioned(self, given: Mapping[str, Preconditioner]) -> Problem:
+        """The same problem with these preconditioners for the parameters that have none of their own. Raises `InputError` for one that does
+        not suit."""
+        missing = {p.key: given[p.key] for p in self.parameters if p.key in given and p.preconditioner is None}
+        if not missing:
+            return self
+        found = copy.copy(self)
+        found._as_given = self.as_given
+        known = self.renderer.parameters()
+        found.preconditioners = self.preconditioners | {
+            k: check_preconditioner(k, p, known[k]) for k, p in missing.items()
+        }
+        found.parameters = tuple(
+            replace(p, preconditioner=missing[p.key]) if p.key in missing else p for p in self.parameters
+        )
+        found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
+        return found
+
+    def remeshed(self, meshes: Mapping[str, ReplacedMesh]) -> Problem:
+        """The same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
+
+        Raises `InputError` where the renderer has no meshes to replace.
+        """
+        if not isinstance(self.renderer, Remeshable):
+            raise InputError(f"{', '.join(meshes)}: this renderer's meshes keep their triangles")
+        given = [
+            replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
+            for p in self.parameters
+        ]
+        shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
+        renderer = self.renderer.with_meshes(shapes, [p.key for p in given])
+        truth = {key: value for key, value in self.truth.items() if key not in meshes}
+        made = Problem(
+            renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
+        )
+        made.origin, made.gatherer, made._as_given = self.origin, self.gatherer, self.as_given
+        made.remeshed_from = self.remeshed_from or self
+        return made
 
     def gathered_by(self, gatherer: Gatherer | None) -> Problem:
         """The same problem, its gradients computed by workers that its views are dealt to."""
@@ -267,10 +333,28 @@ class Problem:
         """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
 
+    def texture_coordinates(self, key: str) -> np.ndarray | None:
+        """(V, 2) of a mesh whose vertex positions are the parameter `key`; None where it has none."""
+        name = f"{key.rpartition('.')[0]}.vertex_texcoords"
+        if name not in self.renderer.parameters():
+            return None
+        found = arrays.numpy(self.renderer.values([name])[name]).reshape(-1, 2)
+        return found if len(found) == self._initial[key].size // 3 else None
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether any parameter's true value, or surface, is known."""
+        return bool(self.truth or self.surfaces)
+
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Root mean square error against the truth, for each key whose truth is known. Waits for the device."""
-        found = self.full({key: parameters[key] for key in self.truth})
-        return {
+        """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root
+        mean square distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
+        found = self.full({key: parameters[key] for key in (*self.truth, *self.surfaces)})
+        errors = {
             key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))
             for key, truth in self.truth.items()
         }
+        for key, surface in self.surfaces.items():
+            if found[key].size == self._initial[key].size:
+                errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)
+        return errors

@@ -79,6 +79,10 @@ def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Array
         table["parameterisation"] = _component(problem.parameterisations[parameter.key])
     if parameter.key in problem.coarse_to_fine:
         table["coarse_to_fine"] = tables.fields(problem.coarse_to_fine[parameter.key])
+    if parameter.key in problem.regularizers:
+        table["regularizer"] = tables.fields(problem.regularizers[parameter.key])
+    if parameter.key in problem.remeshings:
+        table["remeshing"] = tables.fields(problem.remeshings[parameter.key])
     if parameter.key in problem.truth:
         table |= store.field("truth", problem.truth[parameter.key], f"parameter{index}-truth")
     return table

@@ -64,6 +64,13 @@ class _Parameter(Table):
         None,
         description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
     )
+    regularizer: dict[str, Any] | None = Field(
+        None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
+    )
+    remeshing: list[StrictInt] | dict[str, Any] | None = Field(
+        None,
+        description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
+    )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
     )
@@ -141,7 +148,8 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
-    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, model.parameterisation)
+    given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
 
 
 def _value(value: Any, folder: Path) -> Any:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -24,6 +25,8 @@ from unrender.problem.bounds import project
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.errors import FieldError
 from unrender.problem.key_hints import instead_of, near_key
+from unrender.problem.mesh_checks import check_regularizer
+from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.parameter import Parameter
 from unrender.problem.view import View
 from unrender.rendering.renderer import ParameterInfo, Renderer
@@ -36,6 +39,7 @@ __all__ = [
     "check_max_depth",
     "check_parameter",
     "check_parameterisation",
+    "check_preconditioner",
     "check_sequence",
     "check_truth",
     "check_view",
@@ -82,6 +86,7 @@ class CheckedParameter:
         coarse_to_fine: None where its resolution is constant.
         parameterisation: None where none was given.
         transform: of that; None for the identity.
+        regularizer: bound to the mesh; None for none.
         initial: float32, inside the bounds, of the scene's shape.
         notices: one line for each change made to the input.
     """
@@ -93,6 +98,7 @@ class CheckedParameter:
     coarse_to_fine: CoarseToFine | None
     parameterisation: Parameterisation | None
     transform: Transform | None
+    regularizer: MeshRegularizer | None
     initial: np.ndarray
     notices: tuple[str, ...]
 
@@ -136,7 +142,55 @@ def check_parameter(
         known: the scene's parameters.
         renderer: gives the scene's own value where there is no initial one.
     """
-    key = parameter.key
+    key, info = parameter.key, _known(index, parameter.key, known)
+
+    @contextmanager
+    def checking(field: str) -> Iterator[None]:
+        try:
+            yield
+        except InputError as error:
+            raise FieldError(("parameters", index, field), str(error), f"parameter {key}: {field}") from error
+
+    with checking("bounds"):
+        bounds = _bounds(parameter.bounds, info)
+    rate = parameter.learning_rate
+    with checking("learning_rate"):
+        if rate is not None and (not _is_number(rate) or rate <= 0):
+            raise InputError(f"expected a number above 0, got {rate!r}")
+    preconditioner, parameterisation, transform, regularizer = None, None, None, None
+    with checking("preconditioner"):
+        if parameter.preconditioner is not None:
+            preconditioner = check_preconditioner(key, parameter.preconditioner, info)
+    with checking("coarse_to_fine"):
+        schedule = _coarse_to_fine(parameter, info)
+    with checking("initial"):
+        start, notice = _initial(parameter, info, renderer)
+    initial, clipped = _clip_to_bounds(start, bounds)
+    with checking("parameterisation"):
+        if parameter.parameterisation is not None:
+            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
+    with checking("regularizer"):
+        if parameter.regularizer is not None:
+            regularizer = check_regularizer(parameter.regularizer, info)
+    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
+    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
+    own_rate = None if rate is None else float(rate)
+    return CheckedParameter(
+        key,
+        bounds,
+        own_rate,
+        preconditioner,
+        schedule,
+        parameterisation,
+        transform,
+        regularizer,
+        initial,
+        tuple(notices),
+    )
+
+
+def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
+    """What the renderer says of a parameter. Raises `FieldError` for a key that it does not have, or cannot recover."""
     if not isinstance(key, str) or key not in known:
         raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
     if len(key) > _LONGEST_KEY:  # files are named by it
@@ -148,42 +202,7 @@ def check_parameter(
         raise FieldError(
             ("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}{instead_of(key, known)}"
         )
-
-    def wrong(field: str, what: str | Exception) -> FieldError:
-        return FieldError(("parameters", index, field), str(what), f"parameter {key}: {field}")
-
-    try:
-        bounds = _bounds(parameter.bounds, info)
-    except InputError as error:
-        raise wrong("bounds", error) from error
-    rate = parameter.learning_rate
-    if rate is not None and (not _is_number(rate) or rate <= 0):
-        raise wrong("learning_rate", f"expected a number above 0, got {rate!r}")
-    try:
-        preconditioner = _preconditioner(parameter, info)
-    except InputError as error:
-        raise wrong("preconditioner", error) from error
-    try:
-        schedule = _coarse_to_fine(parameter, info)
-    except InputError as error:
-        raise wrong("coarse_to_fine", error) from error
-    try:
-        start, notice = _initial(parameter, info, renderer)
-    except InputError as error:
-        raise wrong("initial", error) from error
-    initial, clipped = _clip_to_bounds(start, bounds)
-    try:
-        parameterisation, transform = None, None
-        if parameter.parameterisation is not None:
-            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
-    except InputError as error:
-        raise wrong("parameterisation", error) from error
-    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
-    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
-    own_rate = None if rate is None else float(rate)
-    return CheckedParameter(
-        key, bounds, own_rate, preconditioner, schedule, parameterisation, transform, initial, tuple(notices)
-    )
+    return info
 
 
 def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
@@ -206,18 +225,16 @@ def check_parameterisation(
     return made, made.transform(bounds, initial)
 
 
-def _preconditioner(parameter: Parameter, info: ParameterInfo) -> Preconditioner | None:
-    preconditioner = parameter.preconditioner
-    if preconditioner is None:
-        return None
+def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
+    """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     if isinstance(preconditioner, MeshPreconditioner) and info.mesh is not None:
         preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh(), info.welded))
     try:
-        preconditioner.check(parameter.key, info.shape)
+        preconditioner.check(key, info.shape)
     except InputError as error:
-        raise InputError(str(error).removeprefix(f"{parameter.key}: preconditioner ")) from error
+        raise InputError(str(error).removeprefix(f"{key}: preconditioner ")) from error
     return preconditioner
 
 

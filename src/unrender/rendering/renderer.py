@@ -20,9 +20,11 @@ __all__ = [
     "CountingSession",
     "LossWeights",
     "ParameterInfo",
+    "Remeshable",
     "RenderSession",
     "Renderer",
     "Rendering",
+    "ReplacedMesh",
     "SampleRequest",
     "Space",
     "StockLoop",
@@ -70,6 +72,11 @@ class ParameterInfo:
     viewpoint: bool = False
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
     welded: bool = False
+
+    @property
+    def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:
+        """`mesh`, where the values are its positions; else None."""
+        return self.mesh if self.welded else None
 
 
 @dataclass(frozen=True)
@@ -230,6 +237,30 @@ class StockLoop(Protocol):
             seeds: of the image and of the adjoint, in [0, 2**32).
             weigh: the derivative of the loss at the image.
         """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ReplacedMesh:
+    """What a shape is to be.
+
+    Attributes:
+        vertices: (V, 3).
+        faces: (F, 3), numbers of vertices.
+        uv: (V, 2) texture coordinates; None where the shape has none.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None = None
+
+
+@runtime_checkable
+class Remeshable(Protocol):
+    """A renderer whose meshes can be replaced."""
+
+    def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
+        """Another one, of the same scene with these meshes for shapes by their ids, for these keys of parameters."""
         ...
 
 

@@ -19,7 +19,7 @@ def charts(run: RunFolder, axis: str) -> list[Chart]:
     x = getattr(history, axis)
     end = float(x[-1]) if len(x) else 0.0
     loss, noise = curves.binned(x, history.loss), curves.binned(x, history.gradient_noise)
-    errors = [(key, s) for key in run.truth if (s := curves.parameter_error(run, key)) is not None]
+    errors = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     lines = [Line(key, getattr(s, axis), s.values, colour=i) for i, (key, s) in enumerate(errors)]
     found = [
         plots.chart("Parameter error (RMSE)", lines, axis, end),
@@ -34,7 +34,7 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
     ends = [float(getattr(run.history, axis)[-1]) for run in runs.values() if len(run.history)]
     if not ends:
         return []
-    keys = [key for run in runs.values() for key in run.truth]
+    keys = [key for run in runs.values() for key in run.known]
     single = len(set(keys)) == 1
     title = "Parameter error (RMSE)" if single else "Parameter error, relative to the start"
     errors = {label: _error(run, single) for label, run in runs.items()}
@@ -50,9 +50,9 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
 
 
 def _error(run: RunFolder, single: bool) -> Series | None:
-    if single and run.truth:
-        return curves.parameter_error(run, next(iter(run.truth)))
-    return curves.relative_error(run, list(run.truth))
+    if single and run.known:
+        return curves.parameter_error(run, run.known[0])
+    return curves.relative_error(run, run.known)
 
 
 def _binned(label: str, run: RunFolder, column: str, axis: str, colour: int) -> Line:

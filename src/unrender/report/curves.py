@@ -55,7 +55,7 @@ class Band:
 
 def parameter_error(run: RunFolder, key: str) -> Series | None:
     """A parameter's root mean square error from start to end of the run; None where its truth is unknown."""
-    if key not in run.truth:
+    if key not in run.known:
         return None
     history = run.history
     recorded = history.parameter_error.get(key)

@@ -161,7 +161,7 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
     ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
     end = ends["seconds"]
     first_run = groups[0].runs[0]
-    keys = [key for key in first_run.parameters if all(key in run.truth for group in groups for run in group.runs)]
+    keys = [key for key in first_run.parameters if all(key in run.known for group in groups for run in group.runs)]
     found = []
     if len(keys) > 1:
         found.append(

@@ -21,9 +21,9 @@ __all__ = ["environment", "facts", "flatten", "loader", "render", "source"]
 _SCRIPT = "viewer.js"
 
 
-def render(template: str, **context: Any) -> bytes:
-    """The page as UTF-8. Its content security policy lets no script run but the one of `viewer.js`."""
-    script = source(_SCRIPT)
+def render(template: str, more_script: str = "", **context: Any) -> bytes:
+    """The page as UTF-8. Its content security policy lets no script run but the one of `viewer.js`, and `more_script` after it."""
+    script = source(_SCRIPT) + (source(more_script) if more_script else "")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     page = _environment().get_template(template)

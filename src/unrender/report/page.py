@@ -7,13 +7,14 @@ from pathlib import Path
 
 from unrender.display import plots
 from unrender.io.files import write
-from unrender.report import convergence, html, image_metrics, panels, tables
+from unrender.report import convergence, html, image_metrics, panels, shapes, tables
 from unrender.runs.folder.reader import read
 
 __all__ = ["page"]
 
 _VIEWS = 8
 _MAPS = 24
+_SHAPES = 6
 
 
 def page(directory: str | Path, open_after: bool = False) -> Path:
@@ -32,6 +33,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
     run = read(directory)
     shown = dict(list(run.views.items())[:_VIEWS])
     maps = [key for key, value in run.parameters.items() if panels.is_map(value)]
+    shown_shapes = [shapes.panel(run, key) for key in list(run.meshes)[:_SHAPES]]
     content = html.render(
         "page.html",
         run=run,
@@ -43,6 +45,8 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         more_views=len(run.views) - len(shown),
         view_rows=tables.view_rows(run),
         measures=image_metrics.available()[1:],
+        shapes=shown_shapes,
+        more_script="shapes.js" if shown_shapes else "",
         maps=[panels.map_of_run(run, key) for key in maps[:_MAPS]],
         more_maps=max(0, len(maps) - _MAPS),
         rows=[tables.parameter_row(run, key) for key in run.parameters],

@@ -68,10 +68,10 @@ class ViewRow:
 def tiles(run: RunFolder) -> list[Tile]:
     """The head of a run's page."""
     found = []
-    series = [(key, s) for key in run.truth if (s := curves.parameter_error(run, key)) is not None]
+    series = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     if len(series) == 1:
         found.append(_tile("Parameter error", float(series[0][1].values[0]), float(series[0][1].values[-1]), "RMSE"))
-    elif (relative := curves.relative_error(run, list(run.truth))) is not None:
+    elif (relative := curves.relative_error(run, run.known)) is not None:
         found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
     after = curves.image_error(run)
     if (measured := _image_error(run)) is not None:

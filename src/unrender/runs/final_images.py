@@ -76,7 +76,8 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
             pictures[f"view{index}/reference"] = reference
             for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
                 name = image_name(index, which)
-                pictures[name], error = _picture(problem, values, index, samples, _SEEDS[which])
+                of = problem.remeshed_from or problem if which == "initial" else problem
+                pictures[name], error = _picture(of, values, index, samples, _SEEDS[which])
                 if error is not None:
                     errors[name] = error
                 advance((2 * index + done + 1) / (2 * len(problem.views)))

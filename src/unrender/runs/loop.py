@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from unrender.core import arrays, phases
+from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.coordinates import by_coordinates
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Reparameterising
+from unrender.estimators.coordinates import by_coordinates, regularized
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Preconditioning, Reparameterising
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
+from unrender.runs.mesh_guard import guarded
 from unrender.runs.metadata import RunMetadata
 from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
@@ -27,6 +29,8 @@ from unrender.runs.run import Run, RunState, interruptible, snapshot
 __all__ = ["Descent", "descend", "initialize", "prepare"]
 
 _ERRORS_PER_SECOND = 10.0
+_ERROR_PAUSE = 20.0
+"""Times what it took, before the parameters' error is measured again."""
 
 
 @dataclass
@@ -66,6 +70,7 @@ class Descent:
         for _ in range(2):
             key = Key(run.seed, 0, stream=1)
             found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
+            found = regularized(found, run.problem, run.parameters)
             update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
             run.parameters, state.optimizer = update.parameters, update.state
             state.noise.update(found.gradient, found.variance)
@@ -83,8 +88,14 @@ def prepare(
     """A run before its first step."""
     if problem.gatherer is not None:
         problem.gatherer.check(estimator)
+        if problem.remeshings:
+            raise InputError(
+                f"{next(iter(problem.remeshings))}: remeshing: meshes of dealt runs keep their triangles: leave it out"
+            )
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
+    if isinstance(optimizer, Preconditioning):
+        problem = problem.preconditioned(optimizer.preconditioners)
     if isinstance(optimizer, OnMeshes):
         optimizer = optimizer.on_meshes(problem.topology)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
@@ -148,11 +159,13 @@ def _step(
     problem = run.problem
     started = time.perf_counter()
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
+    estimate = regularized(estimate, problem, run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:
         update = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
         culprit = update.not_finite
         if not culprit:
+            _warn_of_shortened(run, update.shortened)
             run.parameters, state.optimizer, state.estimator = update.parameters, update.state, after
     finite = not culprit
     if culprit:
@@ -172,9 +185,10 @@ def _step(
         "samples": state.samples,
         "gradient_noise": state.noise.update(estimate.gradient, estimate.variance) if finite else None,
     }
-    if problem.truth and (run.stopped or run.clock >= state.next_error):
+    if problem.has_truth and (run.stopped or run.clock >= state.next_error):
+        measured = time.perf_counter()
         record["parameter_error"] = problem.parameter_error(run.parameters)
-        state.next_error = run.clock + 1 / _ERRORS_PER_SECOND
+        state.next_error = run.clock + max(1 / _ERRORS_PER_SECOND, _ERROR_PAUSE * (time.perf_counter() - measured))
     return record
 
 
@@ -196,11 +210,20 @@ def _warn_of_skipping(run: Run, culprit: str) -> None:
         run.warnings.append(f"step {run.step}: {line}")
 
 
+def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
+    """Warn of steps of meshes that are shortened, once for each."""
+    for key in keys:
+        line = f"{key}: triangles would have turned over; such steps are shortened"
+        if not any(known.endswith(line) for known in run.warnings):
+            run.warnings.append(f"step {run.step}: {line}")
+
+
 @dataclass(frozen=True)
 class _Update:
     """What an optimizer makes of an estimate.
 
     Attributes:
+        shortened: meshes whose triangles would have turned over.
         parameters, state: after it.
         not_finite: what of it is not finite, "" for nothing; it is then not to be applied.
     """
@@ -208,6 +231,7 @@ class _Update:
     parameters: Tree
     state: Any
     not_finite: str
+    shortened: tuple[str, ...] = ()
 
 
 def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
@@ -221,4 +245,13 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     # Before they are bounded: the nearest point to what is no number may be a bound.
     broken = next((key for key, value in moved.items() if not arrays.all_finite(value)), "")
     culprit = f"the optimizer's step for {broken} (from its own state, or the preconditioner)" if broken else ""
-    return _Update(bounded, state, culprit)
+    if culprit:
+        return _Update(bounded, state, culprit)
+    shortened = []
+    for key, faces in problem.faces.items():
+        wanted = arrays.numpy(bounded[key])
+        allowed = guarded(arrays.numpy(parameters[key]), wanted, faces)
+        if allowed is not wanted:
+            bounded[key] = arrays.like(allowed, bounded[key])
+            shortened.append(key)
+    return _Update(bounded, state, "", tuple(shortened))

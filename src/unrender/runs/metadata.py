@@ -12,6 +12,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.estimators.base import Estimator
 from unrender.problem.fingerprint import fingerprint
+from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 
@@ -109,6 +110,7 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
             **({} if problem.gatherer is None else {"workers": problem.gatherer.variant}),
         },
         "truth": problem.truth,
+        "meshes": arrays_of(problem),
     }
 
 

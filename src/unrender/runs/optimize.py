@@ -27,10 +27,12 @@ from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import CallbackHook, Hook
 from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
+from unrender.runs.mesh_watch import MeshWatch
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
 from unrender.runs.notebook_progress import NotebookProgress
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
+from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, terminate_if_told
 
@@ -140,7 +142,16 @@ def assemble_hooks(
 
     `earlier` is the seconds of phases before the run.
     """
-    return [PhaseTimes(earlier), InfluenceWatch(), Budget(), Refinement(), *folder, CallbackHook(callbacks)]
+    return [
+        PhaseTimes(earlier),
+        InfluenceWatch(),
+        MeshWatch(),
+        Budget(),
+        Refinement(),
+        MeshRefinement(),
+        *folder,
+        CallbackHook(callbacks),
+    ]
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:

@@ -64,6 +64,8 @@ class Result:
             of squares over all pixels and channels, see `unrender.sensitivity`; {} of runs without a run folder, and where path
             gradients do not reach the parameters. Where it is small, the images tell nothing.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
+        meshes: {"KEY/faces": (F, 3), ...} of the parameters that are vertex positions, and the true surfaces, "KEY/true_vertices" and
+            "KEY/true_faces", where they are known.
     """
 
     parameters: dict[str, np.ndarray]
@@ -89,6 +91,7 @@ class Result:
     image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     sensitivity: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
+    meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         from unrender.runs import notebook
@@ -130,7 +133,7 @@ class Result:
         try:
             files.make_folder(folder)
             archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
-            others = {schema.PICTURES: self.pictures, schema.SENSITIVITY: self.sensitivity}
+            others = {schema.PICTURES: self.pictures, schema.SENSITIVITY: self.sensitivity, schema.MESHES: self.meshes}
             for name, values in {**archives, **others}.items():
                 if values or name in (schema.PARAMETERS, schema.INITIAL):
                     files.write_arrays(folder / name, values, name_too=False)

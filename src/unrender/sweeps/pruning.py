@@ -109,7 +109,7 @@ class Pruning(Callback):
     def on_start(self, run: Run) -> None:
         """See `Callback.on_start`."""
         problem = run.problem
-        self._initial = problem.parameter_error(problem.start(0)) if problem.truth else {}
+        self._initial = problem.parameter_error(problem.start(0)) if problem.has_truth else {}
         self._errors = {}
         if run.step:  # resumed
             self._errors = {share: error for share, error in read_rungs(self._path).items() if share <= run.progress()}
@@ -129,7 +129,7 @@ class Pruning(Callback):
 
     def _measure(self, run: Run) -> float:
         problem = run.problem
-        if problem.truth:
+        if problem.has_truth:
             return _finite(_combined(problem.parameter_error(run.parameters), self._initial))
         return _finite(_picture_error(problem, run.full()))
 

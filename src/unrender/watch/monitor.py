@@ -20,7 +20,16 @@ from unrender.runs.folder.schema import HISTORY, LIVE, LIVE_STATUS, RECORD, Live
 
 __all__ = ["RunMonitor", "Snapshot"]
 
-_FILES = (RECORD, HISTORY, schema.PARAMETERS, schema.INITIAL, schema.TRUTH, schema.PICTURES, schema.SENSITIVITY)
+_FILES = (
+    RECORD,
+    HISTORY,
+    schema.PARAMETERS,
+    schema.INITIAL,
+    schema.TRUTH,
+    schema.PICTURES,
+    schema.SENSITIVITY,
+    schema.MESHES,
+)
 _LIVE_FILES = (LIVE_STATUS, schema.LIVE_START, schema.LIVE_VIEWS, *_FILES)
 
 WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"
@@ -134,8 +143,8 @@ class RunMonitor:
             initial,
             {key: value for key, value in truth.items() if key in parameters},
             self._try(problems, lambda: _views(start, views, live)) or {},
-            {key: error for key, error in status.initial_error.items() if key in truth},
-            {key: float(of.values[-1]) for key, of in history.parameter_error.items() if key in truth},
+            {key: error for key, error in status.initial_error.items() if key in parameters},
+            {key: float(of.values[-1]) for key, of in history.parameter_error.items() if key in parameters},
             {key: tuple(shape) for key, shape in status.shapes.items()},
         )
 

@@ -6,9 +6,11 @@ every loaded scene, and forward differentiation must find no other one attached:
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import itertools
 import weakref
+from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,10 +21,12 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
+from unrender.rendering.renderer import ReplacedMesh
 
 __all__ = ["LoadedScene", "detach_all", "loaded_scenes"]
 
@@ -97,6 +101,7 @@ class LoadedScene:
     Args:
         description: what to load.
         moving: ids of shapes that move; the spheres among them become meshes.
+        replaced: {id of a shape: what its mesh is to be}.
 
     Attributes:
         scene: as Mitsuba has it.
@@ -106,12 +111,18 @@ class LoadedScene:
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
 
-    def __init__(self, description: SceneDescription, moving: AbstractSet[str] = frozenset()):
+    def __init__(
+        self,
+        description: SceneDescription,
+        moving: AbstractSet[str] = frozenset(),
+        replaced: Mapping[str, ReplacedMesh] | None = None,
+    ):
         self.scene, self.source = load_resolved(description)
         self._shared = is_loaded(description)
         self.meshed: list[str] = []
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
+        replace_meshes(self.scene, replaced or {})
         _make_distributions(self.scene)
         self.parameters: mi.SceneParameters = mi.traverse(self.scene)
         self.leaves: dict[str, Any] = {}
@@ -162,7 +173,8 @@ class LoadedScene:
         if any(key in self.poses for key in changed):
             self.poses.write(self.parameters, self._posed)
         elif changed:
-            self.parameters.update()
+            with _without_warnings():
+                self.parameters.update()
         if changed and self._shared:
             plain = [key for key in self._settings if key not in self.poses]
             self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
@@ -245,6 +257,17 @@ def _make_distributions(scene: mi.Scene) -> None:
     for emitter in scene.emitters():
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
             dr.eval(emitter.sample_direction(somewhere, mi.Point2f(0.5)))
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Mitsuba describes each mesh that is no manifold whenever its vertices are set; problems have a line for it."""
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _index(value: Any) -> tuple[int, ...]:

@@ -20,7 +20,7 @@ from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import ParameterInfo, Space, differentiated
+from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, Space, differentiated
 
 __all__ = ["MitsubaRenderer"]
 
@@ -33,6 +33,7 @@ class MitsubaRenderer:
             only: no pairs.
         max_depth: longest path in segments, >= 1.
         keys: parameters that will be asked for, if known. Spheres that these move become meshes, so that path gradients reach them.
+        replaced: {id of a shape: `ReplacedMesh`}, what its mesh is to be in place of the description's.
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
     vertex positions (3 V,). Geometry moves through Mitsuba's `prb` kernel, whose gradient leaves out visibility; where meshes move, by
@@ -45,9 +46,15 @@ class MitsubaRenderer:
     Raises `InputError` where Mitsuba refuses the description.
     """
 
-    def __init__(self, description: SceneDescription, max_depth: int = 6, keys: Iterable[str] = ()):
+    def __init__(
+        self,
+        description: SceneDescription,
+        max_depth: int = 6,
+        keys: Iterable[str] = (),
+        replaced: Mapping[str, ReplacedMesh] | None = None,
+    ):
         self.max_depth = max_depth
-        self.pair = ScenePair(description, moving_targets(keys))
+        self.pair = ScenePair(description, moving_targets(keys), replaced)
         self.notices = (
             *ignored.notices(self.pair.current, self.pair.loaded().source, max_depth),
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
@@ -106,8 +113,14 @@ class MitsubaRenderer:
             )
         return self._sessions[names, wanted]
 
+    def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
+        """See `Remeshable`."""
+        return MitsubaRenderer(self.pair.description, self.max_depth, keys, self.pair.replaced | dict(meshes))
+
     def stock(self) -> StockSession:
         """See `StockRenderer.stock`."""
+        if self.pair.replaced:
+            raise InputError("method stock: a mesh has other triangles than the scene's own")
         if self._stock is None:
             self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.max_depth)
         return self._stock

@@ -27,7 +27,7 @@ from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
-from unrender.rendering.renderer import ParameterInfo
+from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
 
 __all__ = ["SINGLE", "ScenePair"]
 
@@ -44,6 +44,7 @@ class ScenePair:
     Args:
         description: what to load.
         moving: ids of shapes that move; the spheres among them become meshes.
+        replaced: {id of a shape: what its mesh is to be}; not of a scene that the user has loaded.
 
     Attributes:
         single: whether there is one state only, since the scene was loaded by the user.
@@ -51,10 +52,17 @@ class ScenePair:
         resolutions: (height, width) of each sensor's film, after cropping.
     """
 
-    def __init__(self, description: SceneDescription, moving: AbstractSet[str] = frozenset()):
-        self.description, self.moving = description, moving
+    def __init__(
+        self,
+        description: SceneDescription,
+        moving: AbstractSet[str] = frozenset(),
+        replaced: Mapping[str, ReplacedMesh] | None = None,
+    ):
+        self.description, self.moving, self.replaced = description, moving, dict(replaced or {})
         self.single = is_loaded(description)
-        self._current = LoadedScene(description, moving)
+        if self.single and self.replaced:
+            raise InputError("a scene that was loaded before keeps its meshes: give the .xml file or the dictionary")
+        self._current = LoadedScene(description, moving, self.replaced)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
         known = self.volumetric and not self.single
@@ -75,12 +83,12 @@ class ScenePair:
         if self.single:
             raise InputError(SINGLE)
         if self._previous is None:
-            self._previous = LoadedScene(self.description, self.moving)
+            self._previous = LoadedScene(self.description, self.moving, self.replaced)
         return self._previous
 
     def as_described(self) -> LoadedScene:
         """The first load or, where spheres of it have become meshes, one in which they are spheres."""
-        return LoadedScene(self.description) if self._current.meshed else self._current
+        return LoadedScene(self.description, replaced=self.replaced) if self._current.meshed else self._current
 
     @property
     def current(self) -> mi.Scene:

@@ -14,9 +14,11 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import printable
+from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.io import bounded_files
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import History, HistoryReader
+from unrender.runs.folder.meshes import RunMesh, meshes_in
 from unrender.runs.folder.schema import RunRecord
 
 __all__ = [
@@ -56,6 +58,7 @@ class RunFolder:
         views: {view index: pictures}, ascending; empty where the run saved none.
         error_before, error_after: {key: root mean square error} at the start and at the end, where they are known.
         sensitivity: see `Result.sensitivity`; {} where the run saved none.
+        meshes: {key: `meshes.RunMesh`} of the parameters that are vertex positions.
         shapes: {key: shape} of parameters whose arrays here are smaller than those of the run.
     """
 
@@ -70,6 +73,12 @@ class RunFolder:
     error_after: dict[str, float] = field(default_factory=dict)
     shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
     sensitivity: dict[str, np.ndarray] = field(default_factory=dict)
+    meshes: dict[str, RunMesh] = field(default_factory=dict)
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Keys of parameters whose error is known: those with a truth, and meshes with a true surface."""
+        return (*self.truth, *(key for key in self.error_before if key not in self.truth))
 
     def shape(self, key: str) -> tuple[int, ...]:
         """Of a parameter, as it is in the run."""
@@ -97,13 +106,18 @@ def read(directory: str | Path) -> RunFolder:
         {k: e for k, wanted in known.items() if (e := root_mean_square(of[k], wanted)) is not None}
         for of in (initial, parameters)
     )
+    meshes = meshes_in(_optional(path / schema.MESHES, path), parameters, initial, path / schema.MESHES)
+    for key, mesh in meshes.items():
+        for errors, values, faces in ((before, initial, mesh.first_faces), (after, parameters, mesh.faces)):
+            if (error := _surface_error(values[key], faces, mesh.truth)) is not None:
+                errors[key] = error
     views = pictures_by_view(_optional(path / schema.PICTURES, path), path / schema.PICTURES)
     told = {
         k: x
         for k, x in _optional(path / schema.SENSITIVITY, path).items()
         if k in parameters and x.shape == parameters[k].shape
     }
-    return RunFolder(path, record, history, parameters, initial, known, views, before, after, sensitivity=told)
+    return RunFolder(path, record, history, parameters, initial, known, views, before, after, {}, told, meshes)
 
 
 def read_run_record(folder: Path) -> RunRecord:
@@ -137,6 +151,16 @@ def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64)))
+
+
+def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None) -> float | None:
+    """The distance of a mesh from its true surface; None where there is none, or the mesh is no surface."""
+    if truth is None:
+        return None
+    try:
+        return surface_error(Surface(values.reshape(-1, 3), faces), truth)
+    except (InputError, ValueError):
+        return None
 
 
 def pictures_by_view(arrays: dict[str, np.ndarray], path: Path) -> dict[int, ViewPictures]:

@@ -11,6 +11,7 @@ A run writes what these models say, and `reader` checks what it reads against th
 | `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the first, the true values where they are known |
 | `pictures.npz` | {"view0/reference": (H, W, 3), ...}, see `PICTURE_NAME` |
 | `sensitivity.npz` | {key: array}: see `Result.sensitivity` |
+| `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the meshes that were recovered |
 | `checkpoints/00000050/` | `state.safetensors` and `manifest.json`, see `Manifest` |
 | `live/` | what a run looks like now, see `live.Live`; `status.json` is a `LiveStatus` |
 | `control.json` | {"command": one of `COMMANDS`} |
@@ -47,7 +48,7 @@ __all__ = [
 
 RECORD, METHOD, HISTORY, LOCK, CONTROL = "run.json", "method.toml", "history.jsonl", "lock", "control.json"
 PARAMETERS, INITIAL, TRUTH, PICTURES = "parameters.npz", "initial.npz", "truth.npz", "pictures.npz"
-SENSITIVITY = "sensitivity.npz"
+SENSITIVITY, MESHES = "sensitivity.npz", "meshes.npz"
 REPORT = "report.html"
 CHECKPOINTS, STATE, MANIFEST = "checkpoints", "state.safetensors", "manifest.json"
 LIVE, LIVE_STATUS, LIVE_START, LIVE_VIEWS = "live", "status.json", "start.npz", "views.npz"

@@ -28,11 +28,14 @@ from unrender.runs.final_images import render_final_images
 from unrender.runs.folder import checkpoint
 from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
+from unrender.runs.folder.meshes import FOLDER as MESH_FILES
+from unrender.runs.folder.meshes import write_files
 from unrender.runs.folder.schema import (
     CONTROL,
     HISTORY,
     INITIAL,
     LIVE,
+    MESHES,
     METHOD,
     PARAMETERS,
     PICTURES,
@@ -51,7 +54,7 @@ if TYPE_CHECKING:
 __all__ = ["RunWriter"]
 
 _FILES = (
-    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY),
+    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES),
     *(REPORT, CONTROL),
 )
 _STEPS, _MOST_SECONDS = 50, 60.0
@@ -159,6 +162,7 @@ class RunWriter(Hook):
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
+        self._guarded("meshes", lambda: write_files(self.folder, descent.run.problem, result.parameters))
         return result
 
     def on_error(self, descent: Descent, error: BaseException) -> None:
@@ -191,6 +195,8 @@ class RunWriter(Hook):
     def write_checkpoint(self, descent: Descent, result: Result | None = None) -> None:
         """Write a checkpoint after the last step, and `result`, by default what has been reached so far; once per step."""
         result = result or descent.result()
+        if descent.run.problem.remeshed_from is not None:
+            return  # the last one is from before: a resumed run remeshes once more, to the same mesh
         if result.steps == self._written_step and not self._checkpoint_at_once:
             return
         started = time.perf_counter()
@@ -220,8 +226,9 @@ class RunWriter(Hook):
         serialization.save(self.problem, self.folder)
         files.write(self.folder / METHOD, _method_text(self.method), name_too=False)
         files.write_arrays(self.folder / INITIAL, result.initial, name_too=False)
-        if result.truth:
-            files.write_arrays(self.folder / TRUTH, result.truth, name_too=False)
+        for name, values in ((TRUTH, result.truth), (MESHES, result.meshes)):
+            if values:
+                files.write_arrays(self.folder / name, values, name_too=False)
         files.write_arrays(self.folder / PARAMETERS, result.parameters, name_too=False)
         self._history.rewrite(result.history, name_too=False)
         files.sync_folder(self.folder)
@@ -295,7 +302,7 @@ def _clear(folder: Path) -> None:
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     checkpoint.clear(folder)
-    for name in (serialization.ARRAYS, LIVE):
+    for name in (serialization.ARRAYS, LIVE, MESH_FILES):
         place = folder / name
         if place.is_dir() and not place.is_symlink() and not os.path.ismount(place):
             shutil.rmtree(place, ignore_errors=True)
@@ -304,6 +311,6 @@ def _clear(folder: Path) -> None:
 def _sweep(folder: Path) -> None:
     """Remove what processes that died left half-written: runs, reports, and exports to where they go by default."""
     files.remove_leftovers(folder, (*_FILES, _EXPORT))
-    for name in (serialization.ARRAYS, LIVE):
+    for name in (serialization.ARRAYS, LIVE, MESH_FILES):
         files.remove_leftovers(folder / name)
     checkpoint.remove_partial(folder)

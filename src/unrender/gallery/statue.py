@@ -1,0 +1,119 @@
+"""`statue`: the shape of a bust and the texture on it, together, from pictures all around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.core.registry import register
+from unrender.gallery import fields, meshes, parts, staging, textures
+from unrender.gallery.specification import reference
+from unrender.losses import L2, Loss
+from unrender.problem.parameter import Parameter
+from unrender.problem.problem import Problem
+from unrender.problem.view import View
+from unrender.rendering.mitsuba.scene_loading import load
+
+__all__ = ["Statue"]
+
+_RADIUS = 0.68
+_FINE = 5
+"""Subdivisions of the true mesh."""
+_PROFILE = (
+    *((-1.0, 0.0), (-0.97, 0.4), (-0.6, 0.66), (-0.38, 0.68), (-0.2, 0.34), (-0.05, 0.21)),
+    *((0.1, 0.24), (0.3, 0.35), (0.55, 0.38), (0.78, 0.31), (0.95, 0.14), (1.0, 0.0)),
+)
+"""Heights and radii, from the foot to the crown."""
+
+
+@register(name="statue", position=30)
+@dataclass(frozen=True)
+class Statue:
+    """The shape of a bust and the pattern of its stone together, from pictures all around it, from a grey sphere.
+
+    Several views; the unknowns are the sphere's vertex positions, (3 V,), and the reflectance of its texture, (H, 2 H, 3). The light is
+    known: a sky and a sun. Vertices may slide along the surface and take the texture along, so of the texture there is no truth; the
+    error of the shape is the distance between surfaces. What is hard is that either unknown explains some of what the other does.
+    """
+
+    resolution: int = fields.resolution(64)
+    texture_resolution: int = fields.texture_resolution(32)
+    views: int = fields.integer(6, "cameras, around the bust, by turns lower and higher", at_least=1, at_most=64)
+    subdivisions: int = fields.integer(
+        4, "s: the sphere has 10 · 4^s + 2 vertices, without those doubled at its seam", at_least=1, at_most=7
+    )
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """The grey sphere under the sky and the sun."""
+        grey = np.full((self.texture_resolution, 2 * self.texture_resolution, 3), 0.5, np.float32)
+        return self._stage() | {"statue": _body(lambda directions: _RADIUS * directions, self.subdivisions, grey)}
+
+    def target(self) -> dict[str, Any]:
+        """The bust of veined stone."""
+        return self._stage() | {"statue": _body(_bust, _FINE, _stone(4 * self.texture_resolution))}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Vertices and texture, as the grey sphere has them."""
+        return Parameter("statue.vertex_positions"), Parameter("statue.bsdf.brdf_0.reflectance.data")
+
+    def problem(self, name: str) -> Problem:
+        """The problem: the sphere's scene, the bust's pictures by Mitsuba's own `path` integrator, and its surface."""
+        true = load(self.target)
+        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
+        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
+        surfaces = {"statue.vertex_positions": meshes.surface(next(s for s in true.shapes() if s.is_mesh()))}
+        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name, surfaces=surfaces)
+
+    def _stage(self) -> dict[str, Any]:
+        angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
+        heights = np.where(np.arange(self.views) % 2 == 0, 0.3, 1.8)
+        return {
+            "type": "scene",
+            **{
+                f"camera_{number}": parts.camera(
+                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 34.0, self.resolution
+                )
+                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
+            },
+            "sky": {"type": "constant", "radiance": parts.colour(0.3, 0.33, 0.4)},
+            "sun": staging.sun((0.6, 0.9, 0.7), 0.6),
+        }
+
+
+def _body(place: Any, subdivisions: int, texture: np.ndarray) -> Any:
+    directions, faces = meshes.icosphere(subdivisions)
+    of, faces, coordinates = meshes.unrolled(directions, faces)
+    stone = parts.twosided({"type": "diffuse", "reflectance": textures.bitmap(texture) | {"wrap_mode": "repeat"}})
+    return meshes.triangles("statue", place(directions[of]), faces, stone, coordinates)
+
+
+def _bust(directions: np.ndarray) -> np.ndarray:
+    """Head, neck and shoulders, with a nose, from the unit sphere: (V, 3)."""
+    from scipy.interpolate import PchipInterpolator
+
+    x, y, z = directions.T
+    height = np.arcsin(np.clip(y, -1, 1)) / (np.pi / 2)
+    radius = PchipInterpolator(*np.transpose(_PROFILE))(height)
+    shoulders = textures.ramp(-height, 0.0, 0.3)
+    level = np.maximum(np.sqrt(np.maximum(1 - y * y, 0)), 1e-9)
+    across, along = radius * x / level, radius * z / level
+    nose = 0.14 * np.exp(-((x / 0.2) ** 2) - ((height - 0.38) / 0.09) ** 2) * (z > 0)
+    return np.stack(
+        [across, 0.95 * height, along * (1 - 0.42 * shoulders) + nose + 0.1 * textures.ramp(height, 0.0, 0.3)], -1
+    )
+
+
+def _stone(rows: int) -> np.ndarray:
+    """Bands and veins of two colours, (rows, 2 rows, 3) reflectance, the same at both ends of each row."""
+    u, v = np.meshgrid((np.arange(2 * rows) + 0.5) / (2 * rows), (np.arange(rows) + 0.5) / rows)
+    around = 2 * np.pi * u
+    veins = 0.5 + 0.5 * np.sin(3 * around + 9 * v + 1.5 * np.sin(2 * around + 14 * v))
+    bands = textures.ramp(np.sin(2 * np.pi * 3.5 * v + np.sin(around)), -0.4, 0.4)
+    warm, cold, dark = (np.array(c) for c in ((0.75, 0.55, 0.35), (0.35, 0.45, 0.6), (0.2, 0.14, 0.12)))
+    mixed = warm + bands[..., None] * (cold - warm)
+    return (mixed + 0.6 * veins[..., None] ** 4 * (dark - mixed)).astype(np.float32)

@@ -1,0 +1,132 @@
+"""Two optimizers side by side, each for some of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Reparameterising
+from unrender.preconditioners.base import Preconditioner
+from unrender.preconditioners.mesh import MeshTopology
+from unrender.problem.upsampling import Upsampler, restarted, upsampled
+
+__all__ = ["Partitioned", "PartitionedState"]
+
+
+@dataclass(frozen=True)
+class PartitionedState:
+    """State between steps: that of the optimizer of `keys`, and that of the others."""
+
+    own: Any
+    others: Any
+
+    def upsampled(self, upsampler: Upsampler) -> PartitionedState:
+        """See `Upsamplable`: as the two are."""
+        return PartitionedState(upsampled(self.own, upsampler), upsampled(self.others, upsampler))
+
+    def restarted(self, fresh: PartitionedState) -> PartitionedState:
+        """See `Restartable`: as the two are."""
+        return PartitionedState(restarted(self.own, fresh.own), restarted(self.others, fresh.others))
+
+
+@register
+@dataclass(frozen=True)
+class Partitioned:
+    """One optimizer for the parameters in `keys`, another for the rest: vertices of a mesh beside its texture.
+
+        Partitioned(("vase.vertex_positions",), Adam(0.01, uniform=True), ScheduleFree(0.1), LargeSteps(19.0))
+
+    Args:
+        keys: of parameters.
+        optimizer: for those; it requires the gradient alone.
+        others: for all others, likewise.
+        preconditioner: of those of `keys` that have none of their own; None for none.
+    """
+
+    keys: tuple[str, ...] = ()
+    optimizer: Optimizer = field(default_factory=lambda: Adam(uniform=True))
+    others: Optimizer = field(default_factory=Adam)
+    preconditioner: Preconditioner | None = None
+
+    def __post_init__(self):
+        if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
+            raise InputError(f"Partitioned: keys must be keys of parameters, got {self.keys!r}")
+        object.__setattr__(self, "keys", tuple(self.keys))
+        for name in ("optimizer", "others"):
+            if getattr(self, name).requires != Capabilities(Gradient):
+                kind = type(getattr(self, name)).__name__
+                raise InputError(
+                    f"Partitioned: {name}: expected one that requires the gradient alone, such as Adam, got {kind}"
+                )
+
+    @property
+    def requires(self) -> Capabilities:
+        """A gradient."""
+        return Capabilities(Gradient)
+
+    @property
+    def preconditioners(self) -> Mapping[str, Preconditioner]:
+        """See `Preconditioning`."""
+        return {} if self.preconditioner is None else dict.fromkeys(self.keys, self.preconditioner)
+
+    @property
+    def parameterisations(self) -> Mapping[str, Any]:
+        """See `Reparameterising`."""
+        pairs = (
+            (part, part.parameterisations)
+            for part in (self.optimizer, self.others)
+            if isinstance(part, Reparameterising)
+        )
+        return {
+            k: given
+            for part, found in pairs
+            for k, given in found.items()
+            if (k in self.keys) == (part is self.optimizer)
+        }
+
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Partitioned:
+        """See `OnMeshes.on_meshes`."""
+        parts = (self.optimizer, self.others)
+        own, others = (part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in parts)
+        return replace(self, optimizer=own, others=others)
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> PartitionedState:
+        """See `Optimizer.init`. Raises `InputError` for a key that is no parameter."""
+        for key in self.keys:
+            if key not in parameters:
+                raise InputError(f'Partitioned: keys: unknown parameter "{key}"')
+        own, others = self._parts(parameters)
+        rates_own, rates_others = self._parts(learning_rates or {})
+        return PartitionedState(self.optimizer.init(own, rates_own), self.others.init(others, rates_others))
+
+    def update(self, estimate: Estimate, state: PartitionedState, parameters: Tree) -> tuple[Tree, PartitionedState]:
+        """See `Optimizer.update`."""
+        points, gradients = self._parts(parameters), self._parts(estimate.gradient)
+        fresh = estimate.get(FreshGradient)
+        told = ({}, {}) if fresh is None else self._parts(fresh.values)
+        steps, states = {}, []
+        for part, before, point, gradient, values in zip(
+            (self.optimizer, self.others), (state.own, state.others), points, gradients, told, strict=True
+        ):
+            capabilities = () if fresh is None else (FreshGradient(values),)
+            found, after = part.update(replace(estimate, gradient=gradient, capabilities=capabilities), before, point)
+            steps |= found
+            states.append(after)
+        return {key: steps[key] for key in parameters}, PartitionedState(*states)
+
+    def choices(self, state: PartitionedState) -> tuple[str, ...]:
+        """See `Choosing`."""
+        both = ((self.optimizer, state.own), (self.others, state.others))
+        return tuple(line for part, of in both if isinstance(part, Choosing) for line in part.choices(of))
+
+    def _parts(self, tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What belongs to `keys`, and the rest."""
+        own = {key: value for key, value in tree.items() if key in self.keys}
+        return own, {key: value for key, value in tree.items() if key not in self.keys}

@@ -1,0 +1,110 @@
+"""What is added to the loss to keep a mesh smooth, or its edges alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.core import checks, tables
+from unrender.core.errors import InputError
+from unrender.preconditioners.mesh import MeshTopology
+
+__all__ = ["MeshRegularizer", "of"]
+
+
+@dataclass(frozen=True)
+class MeshRegularizer:
+    """Two terms of the loss, of vertex positions x alone, both without units:
+
+        b mean_i |x_i − mean_{j ~ i} x_j|² / ℓ²  +  e (mean |x_i − x_j|² / (mean |x_i − x_j|)² − 1)
+
+    The first (bi-Laplacian: its gradient is L² x) is small where the surface is smooth and its triangles are regular; ℓ is the mean length
+    of an edge of the mesh as loaded. It pulls a closed mesh together a little. The second is the squared relative deviation of the
+    lengths of edges, whatever their mean is. Large steps (`preconditioners.LargeSteps`) smooth the way; these change where it leads to.
+    Vertices at the same place count as one.
+
+    Args:
+        bilaplacian: b, >= 0. An L2 loss of pictures is 0.01 to 0.1 at the start: 0.01 is a lot.
+        edges: e, >= 0; likewise.
+    """
+
+    bilaplacian: float = 0.0
+    edges: float = 0.0
+    _mesh: _Mesh | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        for name in ("bilaplacian", "edges"):
+            checks.number("regularizer", name, getattr(self, name), above=0.0, inclusive=True)
+
+    def on_mesh(self, positions: np.ndarray, faces: np.ndarray) -> MeshRegularizer:
+        """The same for the vertex positions (3 V,) of a mesh: positions as loaded (V, 3), faces (F, 3)."""
+        bound = MeshRegularizer(self.bilaplacian, self.edges)
+        object.__setattr__(bound, "_mesh", _Mesh.of(positions, faces))
+        return bound
+
+    def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """The two terms together, and their gradient by x, (3 V,)."""
+        mesh = self._mesh
+        if mesh is None:
+            raise InputError("regularizer: it is of no mesh yet (on_mesh)")
+        first, i, j = mesh.first, *mesh.neighbours.T
+        places = x.reshape(-1, 3).astype(np.float64)[first]
+        gradient, value = np.zeros_like(places), 0.0
+        if self.bilaplacian:
+            total = np.zeros_like(places)
+            np.add.at(total, i, places[j])
+            np.add.at(total, j, places[i])
+            bend = places - total / mesh.valence[:, None]
+            factor = self.bilaplacian / (len(places) * mesh.length**2)
+            value += factor * float(np.sum(bend * bend))
+            shared = bend / mesh.valence[:, None]
+            gradient += 2 * factor * bend
+            np.add.at(gradient, i, -2 * factor * shared[j])
+            np.add.at(gradient, j, -2 * factor * shared[i])
+        if self.edges:
+            along = places[i] - places[j]
+            lengths = np.maximum(np.linalg.norm(along, axis=1), 1e-12)
+            mean, square = lengths.mean(), np.mean(lengths * lengths)
+            value += self.edges * float(square / mean**2 - 1)
+            slope = 2 * self.edges / len(lengths) * (lengths / mean**2 - square / mean**3)
+            push = (slope / lengths)[:, None] * along
+            np.add.at(gradient, i, push)
+            np.add.at(gradient, j, -push)
+        # What a place is pulled by, its vertices share.
+        return value, (gradient / mesh.copies[:, None])[mesh.places].reshape(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mesh:
+    """What the terms need of a mesh: its places, one vertex of each, how many are there, its edges, and its mean length of an edge."""
+
+    places: np.ndarray
+    first: np.ndarray
+    copies: np.ndarray
+    neighbours: np.ndarray
+    valence: np.ndarray
+    length: float
+
+    @classmethod
+    def of(cls, positions: np.ndarray, faces: np.ndarray) -> _Mesh:
+        topology = MeshTopology.of(positions, faces)
+        if not len(topology.neighbours):
+            raise InputError("its mesh has no edges")
+        _, first, copies = np.unique(topology.places, return_index=True, return_counts=True)
+        i, j = topology.neighbours.T
+        valence = np.maximum(np.bincount(np.concatenate([i, j]), minlength=len(first)), 1)
+        at = positions[first].astype(np.float64)
+        length = float(np.linalg.norm(at[i] - at[j], axis=1).mean())
+        return cls(topology.places, first, copies, topology.neighbours, valence, length)
+
+
+def of(given: Any) -> MeshRegularizer:
+    """What a parameter was given: one, or a table of its options. Raises `InputError`."""
+    if isinstance(given, MeshRegularizer):
+        return given
+    if not isinstance(given, Mapping):
+        raise InputError(f"expected a table such as {{ bilaplacian = 0.001 }}, got {given!r:.60}")
+    return tables.build(MeshRegularizer, given)

@@ -1,0 +1,59 @@
+"""Runs whose unknown is a mesh: `auto` on the gallery's problems, their folders, exports, and other triangles on the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+import unrender as ur
+from unrender.problem.problem import Problem
+from unrender.runs.folder import reader
+from unrender.runs.metadata import RunAnnotations
+
+SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}
+STATUE, STONE = "statue.vertex_positions", "statue.bsdf.brdf_0.reflectance.data"
+
+
+@pytest.mark.slow
+def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_path: Path) -> None:
+    made = ur.gallery.problem("statue", **SMALL, views=2, texture_resolution=8)
+    given = [
+        replace(p, remeshing={"steps": [5], "method": "subdivide"}) if p.key == STATUE else p for p in made.parameters
+    ]
+    scene = made.renderer.pair.description  # type: ignore
+    problem = Problem(scene, given, made.views, made.loss, made.max_depth, surfaces=made.surfaces)
+    result = ur.optimize(problem, steps=11, run_directory=tmp_path / "run", annotations=RunAnnotations(final_spp=32))
+    run = reader.read(tmp_path / "run")
+    assert run.error_after[STATUE] < 0.9 * run.error_before[STATUE]
+    assert result.history[-1]["parameter_error"][STATUE] == pytest.approx(run.error_after[STATUE], rel=1e-3)
+    assert [record.get("faces") for record in result.history if "faces" in record] == [{STATUE: 1280}]
+    assert result.history[-1]["loss"] < result.history[4]["loss"] < 0.9 * result.history[0]["loss"]
+    assert np.ptp(result.parameters[STONE]) > 0.05
+    # Starts and results have different triangles; both have their pictures.
+    assert len(run.meshes[STATUE].first_faces) == 320
+    before, after = (result.image_errors[f"view0/{which}"][0] for which in ("initial", "result"))
+    assert after < before
+    written = trimesh.load(tmp_path / "run/meshes/statue.ply", process=False)
+    np.testing.assert_array_equal(written.vertices.astype(np.float32).reshape(-1), result.parameters[STATUE])
+    # What is exported renders what the last picture shows.
+    moved = problem.remeshed({STATUE: _mesh(run)})
+    exported = ur.export((moved, result.parameters), tmp_path / "scene", formats=["mitsuba", "ply", "obj"])
+    for path in (tmp_path / "scene/ply/statue.ply", tmp_path / "scene/obj/asset.obj"):
+        again = trimesh.load(path, process=False, maintain_order=True)
+        np.testing.assert_allclose(np.sort(again.vertices, axis=0), np.sort(written.vertices, axis=0), atol=1e-6)
+        assert len(again.faces) == 1280
+    picture = np.array(mi.render(mi.load_file(str(exported.scene)), sensor=0, spp=256))
+    ours = ur.render(moved, result.parameters, 0, spp=256)
+    assert np.sqrt(np.mean((picture - ours) ** 2)) < 0.02
+
+
+def _mesh(run: reader.RunFolder):
+    from unrender.rendering.renderer import ReplacedMesh
+
+    mesh = run.meshes[STATUE]
+    return ReplacedMesh(run.parameters[STATUE].reshape(-1, 3), mesh.faces, mesh.uv)

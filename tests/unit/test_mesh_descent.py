@@ -1,0 +1,272 @@
+"""Descents on meshes: distances of surfaces, folds, regularizers, guarded steps, two optimizers side by side."""
+
+from __future__ import annotations
+
+import importlib.util
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core import tables
+from unrender.core.random import Key
+from unrender.estimators.base import Estimate
+from unrender.evaluation.surfaces import Surface, folds, surface_error
+from unrender.gallery import blobs, meshes
+from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
+from unrender.pixels import Views
+from unrender.preconditioners import LargeSteps, Sobolev
+from unrender.problem import remeshing
+from unrender.problem.mesh_checks import check_regularizer, check_surfaces, mesh_notices
+from unrender.problem.mesh_regularizer import MeshRegularizer
+from unrender.problem.remeshing import Remeshing
+from unrender.runs.mesh_guard import guarded
+from unrender.runs.mesh_watch import MeshWatch
+
+POINTS, FACES = meshes.icosphere(2)
+COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)
+"""The sphere cut along its seam: of which vertex each is a copy, faces, texture coordinates."""
+
+
+def test_distance_between_surfaces_is_that_of_spheres() -> None:
+    fine = Surface(*meshes.icosphere(4))
+    grown = Surface(1.25 * fine.vertices + [0, 0, 3.0], fine.faces)
+    assert surface_error(fine, fine) < 1e-7
+    assert (
+        surface_error(Surface(POINTS[COPY], CUT), Surface(POINTS, FACES)) < 1e-7
+    )  # other triangles' numbers, the same surface
+    assert surface_error(fine, Surface(1.25 * fine.vertices, fine.faces)) == pytest.approx(0.25, rel=0.02)
+    assert surface_error(fine, grown) == pytest.approx(surface_error(grown, fine))
+    square = Surface(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]]), np.array([[0, 1, 2], [1, 3, 2]]))
+    lifted = Surface(square.vertices + [0, 0, 0.3], square.faces)
+    np.testing.assert_allclose(square.distances_from(lifted), 0.3)  # exact, whatever the samples are
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (POINTS[:, :2], FACES, r"finite vertices of shape \(V, 3\)"),
+        (np.where(POINTS > 0.9, np.nan, POINTS), FACES, "finite vertices"),
+        (POINTS, FACES + 0.5, "whole numbers"),
+        (POINTS, FACES + 1, "names vertex 162 of 162"),
+        (POINTS, FACES[:0], "whole numbers"),
+        (np.zeros((162, 3)), FACES, "none of its faces has an area"),
+    ],
+)
+def test_what_is_no_surface_is_one_line(vertices: np.ndarray, faces: np.ndarray, message: str) -> None:
+    with pytest.raises(ur.InputError, match=message):
+        Surface(vertices, faces)
+    with pytest.raises(ur.InputError, match="no vertex positions among the parameters"):
+        check_surfaces({"ball.vertex_position": Surface(POINTS, FACES)}, {"ball.vertex_positions": FACES})
+
+
+def test_folds_are_counted() -> None:
+    assert folds(POINTS, FACES) == 0
+    hinge = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0.9, 0.1, 0.01]])
+    faces = np.array([[0, 2, 1], [0, 1, 3]])
+    assert folds(hinge, faces) == 1
+    assert folds(hinge * [[1, 1, 1], [1, 1, 1], [1, 1, 1], [-1, 1, 1]], faces) == 0
+    assert folds(hinge, np.array([[0, 2, 1], [0, 0, 1]])) == 0  # without area
+
+
+@pytest.mark.parametrize("terms", [{"bilaplacian": 0.3}, {"edges": 0.7}, {"bilaplacian": 0.2, "edges": 0.1}])
+def test_regularizers_have_the_gradient_of_their_value(terms: dict[str, float]) -> None:
+    rng = np.random.default_rng(1)
+    x, along = (rng.normal(size=(len(POINTS), 3))[COPY] for _ in range(2))
+    x = (POINTS[COPY] + 0.05 * x).reshape(-1)
+    bound = MeshRegularizer(**terms).on_mesh(POINTS[COPY], CUT)
+    value, gradient = bound.evaluate(x)
+    ends = [bound.evaluate(x + side * 1e-5 * along.reshape(-1))[0] for side in (1, -1)]
+    assert value > 0
+    assert gradient @ along.reshape(-1) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
+    uncut = MeshRegularizer(**terms).on_mesh(POINTS, FACES)  # the seam does not show
+    moved = np.zeros((len(POINTS), 3))
+    moved[COPY] = x.reshape(-1, 3)
+    assert uncut.evaluate(moved.reshape(-1))[0] == pytest.approx(value)
+    # The whole mesh shifted has the same, the second term at any size.
+    assert bound.evaluate(x + 3.0)[0] == pytest.approx(value)
+    if not bound.bilaplacian:
+        assert bound.evaluate(2 * x)[0] == pytest.approx(value)
+
+
+def test_a_regularizer_needs_a_mesh() -> None:
+    with pytest.raises(ur.InputError, match="vertex positions of a mesh"):
+        check_regularizer({"edges": 1.0}, SimpleNamespace(mesh=None))  # type: ignore
+    with pytest.raises(ur.InputError, match="no option edge"):
+        check_regularizer({"edge": 1.0}, SimpleNamespace(mesh=lambda: (POINTS, FACES)))  # type: ignore
+    with pytest.raises(ur.InputError, match="its mesh has no edges"):
+        check_regularizer({"edges": 1.0}, SimpleNamespace(mesh=lambda: (POINTS, FACES[:0])))  # type: ignore
+
+
+def test_no_triangle_turns_over_in_a_step() -> None:
+    start = POINTS[COPY].reshape(-1).astype(np.float32)
+    small = start * np.float32(0.5)
+    assert guarded(start, small, CUT) is small
+    inward = (
+        POINTS[COPY] * np.where(np.arange(len(POINTS)) == 40, -1.0, 1.0)[COPY][:, None]
+    )  # one vertex through the middle
+    torn = POINTS[COPY] + np.random.default_rng(0).normal(size=POINTS.shape)[COPY]
+    for wanted in (inward, torn, -POINTS[COPY]):
+        found = guarded(start, wanted.reshape(-1).astype(np.float32), CUT).reshape(-1, 3)
+        a, b = (
+            np.cross(*np.moveaxis(np.diff(v.astype(float)[CUT], axis=1), 1, 0)) for v in (start.reshape(-1, 3), found)
+        )
+        assert (np.sum(a * b, axis=1) > 0).all()
+        joined = np.zeros_like(POINTS)
+        joined[COPY] = found
+        np.testing.assert_array_equal(joined[COPY], found.astype(float))  # seams stay closed
+    assert np.abs(found - start.reshape(-1, 3)).max() >= 0
+
+
+def test_two_optimizers_side_by_side_do_what_each_does_alone() -> None:
+    rng = np.random.default_rng(2)
+    start = {
+        "ball.vertex_positions": rng.normal(size=12),
+        "colour": rng.uniform(size=3),
+        "map": rng.uniform(size=(4, 4, 1)),
+    }
+    start = {key: value.astype(np.float32) for key, value in start.items()}
+    mesh, rest = Adam(0.01, uniform=True), ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("map",))
+    both = Partitioned(("ball.vertex_positions",), mesh, rest, LargeSteps(19.0))
+    assert both.preconditioners == {"ball.vertex_positions": LargeSteps(19.0)}
+    own, others = {"ball.vertex_positions": start["ball.vertex_positions"]}, {k: start[k] for k in ("colour", "map")}
+    states = both.init(start, {"colour": 0.3}), mesh.init(own), rest.init(others, {"colour": 0.3})
+    for _ in range(3):
+        gradient = {key: rng.normal(size=value.shape).astype(np.float32) for key, value in start.items()}
+        steps, one = both.update(Estimate(0.0, gradient), states[0], start)
+        alone, two = mesh.update(Estimate(0.0, {k: gradient[k] for k in own}), states[1], own)
+        beside, three = rest.update(Estimate(0.0, {k: gradient[k] for k in others}), states[2], others)
+        states = one, two, three
+        assert list(steps) == list(start)
+        for key, step in (alone | beside).items():
+            np.testing.assert_array_equal(steps[key], step)
+    assert both.choices(states[0]) == rest.choices(states[2])
+    assert tables.component(tables.table(both)) == both  # a run folder stores it
+    with pytest.raises(ur.InputError, match='unknown parameter "ball"'):
+        Partitioned(("ball",), mesh, rest).init(start)
+    with pytest.raises(ur.InputError, match="requires the gradient alone"):
+        Partitioned((), LBFGS(), ur.optimizers.Newton())
+
+
+def test_blobs_are_closed_and_face_outward() -> None:
+    parts = [blobs.Ellipsoid((0, 0, 0), (0.5, 0.3, 0.4), 20.0), blobs.Ellipsoid((0.4, 0.1, 0), (0.2, 0.2, 0.2))]
+    points, faces = blobs.around(blobs.united(parts, 0.02), (-1, -1, -1), (1, 1, 1), 0.08)
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    assert {tuple(side) for side in sides} == {tuple(side) for side in sides[:, ::-1]}
+    a, b, c = points[faces.T]
+    volume = np.sum(a * np.cross(b, c)) / 6
+    assert 4 / 3 * np.pi * 0.06 < volume < 4 / 3 * np.pi * 0.068
+    depth = parts[0].depth(np.array([[0, 0, 0.4], [0, 0, 0.41], [0.0, 0, 0.38]]))
+    np.testing.assert_allclose(depth, [0, -0.01, 0.02], atol=1e-3)
+
+
+def test_subdivision_keeps_surface_seams_and_texture_coordinates() -> None:
+    found = Remeshing((5,), "subdivide").apply(POINTS[COPY], CUT, COORDINATES)
+    assert (len(found.faces), len(found.vertices)) == (4 * len(CUT), len(COPY) + len(_edges(CUT)))
+    assert found.uv is not None
+    np.testing.assert_array_equal(found.vertices[: len(COPY)], POINTS[COPY])
+    assert surface_error(Surface(found.vertices, found.faces), Surface(POINTS, FACES)) < 1e-3
+    volume = [
+        np.sum(v[f[:, 0]] * np.cross(v[f[:, 1]], v[f[:, 2]]))
+        for v, f in ((POINTS, FACES), (found.vertices, found.faces))
+    ]
+    assert volume[0] == pytest.approx(volume[1])  # and which side is out
+    corners = COORDINATES[CUT].mean(axis=1)  # of the triangle in the middle of each, which comes last
+    np.testing.assert_allclose(found.uv[found.faces[3 * len(CUT) :]].mean(axis=1), corners, atol=1e-12)
+    _, places = np.unique(found.vertices, axis=0, return_inverse=True)
+    uncut = Remeshing((5,), "subdivide").apply(POINTS, FACES, None)
+    assert places.max() + 1 == len(uncut.vertices)  # the seam stays closed
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    return np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+
+
+def test_even_triangles_on_the_same_surface() -> None:
+    pytest.importorskip("gpytoolbox", reason="needs gpytoolbox: pip install 'unrender[remesh]'")
+    stretched = POINTS * [1.0, 0.5, 1.7]
+    found = Remeshing((5,), edge=0.6).apply(stretched[COPY], CUT, None)
+    lengths = [
+        np.linalg.norm(np.diff(v[_edges(f)], axis=1)[:, 0], axis=1)
+        for v, f in ((stretched, FACES), (found.vertices, found.faces))
+    ]
+    assert lengths[1].mean() == pytest.approx(0.6 * lengths[0].mean(), rel=0.15)
+    assert np.std(lengths[1]) / lengths[1].mean() < 0.6 * np.std(lengths[0]) / lengths[0].mean()
+    assert surface_error(Surface(found.vertices, found.faces), Surface(stretched, FACES)) < 0.01
+    open_ = Remeshing((5,)).apply(POINTS, FACES[POINTS[FACES].mean(axis=1)[:, 1] > 0], None)
+    assert len(open_.faces) > 400
+
+
+def test_remeshing_that_does_not_suit_is_one_line() -> None:
+    fin = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], 80]]])
+    for faces, uv, message in ((fin, None, "no manifold: 1 of"), (CUT, COORDINATES, "subdivide. keeps them")):
+        with pytest.raises(ur.InputError, match=message):
+            Remeshing((5,)).check(POINTS[COPY] if uv is not None else POINTS, faces, uv)
+        Remeshing((5,), "subdivide").check(POINTS, faces, uv)
+    for wrong, message in (
+        ((0,), "at least 1"),
+        ((9, 3), "ascend"),
+        ({"steps": [3], "edge": 0}, "edge must be"),
+        ("3", "expected steps"),
+    ):
+        with pytest.raises(ur.InputError, match=message):
+            remeshing.of(wrong)
+    with pytest.raises(ur.InputError, match=r"would make \d+ faces"):
+        Remeshing((5,), edge=1e-5).apply(POINTS, FACES, None) if _has_gpytoolbox() else remeshing._check_size(1 << 22)
+
+
+def _has_gpytoolbox() -> bool:
+    return importlib.util.find_spec("gpytoolbox") is not None
+
+
+def test_unusual_meshes_have_a_line() -> None:
+    assert mesh_notices("ball.vertex_positions", POINTS[COPY], CUT) == []
+    assert mesh_notices("ball.vertex_positions", POINTS, FACES[:40]) == []  # open
+    fin = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], 80]], [[0, 0, 1], [3, 4, 3]]])
+    (line,) = mesh_notices("ball.vertex_positions", POINTS, fin)
+    assert line.endswith(
+        "its mesh has 1 edges of more than two faces and 2 triangles without area, which count as borders"
+    )
+
+
+def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
+    key = "ball.vertex_positions"
+    problem = SimpleNamespace(faces={key: FACES}, initial_values=lambda: {key: POINTS.reshape(-1)})
+    crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
+    run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
+    descent, watch = SimpleNamespace(run=run), MeshWatch()
+    for size in (0.0, 1.0, 0.0, 0.0):
+        watch.on_update(descent, Estimate(0.0, {key: np.full(POINTS.size, size)}), True)  # type: ignore
+    assert run.warnings == [
+        f"step 3: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"
+    ]
+    (line,) = watch.warnings(descent)  # type: ignore
+    assert "the mesh folds over at" in line
+    run.parameters[key] = 2 * POINTS.reshape(-1)
+    assert watch.warnings(descent) == []  # type: ignore
+
+
+def test_whole_views_are_drawn_evenly() -> None:
+    shapes = [(2, 3), (4, 4), (1, 5), (3, 3), (2, 2)]
+    problem = SimpleNamespace(
+        views=[SimpleNamespace(reference=np.zeros((*shape, 3))) for shape in shapes],
+        renderer=SimpleNamespace(array=lambda values: values),
+    )
+    seen = np.zeros(5)
+    for step in range(400):
+        sample = Views(2).redraw(problem, None, Key(0, step)).sample  # type: ignore
+        assert sample is not None
+        chosen, counts = np.unique(sample.views, return_counts=True)
+        assert len(chosen) == 2
+        for view, count in zip(chosen, counts, strict=True):
+            assert count == np.prod(shapes[view])
+            np.testing.assert_array_equal(np.asarray(sample.pixels)[np.asarray(sample.views) == view], np.arange(count))
+        assert (np.asarray(sample.weights) == 2.5).all()  # 1 / probability
+        seen[chosen] += 1
+    error = np.sqrt(400 * 0.4 * 0.6)
+    assert np.abs(seen - 160).max() < 4 * error
+    whole = Views(9).redraw(problem, None, Key(0, 0)).sample  # type: ignore
+    assert whole is not None
+    assert len(np.unique(whole.views)) == 5
+    assert (np.asarray(whole.weights) == 1).all()
