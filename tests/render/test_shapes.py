@@ -110,7 +110,8 @@ def test_auto_smooths_colours_of_vertices_over_the_edges_of_their_mesh() -> None
     assert (moved != 0).mean() > 0.9  # those behind, too
     positions = ur.Problem(scene(), [ur.Parameter(KEY)], [ur.View(np.zeros((SIZE, SIZE, 3)))], max_depth=2)
     chosen = method("auto").choose(positions, {})
-    assert chosen.optimizer.preconditioned == ()
+    assert chosen.optimizer.keys == (KEY,)
+    assert chosen.optimizer.others.preconditioned == ()
 
 
 @pytest.mark.slow

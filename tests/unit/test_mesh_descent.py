@@ -92,11 +92,11 @@ def test_regularizers_have_the_gradient_of_their_value(terms: dict[str, float]) 
 
 def test_a_regularizer_needs_a_mesh() -> None:
     with pytest.raises(ur.InputError, match="vertex positions of a mesh"):
-        check_regularizer({"edges": 1.0}, SimpleNamespace(mesh=None))  # type: ignore
+        check_regularizer({"edges": 1.0}, SimpleNamespace(moving_mesh=None))  # type: ignore
     with pytest.raises(ur.InputError, match="no option edge"):
-        check_regularizer({"edge": 1.0}, SimpleNamespace(mesh=lambda: (POINTS, FACES)))  # type: ignore
+        check_regularizer({"edge": 1.0}, SimpleNamespace(moving_mesh=lambda: (POINTS, FACES)))  # type: ignore
     with pytest.raises(ur.InputError, match="its mesh has no edges"):
-        check_regularizer({"edges": 1.0}, SimpleNamespace(mesh=lambda: (POINTS, FACES[:0])))  # type: ignore
+        check_regularizer({"edges": 1.0}, SimpleNamespace(moving_mesh=lambda: (POINTS, FACES[:0])))  # type: ignore
 
 
 def test_no_triangle_turns_over_in_a_step() -> None:
