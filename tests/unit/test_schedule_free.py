@@ -230,7 +230,7 @@ def test_texels_that_nothing_is_told_of_stay_where_they_are(monkeypatch: pytest.
         return float(np.sqrt(np.mean(seen[-1][:, 20:] ** 2))), float(np.median(seen[-1][:, :12]))
 
     noise_of, signal_of = walked()
-    monkeypatch.setattr("unrender.optimizers.schedule_free._LEAST_SIGNAL", 1.0)
+    monkeypatch.setattr("unrender.optimizers.signal_share._LEAST_SIGNAL", 1.0)
     noise_without, signal_without = walked()
     assert noise_of < 0.4 * noise_without
     assert signal_of > 0.7 * signal_without > 0.3
