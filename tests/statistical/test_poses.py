@@ -111,6 +111,27 @@ def test_a_pose_beside_other_parameters() -> None:
         assert verdict, figures
 
 
+@pytest.mark.slow
+def test_shapes_that_path_gradients_have_moved_are_posed_from_where_they_were() -> None:
+    key, turns = "block.rotation.y", np.array([0.0, 0.4])
+
+    def moved(renderer: MitsubaRenderer) -> None:
+        at = {key: renderer.array(np.array(0.9, np.float32))}
+        renderer.prepare([key], None).image(at, SampleRequest(0, 4, 1))
+
+    def seen(renderer: MitsubaRenderer) -> np.ndarray:
+        return (
+            renderer.prepare([key], None, derivatives=False).image_batch({key: turns}, SampleRequest(0, 4, 1)).numpy()
+        )
+
+    first, second = MitsubaRenderer(scene, 2), MitsubaRenderer(scene, 2)
+    moved(first)
+    expected = seen(second)
+    np.testing.assert_array_equal(seen(first), expected)
+    moved(second)
+    np.testing.assert_array_equal(seen(second), expected)
+
+
 def test_all_states_of_a_batch_share_their_random_numbers() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
     session = renderer.prepare(["block.rotation.y"], None, derivatives=False)
