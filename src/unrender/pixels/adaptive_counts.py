@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -85,12 +86,14 @@ class AdaptiveCounts:
     for s samples per pixel on average (the estimator's `spp`), m in each, mean 1 of q over a view, and c_j the cost of a path. The variance
     of the gradient is that of all pixels' over their n_j, and q minimises it at equal cost. The numbers are rounded at random before the
     samples are taken, from what earlier steps' samples told; each pixel's samples are weighted by 1 / n_j, and a sample's loss
-    derivative is that at the mean of its pixel's other samples. So the gradient is as unbiased as with equal numbers, at most
-    s / m times as noisy whatever the maps, and every pixel keeps its memory of earlier steps: for control variates, too.
+    derivative is that at the mean of its pixel's other samples. So the gradient is as unbiased as with equal numbers, and every pixel keeps
+    its memory of earlier steps: for control variates, too. Where maps are wrong its variance is at most s / m times that of equal
+    numbers, or s (s - 1) / (m (m - 1)) times where it is the noise of the images that dominates.
 
     Both factors are measured by the samples of the steps, the second along random ±1 tangents (`RenderSession.tangent_moment`), in the
     first steps and one of `refresh`; tiles that few paths have met are pooled with those around (`pooling.pool`). λ is 0.8 at first,
-    and falls to 0.1 as samples confirm the maps (`uniform_share.choose`). Each view has its own s samples a pixel.
+    and falls to 0.1 as samples confirm the maps (`uniform_share.choose`), judged as if the noise of the images dominated. Each view
+    has its own s samples a pixel.
 
     Args:
         least: m, samples in each pixel, >= 2; `spp` must be more.
@@ -166,9 +169,10 @@ class AdaptiveCounts:
         counts = np.ones(len(tile)) if draws.counts is None else draws.counts
         samples = TileSamples(tile, found, np.ones(len(tile)), counts)
         values = samples.normalised()
+        gain = self._gain(float(counts.mean()))
         if state.pooled:
             told = samples.judged(values, state.pooled)
-            evidence = uniform_share.observed(evidence, told, state.density[tile], decay)
+            evidence = uniform_share.observed(evidence, told, state.density[tile], decay, gain)
         maps, paths = list(state.maps), state.counts * decay
         for index, value in enumerate(values):
             total, number = samples.summed(value, len(tiles.views))
@@ -179,7 +183,17 @@ class AdaptiveCounts:
         learnt = replace(
             state, maps=tuple(maps), counts=paths + number, evidence=evidence, since=0, learnt=state.learnt + 1
         )
-        return self._mapped(tiles, learnt)
+        return self._mapped(tiles, learnt, gain)
+
+    def _gain(self, spp: float) -> Callable[[np.ndarray], np.ndarray]:
+        """One over the variance of a pixel for its number of samples relative to equal ones beyond `least`, where noise of the image is
+        all of it: that of n samples goes with 1 / (n (n - 1)), the noise of one times that of the others."""
+
+        def gain(share: np.ndarray) -> np.ndarray:
+            number = self.least + (spp - self.least) * share
+            return number * (number - 1) / (spp * (spp - 1))
+
+        return gain
 
     def observe(self, problem: Problem, state: AdaptiveCountsState, gradient: Tree) -> AdaptiveCountsState:
         """Update the mean square of the gradient's elements, where variances are `relative`."""
@@ -187,7 +201,9 @@ class AdaptiveCounts:
             return state
         return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
-    def _mapped(self, tiles: Tiles, state: AdaptiveCountsState) -> AdaptiveCountsState:
+    def _mapped(
+        self, tiles: Tiles, state: AdaptiveCountsState, gain: Callable[[np.ndarray], np.ndarray]
+    ) -> AdaptiveCountsState:
         """The state with numbers of samples by its maps and its evidence."""
         pooled = tuple(pool(tiles, values, state.counts, _PRIOR) for values in state.maps)
         density = np.sqrt((pooled[0] * pooled[1]).sum(axis=1) / state.costs)
@@ -199,7 +215,7 @@ class AdaptiveCounts:
         uniform = self.uniform
         if uniform is None:
             cost = float(np.average(density, weights=tiles.sizes * state.costs))
-            uniform = uniform_share.choose(state.evidence, cost)
+            uniform = uniform_share.choose(state.evidence, cost, gain)
         return replace(state, pooled=pooled, density=density, uniform=uniform)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,7 +35,13 @@ class ShareEvidence:
     squares: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
 
-def observed(evidence: ShareEvidence, samples: np.ndarray, density: np.ndarray, decay: float) -> ShareEvidence:
+def observed(
+    evidence: ShareEvidence,
+    samples: np.ndarray,
+    density: np.ndarray,
+    decay: float,
+    gain: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> ShareEvidence:
     """The evidence with further samples.
 
     Args:
@@ -43,13 +50,16 @@ def observed(evidence: ShareEvidence, samples: np.ndarray, density: np.ndarray, 
             estimates the second moment under uniform sampling.
         density: q, the map at each sample, relative to uniform sampling, (N,).
         decay: weight of what was known before.
+        gain: one over the second moment under a probability relative to uniform sampling, for that of a sample under uniform sampling;
+            None for the probability itself.
     """
     mixed = SHARES[:, None] + (1 - SHARES[:, None]) * density
+    mixed = mixed if gain is None else gain(mixed)
     moments = np.concatenate([samples @ (1 / mixed).T, samples.sum(axis=1, keepdims=True)], axis=1)
     return ShareEvidence(evidence.moments * decay + moments, evidence.squares * decay + np.square(samples).sum(axis=1))
 
 
-def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
+def choose(evidence: ShareEvidence, cost: float = 1.0, gain: Callable[[np.ndarray], np.ndarray] | None = None) -> float:
     """The share λ of uniform draws in p = λ + (1 - λ) q that minimises a pessimistic estimate of the gradient's second moment over that of
     uniform sampling:
 
@@ -62,12 +72,14 @@ def choose(evidence: ShareEvidence, cost: float = 1.0) -> float:
     Args:
         evidence: of samples.
         cost: of a path drawn by the map, over that of one drawn uniformly: J is multiplied by λ + (1 - λ) times it.
+        gain: that of `observed`: of λ, in place of λ in ε / λ.
     """
+    least = SHARES if gain is None else gain(SHARES)
     worst = np.zeros(len(SHARES))
     for moments, square in zip(evidence.moments, evidence.squares, strict=True):
         uniform = float(moments[-1])
         if not (uniform > 0 and square > 0):
             return MOST
         unknown = _UNKNOWN / (_UNKNOWN + uniform**2 / float(square))
-        worst = np.maximum(worst, (1 - unknown) * moments[:-1] / uniform + unknown / SHARES)
+        worst = np.maximum(worst, (1 - unknown) * moments[:-1] / uniform + unknown / least)
     return float(SHARES[np.argmin(worst * (SHARES + (1 - SHARES) * cost))])
