@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from unrender.backend import variant
-from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder
+from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder, turntable
 from unrender.capture import mesh as meshes
 from unrender.capture.capture import Capture
 from unrender.capture.conventions import reinterpreted
@@ -31,6 +31,7 @@ CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
 """Along the longest side of the hull: memory grows with the cube."""
+TURNTABLE = "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
 _OF_CHECK = {CHECK, SHEET}
 _OF_IMPORT = {*problem_folder.OWN, SHEET}
 
@@ -53,6 +54,7 @@ class Options:
         texture: texels along the sides of the textures.
         unknowns: of the asset, of `unknowns.NAMES`.
         band: pixels along the border of masks that count little.
+        turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
     """
 
     mesh: Path | None = None
@@ -68,6 +70,7 @@ class Options:
     texture: int = 512
     unknowns: tuple[str, ...] = DEFAULT
     band: int = 0
+    turntable: bool | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.voxels <= MOST_VOXELS:
@@ -106,6 +109,7 @@ class _Read:
     mesh: Mesh
     silhouettes: Silhouettes
     overlaps: list[float]
+    turntable: bool
     notices: tuple[str, ...]
     refusal: str
 
@@ -131,7 +135,15 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
         with phases.phase("problem"):
             name = folder.resolve().name
             problem_folder.write(
-                place, name, found.views, mesh, found.silhouettes, options.texture, options.unknowns, options.band
+                place,
+                name,
+                found.views,
+                mesh,
+                found.silhouettes,
+                options.texture,
+                options.unknowns,
+                options.band,
+                found.turntable,
             )
             (place / SHEET).write_bytes(
                 _sheet(
@@ -218,7 +230,10 @@ def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
             raise InputError(f"{folder}: {flips.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
         refusal = "" if mean >= flips.SUFFICIENT else flips.explain(capture, training, given, mean)
-    return _Read(capture, views, mesh, silhouettes, overlaps, (*capture.notices, *notices), refusal)
+    turned = turntable.stands_still(views) if options.turntable is None else options.turntable
+    if turned and options.turntable is None:
+        notices.append(TURNTABLE)
+    return _Read(capture, views, mesh, silhouettes, overlaps, turned, (*capture.notices, *notices), refusal)
 
 
 def _has_masks(capture: Capture) -> bool:

@@ -16,6 +16,7 @@ from unrender.capture import unknowns
 from unrender.capture.mesh import Mesh, ply
 from unrender.capture.overlays import png
 from unrender.capture.silhouettes import Silhouettes
+from unrender.capture.turntable import light_turns
 from unrender.capture.views import CapturedView
 from unrender.core.errors import InputError
 from unrender.core.text import printable
@@ -24,6 +25,7 @@ from unrender.io import toml_lines
 from unrender.judging.held_out import HELD_OUT
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.mitsuba import turntable_light
 from unrender.stages import stages_file
 
 __all__ = ["OWN", "PROBLEM", "to_world", "write"]
@@ -50,6 +52,7 @@ def write(
     texture: int,
     chosen: Sequence[str] = unknowns.DEFAULT,
     band: int = 0,
+    turntable: bool = False,
 ) -> None:
     """Write the problem and its stages to an empty folder.
 
@@ -62,13 +65,14 @@ def write(
         texture: texels along the sides of the textures.
         chosen: the unknowns, of `unknowns.NAMES`.
         band: pixels along the border of the masks that count little, of training views.
+        turntable: whether the light stands still before the cameras.
 
     Raises:
         InputError: a mask leaves no whole pixel.
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
-    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen))
+    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
     for part in _FOLDERS:
         (folder / part).mkdir()
     level, clipped = [], False
@@ -87,7 +91,7 @@ def write(
     # Numbers above 1 are no photograph's of 8 or 16 bits, which end at white.
     white = clipped and all(float(view.values.max()) <= 1.001 for view in views)
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
-    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))))
+    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
         moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
@@ -95,7 +99,7 @@ def write(
             text = _toml(name, [stems[i] for i in sensors], sensors, held_out, moved, loss)
             (folder / file).write_text(text, encoding="utf-8")
     note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
-    text = stages_file.text(unknowns.stages(chosen, Path(PROBLEM)), f"{note}. Written by `unrender import`.")
+    text = stages_file.text(unknowns.stages(chosen, Path(PROBLEM), turntable), f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 
 
@@ -151,20 +155,37 @@ def _toml(
     return "\n".join(parts)
 
 
-def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh, chosen: Sequence[str]) -> bytes:
+def _scene(
+    views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh, chosen: Sequence[str], turntable: bool
+) -> bytes:
     root = Xml.Element("scene", version="3.0.0")
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
-    for view, stem in zip(views, stems, strict=True):
+    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
         distance = float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0)))
-        root.append(_sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius)))
+        sensor = _sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius))
+        for name in ("shutter_open", "shutter_close") if turntable else ():
+            _value(sensor, "float", name, float(index))
+        root.append(sensor)
     shape = Xml.SubElement(root, "shape", type="ply", id="asset")
     _value(shape, "string", "filename", MESH)
     _material(shape, chosen)
-    light = Xml.SubElement(root, "emitter", type="envmap", id="light")
-    _value(light, "string", "filename", LIGHT)
+    _light(root, views, radius, turntable)
     Xml.indent(root)
     return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _light(root: Xml.Element, views: Sequence[CapturedView], radius: float, turntable: bool) -> None:
+    """An environment map; of a turntable, one that turns with the cameras."""
+    if turntable:
+        root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
+        turns = light_turns(np.array([view.camera_to_world for view in views]))
+        _value(root, "string", "turns", turntable_light.text(turns))
+        _value(root, "float", "distance", 1e4 * radius)
+        light = Xml.SubElement(root, "emitter", type="envmap", name="map")
+    else:
+        light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    _value(light, "string", "filename", LIGHT)
 
 
 def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:

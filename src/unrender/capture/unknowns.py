@@ -40,8 +40,8 @@ def parse(text: str) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in given)
 
 
-def keys(unknowns: Sequence[str]) -> dict[str, str]:
-    """{name: the parameter's key} of all names; under a normal map, the material is nested."""
+def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
+    """{name: the parameter's key} of all names; under a normal map, the material is nested, and so is the light of a turntable."""
     material = "asset.bsdf.nested_bsdf" if "normal" in unknowns else "asset.bsdf"
     return {
         "colour": f"{material}.base_color.data",
@@ -49,14 +49,14 @@ def keys(unknowns: Sequence[str]) -> dict[str, str]:
         "metallic": f"{material}.metallic.data",
         "normal": "asset.bsdf.normalmap.data",
         "shape": "asset.vertex_positions",
-        "light": "light.data",
+        "light": "light.map.data" if turntable else "light.data",
         "exposure": EXPOSURE,
     }
 
 
-def parameters(unknowns: Sequence[str], diagonal: float) -> list[dict[str, Any]]:
+def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False) -> list[dict[str, Any]]:
     """The [[parameters]] of a problem file. `diagonal`: of the mesh's bounding box, > 0."""
-    of = keys(unknowns)
+    of = keys(unknowns, turntable)
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
         "colour": unit,
@@ -85,9 +85,9 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
     return found
 
 
-def stages(unknowns: Sequence[str], problem: Path) -> Stages:
+def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
     """Light and colour at low resolution, then what shines, then the shape, then all."""
-    of, found = keys(unknowns), []
+    of, found = keys(unknowns, turntable), []
 
     def add(name: str, wanted: Sequence[str], share: float, coarser: int = 1) -> None:
         moved = [one for one in NAMES if one in unknowns and one in (*wanted, "exposure")]

@@ -53,6 +53,14 @@ _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
 ]
 
+_Turntable = Annotated[
+    bool | None,
+    typer.Option(
+        "--turntable/--no-turntable",
+        help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
+    ),
+]
+
 
 def import_(
     folder: _Folder,
@@ -71,6 +79,7 @@ def import_(
     texture: _Texture = 512,
     unknowns: _Unknowns = "colour,light",
     band: _Band = 0,
+    turntable: _Turntable = None,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
@@ -86,7 +95,20 @@ def import_(
 
     names = parse(unknowns)
     options = importing.Options(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band
+        mesh,
+        masks,
+        kind,
+        axes,
+        world_to_camera,
+        resolution,
+        scale,
+        hold_out,
+        voxels,
+        faces,
+        texture,
+        names,
+        band,
+        turntable,
     )
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
     place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
