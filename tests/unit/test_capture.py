@@ -18,11 +18,11 @@ import unrender
 from unrender.capture import atlas, formats, hull, importing, pictures
 from unrender.capture.cameras import Lens, project, rigid
 from unrender.capture.capture import Capture, Photograph
+from unrender.capture.captured_view import CapturedView
 from unrender.capture.conventions import AXES, pose, reinterpreted
 from unrender.capture.formats import colmap
 from unrender.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
 from unrender.capture.undistortion import Resampling, pinhole
-from unrender.capture.views import CapturedView
 from unrender.core.errors import InputError
 
 LENS = Lens(64, 64, 80.0, 80.0, 32.0, 32.0)

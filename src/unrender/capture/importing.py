@@ -10,14 +10,26 @@ import numpy as np
 from PIL import Image
 
 from unrender.backend import variant
-from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder, turntable
+from unrender.capture import (
+    atlas,
+    flips,
+    formats,
+    hull,
+    overlays,
+    photometric,
+    photometric_folder,
+    problem_folder,
+    turntable,
+)
 from unrender.capture import mesh as meshes
 from unrender.capture.capture import Capture
 from unrender.capture.conventions import reinterpreted
+from unrender.capture.formats import lights
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
+from unrender.capture.stored import StoredViews
 from unrender.capture.unknowns import DEFAULT
-from unrender.capture.views import CapturedView, prepare
+from unrender.capture.views import prepare
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.text import printable
@@ -31,7 +43,10 @@ CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
 """Along the longest side of the hull: memory grows with the cube."""
-TURNTABLE = "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
+TURNTABLE = (
+    "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
+)
+LIT_DEFAULT = ("colour", "normal")
 _OF_CHECK = {CHECK, SHEET}
 _OF_IMPORT = {*problem_folder.OWN, SHEET}
 
@@ -105,7 +120,7 @@ class Imported:
 @dataclass(frozen=True)
 class _Read:
     capture: Capture
-    views: list[CapturedView]
+    views: StoredViews
     mesh: Mesh
     silhouettes: Silhouettes
     overlaps: list[float]
@@ -123,6 +138,8 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
         InputError: which file, and what was expected; nothing is written then.
     """
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
+    if formats.is_lit(folder, options.kind):
+        return _import_lit(folder, out, options)
     found = _read(folder, options, unwrapped=True)
     if found.refusal:
         raise InputError(f"{folder}: {found.refusal}")
@@ -155,6 +172,23 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     return _imported(found, out, mesh)
 
 
+def _import_lit(folder: Path, out: Path, options: Options) -> Imported:
+    """One camera under known lights."""
+    variant.ensure()
+    capture = lights.read(folder, options.masks)
+    with phases.phase("photographs"):
+        views = photometric.prepare(capture, options.resolution, options.scale, options.hold_out)
+    name = folder.resolve().name
+    chosen = LIT_DEFAULT if options.unknowns == DEFAULT else options.unknowns
+    _write_folder(out, lambda place: photometric_folder.write(place, name, views, chosen))
+    held_out = sum(views.held_out)
+    notices = ["one camera under known lights: normals and colours of a plate, without shadows that it casts"]
+    if views.linear:
+        notices.append("values are taken as linear: a matt surface explains them better than as sRGB")
+    size = views.mask.shape[1], views.mask.shape[0]
+    return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 2, (), tuple(notices))
+
+
 def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
     """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
 
@@ -164,6 +198,8 @@ def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
         InputError: which file, and what was expected; nothing is written then.
     """
     _check_place(out, folder, options, _OF_CHECK)
+    if formats.is_lit(folder, options.kind):
+        raise InputError(f"{folder}: one camera under known lights has no poses to check")
     found = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:
@@ -215,10 +251,10 @@ def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
         views, notices = prepare(
             capture, options.resolution, options.scale, options.hold_out, lambda done, count: advance(done / count)
         )
-    if given is None and any(view.mask is None for view in views):
+    masked = all(views.masked)
+    if given is None and not masked:
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
-    masked = all(view.mask is not None for view in views)
-    training = [view for view in views if not view.held_out]
+    training = views.of(held_out=False)
     with phases.phase("shape"):
         try:
             mesh = given or hull.shape(training, options.voxels, options.faces)
@@ -250,13 +286,14 @@ def _overlay(found: _Read, index: int) -> np.ndarray:
 def _sheet(found: _Read, thumbnails: list[Image.Image]) -> bytes:
     """Of those of `overlays.chosen`."""
     overlaps = [f"IoU {value:.3f}  " for value in found.overlaps] or [""] * len(found.views)
-    labels = [f"{overlaps[index]}{printable(found.views[index].name)}" for index in overlays.chosen(len(found.views))]
+    names = [view.name for view in found.views.bare()]
+    labels = [f"{overlaps[index]}{printable(names[index])}" for index in overlays.chosen(len(names))]
     return overlays.contact_sheet(thumbnails, labels)
 
 
 def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:
-    held_out = sum(view.held_out for view in found.views)
-    size = max((view.lens.width, view.lens.height) for view in found.views)
+    held_out = sum(view.held_out for view in found.views.bare())
+    size = max((view.lens.width, view.lens.height) for view in found.views.bare())
     counts = len(found.views) - held_out, held_out
     return Imported(out, found.capture.kind, *counts, size, len(mesh.faces), tuple(found.overlaps), found.notices)
 

@@ -6,11 +6,9 @@ background: it stands still in the photographs although the poses differ.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from unrender.capture.views import CapturedView
+from unrender.capture.captured_view import CapturedViews
 
 __all__ = ["axis", "light_turns", "stands_still"]
 
@@ -53,14 +51,14 @@ def light_turns(poses: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def stands_still(views: Sequence[CapturedView]) -> bool:
+def stands_still(views: CapturedViews) -> bool:
     """Whether the background is the same in photographs whose poses differ by more than 20 degrees, all from one height."""
     poses = np.array([view.camera_to_world for view in views])
     seen = poses[:, :3, :3].transpose(0, 2, 1) @ axis(poses)
     return float(np.linalg.norm(seen.mean(0))) > _LEVEL and likeness(views) > _LIKENESS
 
 
-def likeness(views: Sequence[CapturedView]) -> float:
+def likeness(views: CapturedViews) -> float:
     """The mean correlation of two photographs' backgrounds, over pairs whose poses differ by more than 20 degrees; 0 where it is unknown.
 
     Of the background's variation along each row alone: what is above and what is below are alike wherever one stands.

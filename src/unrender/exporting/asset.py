@@ -152,7 +152,7 @@ def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None,
         before = np.eye(3)
         if turntable_light.is_turntable(emitter):
             notices.append(f"{emitter.id() or 'light'}: a turntable's, as it stood before the first camera")
-            before, emitter = turntable_light.turns(emitter)[0], emitter.map  # noqa: PLW2901
+            before, emitter = turntable_light.turns(emitter)[0], emitter.map
         values: Any = mi.traverse(emitter)
         if emitter.class_name() == "EnvironmentMapEmitter":
             pixels = np.array(values["data"])[:, 1:-1, :3]  # without the columns that Mitsuba repeats
