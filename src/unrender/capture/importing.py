@@ -102,7 +102,7 @@ class Imported:
         views: count of training views.
         held_out: count of held-out views.
         size: width and height of the largest view.
-        faces: of the mesh.
+        faces: of the mesh; 0 where there is none to look at.
         overlaps: of the mesh's silhouettes with the masks, in order of the views; none where there are no masks.
         notices: one line for each thing that was left out or changed.
     """
@@ -186,7 +186,7 @@ def _import_lit(folder: Path, out: Path, options: Options) -> Imported:
     if views.linear:
         notices.append("values are taken as linear: a matt surface explains them better than as sRGB")
     size = views.mask.shape[1], views.mask.shape[0]
-    return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 2, (), tuple(notices))
+    return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
 
 
 def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:

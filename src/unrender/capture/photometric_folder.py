@@ -64,7 +64,9 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
         InputError: the mask leaves no whole pixel, or an unknown is none of such a problem.
     """
     if others := [one for one in chosen if one not in NAMES]:
-        raise InputError(f"--unknowns {others[0]}: of one camera under known lights, expected some of {', '.join(NAMES)}")
+        raise InputError(
+            f"--unknowns {others[0]}: of one camera under known lights, expected some of {', '.join(NAMES)}"
+        )
     for part in (REFERENCES, MASKS, TEXTURES):
         (folder / part).mkdir()
     inside = ndimage.binary_erosion(views.mask > 0.999, np.ones((3, 3)), border_value=1)
@@ -115,8 +117,8 @@ def _scene(views: LitViews, strength: float) -> bytes:
     Xml.SubElement(transform, "scale", x="1", y=repr(height / width), z="1")
     normal = Xml.SubElement(plate, "bsdf", type="normalmap")
     add_value(normal, "boolean", "use_shadowing_function", "false")
-    add_texture(normal, "normalmap", _NORMAL, raw=True, upright=True)
-    add_texture(Xml.SubElement(normal, "bsdf", type="diffuse"), "reflectance", _COLOUR, raw=True, upright=True)
+    add_texture(normal, "normalmap", _NORMAL, raw=True, pixels=True)
+    add_texture(Xml.SubElement(normal, "bsdf", type="diffuse"), "reflectance", _COLOUR, raw=True, pixels=True)
     light = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
     add_value(light, "string", "turns", turntable_light.text(np.array([_towards(d) for d in views.directions])))
     add_value(light, "float", "distance", _FAR)

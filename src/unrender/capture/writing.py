@@ -44,7 +44,7 @@ def add_value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
     Xml.SubElement(parent, kind, name=name, value=text)
 
 
-def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, upright: bool = False) -> None:
+def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bool = False) -> None:
     """A picture as the property `name` of a BSDF.
 
     Args:
@@ -52,14 +52,15 @@ def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, upright: b
         name: of the property.
         file: below the folder of textures.
         raw: whether it holds other things than colours.
-        upright: whether the first row is at v = 1; else at v = 0, as where an atlas says so.
+        pixels: whether texels are pixels of a picture, whose first row is at v = 1: then nothing is interpolated.
     """
     texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
     for key, value in (("filename", f"{TEXTURES}/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):
         add_value(texture, "string", key, value)
     if raw:
         add_value(texture, "boolean", "raw", "true")
-    if upright:
+    if pixels:
+        add_value(texture, "string", "filter_type", "nearest")
         transform = Xml.SubElement(texture, "transform", name="to_uv")
         Xml.SubElement(transform, "scale", x="1", y="-1")
         Xml.SubElement(transform, "translate", x="0", y="1")

@@ -1,4 +1,4 @@
-"""`unrender import`: a folder of posed photographs as a problem."""
+"""`unrender import`: a folder of photographs as a problem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["import_"]
 
 
 _Folder = Annotated[
-    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model or poses_bounds.npy.")
+    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model, poses_bounds.npy or lights.txt.")
 ]
 _Mesh = Annotated[
     Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
@@ -37,7 +37,9 @@ _HoldOut = Annotated[
     int | None,
     typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
 ]
-_Kind = Annotated[str | None, typer.Option("--format", help="transforms, colmap or llff, where several are there.")]
+_Kind = Annotated[
+    str | None, typer.Option("--format", help="transforms, colmap, llff or lights, where several are there.")
+]
 _Axes = Annotated[str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")]
 _Direction = Annotated[
     bool | None,
@@ -127,11 +129,17 @@ def import_(
     console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
     if refusal:
         raise InputError(f"{folder}: {refusal}")
-    if not check:
-        console.print(f"to look at: {place / importing.SHEET}", soft_wrap=True, markup=False)
-        console.print(f"next: unrender run {shlex.quote(str(written))} --seconds 60", soft_wrap=True, markup=False)
-        staged = place / importing.STAGES
-        console.print(f"in stages: unrender run {shlex.quote(str(staged))} --seconds 300", soft_wrap=True, markup=False)
+    if check:
+        return
+    names = (
+        (importing.SHEET, "to look at", ""),
+        (importing.PROBLEM, "next", "60"),
+        (importing.STAGES, "in stages", "300"),
+    )
+    for file, what, seconds in names:
+        if (path := place / file).is_file():
+            command = f"unrender run {shlex.quote(str(path))} --seconds {seconds}" if seconds else path
+            console.print(f"{what}: {command}", soft_wrap=True, markup=False)
 
 
 def _tell(console: Console, found: Imported) -> None:
@@ -140,9 +148,8 @@ def _tell(console: Console, found: Imported) -> None:
     for notice in found.notices:
         console.print(f"note: {notice}", soft_wrap=True, markup=False)
     counts = f"{found.views} photographs and {found.held_out} held out"
-    console.print(
-        f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}; a mesh of {found.faces} faces", markup=False
-    )
+    shape = f"; a mesh of {found.faces} faces" if found.faces else ""
+    console.print(f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}{shape}", markup=False)
     if found.overlaps:
         worst = min(found.overlaps)
         console.print(

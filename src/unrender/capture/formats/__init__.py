@@ -72,7 +72,9 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             return capture
     if kind is not None:
         raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
-    raise InputError(f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}")
+    raise InputError(
+        f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}"
+    )
 
 
 def _check_photographs(capture: Capture) -> None:

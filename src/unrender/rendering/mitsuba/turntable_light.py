@@ -2,10 +2,10 @@
 
     {"type": "turntable", "turns": "w x y z, w x y z, ...", "map": an envmap, constant or directional}
 
-On a turntable the light stands still and the object turns; the scene's world is the object's, so it is the light that turns. A ray's time says how far: light of row i of `turns` (unit quaternions,
-from the map's axes to the world's) reaches rays of times i - 1/2 to i + 1/2. Sensors have i as `shutter_open` and `shutter_close`, which
-all integrators carry along, Mitsuba's own, too. Times outside of the table have its first or last row. `distance`, 10^6 where it is not
-given, is how far away the light is for shadows: larger than the scene.
+On a turntable the light stands still and the object turns. The scene's world is the object's, so it is the light that turns. A ray's time
+says how far: light of row i of `turns` (unit quaternions, from the map's axes to the world's) reaches rays of times i - 1/2 to i + 1/2.
+Sensors have i as `shutter_open` and `shutter_close`, which all integrators carry along, Mitsuba's own, too. Times outside of the table have
+its first or last row. `distance`, 10^6 where it is not given, is how far away the light is for shadows: larger than the scene.
 """
 
 from __future__ import annotations
@@ -98,7 +98,9 @@ def _plugin(variant: str) -> type:
             super().__init__(properties)
             self.map = properties.get(_MAP, None)
             if not isinstance(self.map, mi.Emitter) or not mi.has_flag(self.map.flags(), mi.EmitterFlags.Infinite):
-                raise InputError(f"emitter {PLUGIN}: {_MAP} must be light from afar, such as an envmap or a directional")
+                raise InputError(
+                    f"emitter {PLUGIN}: {_MAP} must be light from afar, such as an envmap or a directional"
+                )
             self.rows = _rows(properties)
             self.m_flags = self.map.flags()
             self.table = mi.Float(self.rows.astype(np.float32).ravel())
