@@ -22,6 +22,7 @@ import unrender as ur
 from benchmarks.internals import dr, from_tensor, project, stock_scene
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import scratch
+from unrender import methods
 from unrender.capture import importing
 from unrender.judging.measures import measure
 
@@ -138,7 +139,7 @@ def run(
     found["projection"] = {"psnr": [judge.psnr(lambda view: projection.picture(judge.problem, view))]}
     print({name: np.mean(row["psnr"]) for name, row in found.items()}, flush=True)
     for name in method:
-        parts = ur_method(name, problem)
+        parts = method_parts(name, problem)
         rows = found.setdefault(name, {"psnr": [], "steps": [], "settings": METHODS[name]})
         for seed in range(seeds):
             result = ur.optimize(problem, *parts, seconds=seconds, seed=seed)
@@ -164,9 +165,7 @@ def run(
     return {"sizes": sizes, "found": found, "grid": grid, "seconds": seconds}
 
 
-def ur_method(name: str, problem: ur.Problem) -> tuple[Any, Any]:
+def method_parts(name: str, problem: ur.Problem) -> tuple[Any, Any]:
     """Estimator and optimizer of a method for the problem."""
-    from unrender import methods
-
     choice = methods.method(name).choose(problem, METHODS[name])
     return choice.estimator, choice.optimizer

@@ -17,7 +17,8 @@ from unrender.stages.stages_file import Stage, Stages
 __all__ = ["DEFAULT", "NAMES", "keys", "parameters", "parse", "stages", "textures"]
 
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure")
-DEFAULT = ("colour", "light")
+DEFAULT = ("colour", "roughness", "metallic", "light")
+_MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _METALLIC = 0.1
 """Above 0, which is a bound."""
@@ -26,6 +27,8 @@ _FLAT = (0.5, 0.5, 1.0)
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 """Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
 _COARSER = 4
+_MANY, _PIXELS, _SPP = 1 << 18, 1 << 14, 8
+"""Pixels of all views beyond which stages take so many of them a step, and so many samples of each."""
 
 
 def parse(text: str) -> tuple[str, ...]:
@@ -85,17 +88,29 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
     return found
 
 
-def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Light and colour at low resolution, then what shines, then the shape, then all."""
+def stages(unknowns: Sequence[str], problem: Path, pixels: int, turntable: bool = False) -> Stages:
+    """Materials and light at low resolution, then in full, then normals, then the shape.
+
+    Args:
+        unknowns: of `NAMES`.
+        problem: its file.
+        pixels: of all training views.
+        turntable: see `keys`.
+    """
     of, found = keys(unknowns, turntable), []
+    moved: list[str] = []
 
-    def add(name: str, wanted: Sequence[str], share: float, coarser: int = 1) -> None:
-        moved = [one for one in NAMES if one in unknowns and one in (*wanted, "exposure")]
-        if any(one in wanted for one in moved):
-            found.append(Stage(name, tuple(of[one] for one in moved), share, coarser))
+    def add(name: str, more: Sequence[str], share: float, coarser: int = 1) -> None:
+        given = [one for one in more if one in unknowns]
+        if given:
+            moved.extend(one for one in given if one not in moved)
+            exposed = [one for one in NAMES if one in unknowns and one in (*moved, "exposure")]
+            found.append(Stage(name, tuple(of[one] for one in exposed), share, coarser))
 
-    add("light-and-colour", ("colour", "light"), 1.0, _COARSER)
-    add("roughness", ("roughness", "metallic"), 1.0)
-    add("shape", ("shape", "normal"), 1.0)
-    add("all", NAMES, 2.0)
-    return Stages(problem, tuple(found))
+    add("coarse-materials", _MATERIALS, 1.0, _COARSER)
+    add("materials", _MATERIALS, 3.0)
+    add("normals", ("normal",), 1.0)
+    add("shape", ("shape",), 1.0)
+    # L1 of a noisy image pulls away from what is noisy, so that a few pixels with many samples tell more than many pixels with few.
+    settings = {"pixels": _PIXELS, "spp": _SPP} if pixels > _MANY else None
+    return Stages(problem, tuple(found or [Stage("exposure", (of["exposure"],))]), settings=settings)

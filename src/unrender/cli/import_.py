@@ -79,7 +79,7 @@ def import_(
     voxels: _Voxels = 96,
     faces: _Faces = 10_000,
     texture: _Texture = 512,
-    unknowns: _Unknowns = "colour,light",
+    unknowns: _Unknowns = "colour,roughness,metallic,light",
     band: _Band = 0,
     turntable: _Turntable = None,
     overwrite: Overwrite = False,
