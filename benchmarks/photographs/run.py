@@ -103,7 +103,7 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
 def prepare(photographs: Path, folder: Path, resolution: int, texture: int, faces: int) -> None:
     """Import the photographs."""
     shutil.rmtree(folder, ignore_errors=True)
-    options = importing.Options(resolution=resolution, texture=texture, faces=faces, unknowns=UNKNOWNS)
+    options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=UNKNOWNS)
     importing.import_capture(photographs, folder, options)
 
 

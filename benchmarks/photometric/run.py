@@ -40,7 +40,7 @@ def run(
     """
     folder = scratch("photometric/plate")
     shutil.rmtree(folder, ignore_errors=True)
-    importing.import_capture(photographs, folder, importing.Options(resolution=resolution))
+    importing.import_capture(photographs, folder, importing.ImportOptions(resolution=resolution))
     views = photometric.prepare(lights.read(photographs), resolution, None, None)
     problem, held_out = (ur.Problem.from_file(folder / name) for name in ("problem.toml", "held-out.toml"))
     inside = np.asarray(problem.views[0].mask) > 0

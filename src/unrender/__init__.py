@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from unrender import (
         smoothing as smoothed,
     )
+    from unrender.capture.importing import ImportOptions, import_capture
     from unrender.cli.sweep_function import sweep
     from unrender.core.random import Key
     from unrender.core.registry import register
@@ -88,6 +89,7 @@ _HOMES = {
     "Estimate": "estimators.base",
     "FilteredGradient": "estimators.filtered",
     "Grid": "io.volumes",
+    "ImportOptions": "capture.importing",
     "Key": "core.random",
     "Live": "runs.live",
     "LossValues": "estimators.loss_values",
@@ -104,6 +106,7 @@ _HOMES = {
     "deal": "dealing.deal",
     "estimate": "runs.optimize",
     "export": "exporting.scene_folder",
+    "import_capture": "capture.importing",
     "judge": "judging.judge",
     "optimize": "runs.optimize",
     "read_grid": "io.volumes",
@@ -127,6 +130,7 @@ __all__ = [
     "Estimate",
     "FilteredGradient",
     "Grid",
+    "ImportOptions",
     "InputError",
     "Key",
     "Live",
@@ -148,6 +152,7 @@ __all__ = [
     "export",
     "gallery",
     "images",
+    "import_capture",
     "judge",
     "losses",
     "metrics",

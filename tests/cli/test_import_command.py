@@ -321,7 +321,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "a raw file": (_raw, "view_2.nef: camera raw files are not read; develop them to .exr"),
     "a photograph twice": (_frame("file_path", "images/view_1.png"), "view_1.png: given twice, with different poses"),
     "frames in a table": (_top("frames", {"0": {}}), "transforms.json: frames: expected a list of at least one frame"),
-    "a frame of words": (_top("frames", ["images/view_0.png"]), "transforms.json: frames[0]: expected a table with file_path"),
+    "a frame of words": (
+        _top("frames", ["images/view_0.png"]),
+        "transforms.json: frames[0]: expected a table with file_path",
+    ),
     "a lens in words": (_top("k1", "barrel"), "k1: expected a number, got 'barrel'"),
 }
 

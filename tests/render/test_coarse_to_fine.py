@@ -471,7 +471,9 @@ def test_the_scene_takes_each_resolution(folder: Path) -> None:
     assert found.coarse_to_fine[WALL] == ur.CoarseToFine((2, 4))
     assert found.coarse_to_fine[SMOKE] == ur.CoarseToFine((3,), states="reset")
     scenes = Scenes()
-    result = ur.optimize(found, *PAIRS["coupled"], 5, callbacks=[scenes], run_directory=folder / "run", checkpoint_every=1)
+    result = ur.optimize(
+        found, *PAIRS["coupled"], 5, callbacks=[scenes], run_directory=folder / "run", checkpoint_every=1
+    )
     expected = [(2, 2), (2, 2), (4, 2), (4, 4), (8, 4)]
     for step, seen in enumerate(scenes.seen):
         assert all(each == expected[step] for each in seen)

@@ -28,16 +28,17 @@ from unrender.capture.formats import lights
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
 from unrender.capture.stored import StoredViews
-from unrender.capture.unknowns import DEFAULT
+from unrender.capture.unknowns import DEFAULT, parse
 from unrender.capture.views import prepare
-from unrender.core import phases
+from unrender.core import checks, phases
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.io import files
 from unrender.stages import stages_file
 
-__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "Imported", "Options", "check", "import_capture"]
+__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "ImportOptions", "Imported", "check", "import_capture"]
 
 CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
@@ -52,7 +53,7 @@ _OF_IMPORT = {*problem_folder.OWN, SHEET}
 
 
 @dataclass(frozen=True)
-class Options:
+class ImportOptions:
     """How a capture is read.
 
     Attributes:
@@ -72,8 +73,8 @@ class Options:
         turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
     """
 
-    mesh: Path | None = None
-    masks: Path | None = None
+    mesh: str | Path | None = None
+    masks: str | Path | None = None
     kind: str | None = None
     axes: str | None = None
     world_to_camera: bool | None = None
@@ -88,7 +89,13 @@ class Options:
     turntable: bool | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.voxels <= MOST_VOXELS:
+        for name in ("mesh", "masks"):
+            given = getattr(self, name)
+            object.__setattr__(self, name, None if given is None else Path(given))
+        object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
+        for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
+            checks.integer("import", name, getattr(self, name), at_least=least)
+        if self.voxels > MOST_VOXELS:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
 
 
@@ -129,14 +136,30 @@ class _Read:
     refusal: str
 
 
-def import_capture(folder: Path, out: Path, options: Options) -> Imported:
-    """Write the problem of a folder of posed photographs: scene.xml, problem.toml, held-out.toml, references, masks, mesh, and check.png.
+@exclusive("import_capture")
+def import_capture(
+    folder: str | Path, out: str | Path, options: ImportOptions | None = None, overwrite: bool = False
+) -> Imported:
+    """Write the problem of a folder of photographs: scene, problem files, stages, references, masks, mesh, check.png.
 
-    What stands at `out` is replaced in one instant, and only when all is written. It may be an earlier import or check, nothing else.
+    Of one camera under known lights, there are neither stages nor a mesh.
+
+    Args:
+        folder: with photographs and their cameras, or lights.
+        out: a folder to be made.
+        options: None for the defaults.
+        overwrite: whether an earlier import or check may be replaced: in one instant, and only when all is written.
+
+    Returns:
+        what was found.
 
     Raises:
         InputError: which file, and what was expected; nothing is written then.
     """
+    folder, out = Path(folder), Path(out)
+    options = options or ImportOptions()
+    if not overwrite and out.is_dir() and any(out.iterdir()):
+        raise InputError(f"import_capture: {out}: not empty; give overwrite=True to replace an earlier import")
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
     if formats.is_lit(folder, options.kind):
         return _import_lit(folder, out, options)
@@ -172,7 +195,7 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     return _imported(found, out, mesh)
 
 
-def _import_lit(folder: Path, out: Path, options: Options) -> Imported:
+def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """One camera under known lights."""
     variant.ensure()
     capture = lights.read(folder, options.masks)
@@ -189,7 +212,7 @@ def _import_lit(folder: Path, out: Path, options: Options) -> Imported:
     return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
 
 
-def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
+def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
     """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
 
     Returns what was found, and in one line which convention looks wrong, "" where none does.
@@ -217,7 +240,7 @@ def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
     return _imported(found, out, found.mesh), found.refusal
 
 
-def _check_place(out: Path, folder: Path, options: Options, own: set[str]) -> None:
+def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str]) -> None:
     """Raise `InputError` where replacing `out` would remove more than an earlier import's or check's files, `own`."""
     place = out.resolve()
     if out.name in ("", "..") or Path.cwd().is_relative_to(place):
@@ -233,7 +256,7 @@ def _check_place(out: Path, folder: Path, options: Options, own: set[str]) -> No
         raise InputError(f"--out {out}: holds other things, such as {printable(others[0])}; give a new one")
 
 
-def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
+def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     """What the folder holds, its shape and how they fit; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
     capture = formats.read(folder, options.kind, options.masks)

@@ -96,7 +96,7 @@ def import_(
     from unrender.capture.unknowns import parse
 
     names = parse(unknowns)
-    options = importing.Options(
+    options = importing.ImportOptions(
         mesh,
         masks,
         kind,
@@ -121,7 +121,7 @@ def import_(
             if check:
                 found, refusal = importing.check(folder, place, options)
             else:
-                found = importing.import_capture(folder, place, options)
+                found = importing.import_capture(folder, place, options, overwrite=True)
     finally:
         arguments.remove_if_empty(place)
     _tell(console, found)
