@@ -110,8 +110,7 @@ def write(
             text = problem_text(name, listed, held_out, moved, loss, _MAX_DEPTH)
             (folder / file).write_text(text, encoding="utf-8")
     note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
-    pixels = sum(view.lens.width * view.lens.height for view in views if not view.held_out)
-    stages = unknowns.stages(chosen, Path(PROBLEM), pixels, turntable)
+    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 

@@ -27,8 +27,6 @@ _FLAT = (0.5, 0.5, 1.0)
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 """Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
 _COARSER = 4
-_MANY, _PIXELS, _SPP = 1 << 18, 1 << 14, 8
-"""Pixels of all views beyond which stages take so many of them a step, and so many samples of each."""
 
 
 def parse(text: str) -> tuple[str, ...]:
@@ -88,15 +86,8 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
     return found
 
 
-def stages(unknowns: Sequence[str], problem: Path, pixels: int, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the shape.
-
-    Args:
-        unknowns: of `NAMES`.
-        problem: its file.
-        pixels: of all training views.
-        turntable: see `keys`.
-    """
+def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
+    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving."""
     of, found = keys(unknowns, turntable), []
     moved: list[str] = []
 
@@ -111,6 +102,4 @@ def stages(unknowns: Sequence[str], problem: Path, pixels: int, turntable: bool 
     add("materials", _MATERIALS, 3.0)
     add("normals", ("normal",), 1.0)
     add("shape", ("shape",), 1.0)
-    # L1 of a noisy image pulls away from what is noisy, so that a few pixels with many samples tell more than many pixels with few.
-    settings = {"pixels": _PIXELS, "spp": _SPP} if pixels > _MANY else None
-    return Stages(problem, tuple(found or [Stage("exposure", (of["exposure"],))]), settings=settings)
+    return Stages(problem, tuple(found or [Stage("exposure", (of["exposure"],))]))
