@@ -67,7 +67,7 @@ class Judge:
 
 
 def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int, seed: int) -> tuple[dict, int]:
-    """The usual loop over random views; its values, and how many steps it took. Two steps of warm-up do not count."""
+    """The usual loop over random views; its values, and how many steps it took. A step with each view, to warm up, does not count."""
     scene, parameters = stock_scene(problem)
     integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
     start, rng, step = problem.initial(), np.random.default_rng(seed), 0
@@ -78,14 +78,21 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
             optimizer[key] = from_tensor(value, parameters[key])
         parameters.update(optimizer)
         clock, step = 0.0, 0
-        while clock < seconds and not (warm and step == 2):
+        while step < len(problem.views) if warm else clock < seconds:
             began = time.perf_counter()
             loss: Any = 0.0
-            for view in rng.choice(len(problem.views), min(views, len(problem.views)), replace=False):
+            drawn = rng.choice(len(problem.views), min(views, len(problem.views)), replace=False)
+            for view in [step] if warm else drawn:
                 number = int(rng.integers(1 << 30))
                 sensor = problem.views[view].sensor
                 image = mi.render(
-                    scene, parameters, sensor=sensor, integrator=integrator, spp=spp, seed=number, seed_grad=number + 1
+                    scene,
+                    parameters,
+                    sensor=sensor,
+                    integrator=integrator,
+                    spp=1 if warm else spp,
+                    seed=number,
+                    seed_grad=number + 1,
                 )
                 loss += problem.loss_value(int(view), image)
             dr.backward(loss)

@@ -73,8 +73,8 @@ class ImportOptions:
         turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
     """
 
-    mesh: str | Path | None = None
-    masks: str | Path | None = None
+    mesh: Path | None = None
+    masks: Path | None = None
     kind: str | None = None
     axes: str | None = None
     world_to_camera: bool | None = None

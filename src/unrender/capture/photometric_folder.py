@@ -69,15 +69,16 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
         )
     for part in (REFERENCES, MASKS, TEXTURES):
         (folder / part).mkdir()
-    inside = ndimage.binary_erosion(views.mask > 0.999, np.ones((3, 3)), border_value=1)
+    inside: np.ndarray = np.asarray(ndimage.binary_erosion(views.mask > 0.999, np.ones((3, 3)), border_value=1))
     if not inside.any():
         raise InputError(f"{name}: the mask leaves no whole pixel; give a larger --resolution")
     chosen_views = views.training
-    _, colour = least_squares(views.values[chosen_views][:, inside], views.directions[chosen_views])
+    seen: np.ndarray = views.values[chosen_views]
+    _, colour = least_squares(seen[:, inside], views.directions[chosen_views])
     strength = max(float(np.quantile(colour.max(1), 0.99)) / _BRIGHTEST, 1e-4)
     height, width = views.mask.shape
     write_exr(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
-    write_exr(np.broadcast_to(np.float32([0.5, 0.5, 1.0]), (height, width, 3)), folder / TEXTURES / _NORMAL)
+    write_exr(np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / TEXTURES / _NORMAL)
     (folder / SCENE).write_bytes(_scene(views, strength))
     (folder / MASKS / "mask.png").write_bytes(png(np.repeat(inside[..., None], 3, 2).astype(np.float32)))
     tables: list[list[dict[str, object]]] = [[], []]

@@ -151,9 +151,11 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     root = Xml.Element("scene", version="3.0.0")
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
+    distances = [float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0))) for view in views]
+    # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
+    clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
-        distance = float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0)))
-        sensor = _sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius))
+        sensor = _sensor(view, stem, *clip)
         for name in ("shutter_open", "shutter_close") if turntable else ():
             add_value(sensor, "float", name, float(index))
         root.append(sensor)
