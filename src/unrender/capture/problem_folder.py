@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -99,6 +100,17 @@ def write(
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
     tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
+    _write_problems(folder, name, views, stems, tables, loss)
+    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
+    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
+    text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
+    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
+
+
+def _write_problems(
+    folder: Path, name: str, views: CapturedViews, stems: Sequence[str], tables: Sequence[dict], loss: Any
+) -> None:
+    """The files of the training views and of those that are held out; `tables`: of the parameters."""
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
         moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
@@ -109,10 +121,6 @@ def write(
             ]
             text = problem_text(name, listed, held_out, moved, loss, _MAX_DEPTH)
             (folder / file).write_text(text, encoding="utf-8")
-    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
-    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
-    text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
-    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:

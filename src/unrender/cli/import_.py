@@ -96,22 +96,11 @@ def import_(
     from unrender.capture.unknowns import parse
 
     names = parse(unknowns)
+    # fmt: off
     options = importing.ImportOptions(
-        mesh,
-        masks,
-        kind,
-        axes,
-        world_to_camera,
-        resolution,
-        scale,
-        hold_out,
-        voxels,
-        faces,
-        texture,
-        names,
-        band,
-        turntable,
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable
     )
+    # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
     place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
     refusal = ""
@@ -129,8 +118,13 @@ def import_(
     console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
     if refusal:
         raise InputError(f"{folder}: {refusal}")
-    if check:
-        return
+    if not check:
+        _tell_next(console, place)
+
+
+def _tell_next(console: Console, place: Path) -> None:
+    from unrender.capture import importing
+
     names = (
         (importing.SHEET, "to look at", ""),
         (importing.PROBLEM, "next", "60"),

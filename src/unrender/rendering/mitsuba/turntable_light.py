@@ -87,6 +87,15 @@ def _rows(properties: Any) -> np.ndarray:
     return found / length
 
 
+def _rotated(table: Any, rows: int, vector: Any, time: Any, back: bool) -> Any:
+    """A vector of the map's axes in the world's; `back`: of the world's in the map's. `table`: quaternions, `mi.Float` (4 * rows,)."""
+    row = mi.UInt32(dr.clip(dr.round(mi.Float(time)), 0, rows - 1))
+    w, x, y, z = (dr.gather(mi.Float, table, 4 * row + k) for k in range(4))
+    axis: Any = mi.Vector3f(x, y, z)
+    across: Any = 2 * dr.cross(axis, vector)
+    return mi.Vector3f(vector + (-w if back else w) * across + dr.cross(axis, across))
+
+
 @cache
 def _plugin(variant: str) -> type:
     del variant  # the base class is that of the variant that is set
@@ -120,13 +129,7 @@ def _plugin(variant: str) -> type:
             return mi.ScalarBoundingBox3f()
 
         def _turned(self, vector: Any, time: Any, back: bool = False) -> Any:
-            """A vector of the map's axes in the world's; `back`: of the world's in the map's."""
-            row = mi.UInt32(dr.clip(dr.round(mi.Float(time)), 0, len(self.rows) - 1))
-            w, x, y, z = (dr.gather(mi.Float, self.table, 4 * row + k) for k in range(4))
-            axis: Any = mi.Vector3f(x, y, z)
-            w = -w if back else w
-            across: Any = 2 * dr.cross(axis, vector)
-            return mi.Vector3f(vector + w * across + dr.cross(axis, across))
+            return _rotated(self.table, len(self.rows), vector, time, back)
 
         def eval(self, si: Any, active: Any = True) -> Any:
             local = mi.SurfaceInteraction3f(si)
