@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from unrender import (
         smoothing as smoothed,
     )
+    from unrender.capture.importing import ImportOptions, import_capture
     from unrender.cli.sweep_function import sweep
     from unrender.core.random import Key
     from unrender.core.registry import register
@@ -90,6 +91,7 @@ _HOMES = {
     "FilteredGradient": "estimators.filtered",
     "Grid": "io.volumes",
     "HybridGradient": "estimators.hybrid",
+    "ImportOptions": "capture.importing",
     "Key": "core.random",
     "Live": "runs.live",
     "LossValues": "estimators.loss_values",
@@ -106,6 +108,7 @@ _HOMES = {
     "deal": "dealing.deal",
     "estimate": "runs.optimize",
     "export": "exporting.scene_folder",
+    "import_capture": "capture.importing",
     "judge": "judging.judge",
     "optimize": "runs.optimize",
     "read_grid": "io.volumes",
@@ -130,6 +133,7 @@ __all__ = [
     "FilteredGradient",
     "Grid",
     "HybridGradient",
+    "ImportOptions",
     "InputError",
     "Key",
     "Live",
@@ -151,6 +155,7 @@ __all__ = [
     "export",
     "gallery",
     "images",
+    "import_capture",
     "judge",
     "losses",
     "metrics",

@@ -21,7 +21,7 @@ from tiers import quick
 from unrender.capture import formats, importing
 from unrender.capture.cameras import FISHEYE, Lens, project
 from unrender.capture.conventions import reinterpreted
-from unrender.capture.importing import Options
+from unrender.capture.importing import ImportOptions
 from unrender.capture.views import prepare
 from unrender.io import images
 
@@ -76,7 +76,7 @@ def test_the_imported_scene_renders_what_the_photographs_show(name: str, mesh: P
     lens, write = CASES[name]
     shots = made.shots(mesh, lens, 3)
     write(tmp_path / "capture", shots, lens)
-    options = Options(mesh=mesh, resolution=48, hold_out=0, texture=4)
+    options = ImportOptions(mesh=mesh, resolution=48, hold_out=0, texture=4)
     found = importing.import_capture(tmp_path / "capture", tmp_path / "problem", options)
     assert min(found.overlaps) > 0.97
     shown = _references(tmp_path / "problem")
@@ -92,7 +92,9 @@ def test_a_shift_of_a_fraction_of_a_pixel_would_be_seen(mesh: Path, tmp_path: Pa
     """The fault that the test above is to catch: pixel centres taken at whole numbers."""
     wrong = Lens(PINHOLE.width, PINHOLE.height, PINHOLE.fx, PINHOLE.fy, PINHOLE.cx - 0.5, PINHOLE.cy - 0.5)
     made.write_transforms(tmp_path / "capture", made.shots(mesh, PINHOLE, 3), wrong)
-    importing.import_capture(tmp_path / "capture", tmp_path / "problem", Options(mesh=mesh, hold_out=0, texture=4))
+    importing.import_capture(
+        tmp_path / "capture", tmp_path / "problem", ImportOptions(mesh=mesh, hold_out=0, texture=4)
+    )
     shown = _references(tmp_path / "problem")
     for picture, (reference, mask) in zip(_normals(tmp_path / "problem"), shown, strict=True):
         assert np.abs(picture - reference)[mask].mean() > 0.006
@@ -157,7 +159,9 @@ def test_the_layout_of_synthetic4relight(mesh: Path, tmp_path: Path) -> None:
 
 
 def _check_split(place: Path, name: str, mesh: Path) -> None:
-    found = importing.import_capture(place / name, place / "problem", Options(mesh=mesh, resolution=48, texture=4))
+    found = importing.import_capture(
+        place / name, place / "problem", ImportOptions(mesh=mesh, resolution=48, texture=4)
+    )
     assert (found.views, found.held_out) == (3, 1)
     assert min(found.overlaps) > 0.97
     for picture, (reference, mask) in zip(_normals(place / "problem"), _references(place / "problem"), strict=True):
@@ -170,7 +174,7 @@ def test_the_hull_of_real_masks_covers_them(assets: Path, tmp_path: Path) -> Non
     folder = assets / "photographs" / "ethiopian-head"
     if not folder.is_dir():
         pytest.skip(f"no photographs: {folder} is not a folder")
-    found, refusal = importing.check(folder, tmp_path / "check", Options(resolution=125, voxels=64))
+    found, refusal = importing.check(folder, tmp_path / "check", ImportOptions(resolution=125, voxels=64))
     assert refusal == ""
     assert (found.views, found.held_out) == (57, 9)
     assert np.mean(found.overlaps[::8]) > 0.95  # those held out

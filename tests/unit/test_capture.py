@@ -18,11 +18,11 @@ import unrender
 from unrender.capture import atlas, formats, hull, importing, pictures
 from unrender.capture.cameras import Lens, project, rigid
 from unrender.capture.capture import Capture, Photograph
+from unrender.capture.captured_view import CapturedView
 from unrender.capture.conventions import AXES, pose, reinterpreted
 from unrender.capture.formats import colmap
 from unrender.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
 from unrender.capture.undistortion import Resampling, pinhole
-from unrender.capture.views import CapturedView
 from unrender.core.errors import InputError
 
 LENS = Lens(64, 64, 80.0, 80.0, 32.0, 32.0)
@@ -222,7 +222,7 @@ def test_lenses_that_leave_no_pixel_or_have_no_width_are_refused() -> None:
     with pytest.raises(InputError, match="width and height"):
         Lens(10**400, 40, 48.0, 48.0, 20.0, 20.0)
     with pytest.raises(InputError, match="--voxels 512"):
-        importing.Options(voxels=512)
+        importing.ImportOptions(voxels=512)
 
 
 def test_the_atlas_program_imports_nothing_from_the_current_directory(
@@ -334,4 +334,4 @@ def test_a_missing_package_is_told_before_photographs_are_read(
     _transforms(tmp_path, ["a.png"])
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match=r"pip install 'unrender\[capture\]'"):
-        importing.import_capture(tmp_path, tmp_path / "out", importing.Options())
+        importing.import_capture(tmp_path, tmp_path / "out", importing.ImportOptions())

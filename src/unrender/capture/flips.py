@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from unrender.capture.capture import Capture
+from unrender.capture.captured_view import CapturedView, CapturedViews
 from unrender.capture.conventions import AXES, reinterpreted
 from unrender.capture.hull import visual_hull
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
-from unrender.capture.views import CapturedView
 from unrender.core.errors import InputError
 
 __all__ = ["SUFFICIENT", "Trial", "explain", "trials"]
@@ -41,7 +41,7 @@ class Trial:
     overlap: float
 
 
-def explain(capture: Capture, views: Sequence[CapturedView], mesh: Mesh | None, found: float) -> str:
+def explain(capture: Capture, views: CapturedViews, mesh: Mesh | None, found: float) -> str:
     """One line on why masks and mesh, or masks and poses, do not fit, where `found` is their overlap as given."""
     whose = "the mesh covers" if mesh is not None else "a shape carved from all masks covers"
     line = f"{whose} the masks with an overlap (IoU) of {found:.2f}, expected at least {SUFFICIENT:g}"
@@ -51,7 +51,7 @@ def explain(capture: Capture, views: Sequence[CapturedView], mesh: Mesh | None, 
     return f"{line}; {best.what} would give {best.overlap:.2f}: {best.remedy}"
 
 
-def trials(capture: Capture, views: Sequence[CapturedView], mesh: Mesh | None) -> list[Trial]:
+def trials(capture: Capture, views: CapturedViews, mesh: Mesh | None) -> list[Trial]:
     """Other conventions of the poses, and of the mesh where there is one, with how well each fits."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
     few = [_reduced(views[index]) for index in chosen]
@@ -92,7 +92,7 @@ def _meshes(mesh: Mesh | None) -> Iterator[tuple[str, str, Mesh]]:
         )
 
 
-def _fit(views: Sequence[CapturedView], mesh: Mesh | None) -> float:
+def _fit(views: CapturedViews, mesh: Mesh | None) -> float:
     """Mean overlap; 0 where no hull is left, or the mesh is seen by none."""
     try:
         shape = visual_hull(views, _VOXELS) if mesh is None else mesh

@@ -12,9 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from unrender.capture.cameras import project
+from unrender.capture.cameras import Lens, project
+from unrender.capture.captured_view import CapturedView, CapturedViews
 from unrender.capture.mesh import Mesh, decimate, smooth, without_crumbs
-from unrender.capture.views import CapturedView
+from unrender.capture.stored import StoredArrays
 from unrender.core.errors import InputError
 
 __all__ = ["EMPTY", "field", "shape", "visual_hull"]
@@ -28,8 +29,11 @@ _UNKNOWN = 1e4
 _CRUMBS = 0.02
 _SMOOTHING = 10
 
+Camera = tuple[Lens, np.ndarray]
+"""A lens and its pose."""
 
-def shape(views: Sequence[CapturedView], resolution: int, faces: int) -> Mesh:
+
+def shape(views: CapturedViews, resolution: int, faces: int) -> Mesh:
     """A first shape from the masks of `views`: the hull, without loose parts of less than 2 % of its faces, smoothed, decimated.
 
     Args:
@@ -43,16 +47,17 @@ def shape(views: Sequence[CapturedView], resolution: int, faces: int) -> Mesh:
     return decimate(smooth(without_crumbs(visual_hull(views, resolution), _CRUMBS), _SMOOTHING), faces)
 
 
-def visual_hull(views: Sequence[CapturedView], resolution: int) -> Mesh:
+def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
     """The zero level of `field`, by marching cubes. Raises `InputError` where it is empty."""
     from skimage import measure
 
-    distances = [_distance(view) for view in views]
-    low, high = _box(views, distances)
+    cameras = [(view.lens, view.camera_to_world) for view in views]
+    distances = StoredArrays(map(_distance, views))
+    low, high = _box(*_first_ball(views), cameras, distances)
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 3  # a voxel of air around it
     low = (low + high) / 2 - (counts - 1) / 2 * spacing
-    values = _refined(views, distances, low, spacing, counts)
+    values = _refined(cameras, distances, low, spacing, counts)
     values[0], values[-1] = np.minimum(values[0], -spacing), np.minimum(values[-1], -spacing)
     for side in (0, -1):
         values[:, side] = np.minimum(values[:, side], -spacing)
@@ -69,21 +74,21 @@ def visual_hull(views: Sequence[CapturedView], resolution: int) -> Mesh:
 EMPTY = "no point lies inside all masks: poses, masks or their order do not belong together"
 
 
-def field(views: Sequence[CapturedView], distances: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
+def field(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
     """Of points (N, 3), (N,): positive inside. `distances` are those of the masks, in pixels."""
     from scipy import ndimage
 
     found = np.full(len(points), np.inf)
-    for view, distance in zip(views, distances, strict=True):
-        at, depth = project(view.lens, view.camera_to_world, points)
+    for (lens, pose), distance in zip(cameras, distances, strict=True):
+        at, depth = project(lens, pose, points)
         pixels = ndimage.map_coordinates(distance, (at - 0.5).T[::-1], order=1, mode="nearest")
-        outside = (at < 0) | (at > (view.lens.width, view.lens.height))
+        outside = (at < 0) | (at > (lens.width, lens.height))
         if _touches_edge(distance):
             pixels[outside.any(1)] = _UNKNOWN
         else:  # the object ends inside the picture
-            off = np.abs(at - np.clip(at, 0, (view.lens.width, view.lens.height))).max(1)
+            off = np.abs(at - np.clip(at, 0, (lens.width, lens.height))).max(1)
             pixels = np.where(outside.any(1), np.minimum(pixels, 0) - off, pixels)
-        np.minimum(found, np.where(depth > 0, pixels * depth / view.lens.fx, -np.inf), out=found)
+        np.minimum(found, np.where(depth > 0, pixels * depth / lens.fx, -np.inf), out=found)
     return found
 
 
@@ -107,15 +112,16 @@ def _touches_edge(distance: np.ndarray) -> bool:
     return any((side > 0).any() for side in (distance[0], distance[-1], distance[:, 0], distance[:, -1]))
 
 
-def _box(views: Sequence[CapturedView], distances: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around the hull, by coarse grids that shrink or grow."""
-    middle, radius = _first_ball(views)
+def _box(
+    middle: np.ndarray, radius: float, cameras: Sequence[Camera], distances: StoredArrays
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around the hull, by coarse grids that shrink or grow, of a ball to begin with."""
     low, high = middle - radius, middle + radius
     for _ in range(4):
         spacing = float((high - low).max()) / _COARSE
         axes = [np.linspace(low[axis], high[axis], _COARSE + 1) for axis in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-        values = _evaluated(views, distances, points.reshape(-1, 3)).reshape(points.shape[:3])
+        values = _evaluated(cameras, distances, points.reshape(-1, 3)).reshape(points.shape[:3])
         near = values > -spacing
         if not near.any():
             raise InputError(EMPTY)
@@ -130,7 +136,7 @@ def _box(views: Sequence[CapturedView], distances: Sequence[np.ndarray]) -> tupl
     return low, high
 
 
-def _first_ball(views: Sequence[CapturedView]) -> tuple[np.ndarray, float]:
+def _first_ball(views: CapturedViews) -> tuple[np.ndarray, float]:
     """The point nearest to the rays through the middles of all masks, and a radius that no mask exceeds there."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
@@ -154,23 +160,23 @@ def _first_ball(views: Sequence[CapturedView]) -> tuple[np.ndarray, float]:
     return middle, 1.2 * float(np.max(radii))
 
 
-def _evaluated(views: Sequence[CapturedView], distances: Sequence[np.ndarray], points: np.ndarray) -> np.ndarray:
+def _evaluated(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
     chunks = [points[start : start + _CHUNK] for start in range(0, len(points), _CHUNK)]
-    return np.concatenate([field(views, distances, chunk) for chunk in chunks])
+    return np.concatenate([field(cameras, distances, chunk) for chunk in chunks])
 
 
 def _refined(
-    views: Sequence[CapturedView], distances: Sequence[np.ndarray], low: np.ndarray, spacing: float, counts: np.ndarray
+    cameras: Sequence[Camera], distances: StoredArrays, low: np.ndarray, spacing: float, counts: np.ndarray
 ) -> np.ndarray:
     """The field on a grid, evaluated only where a coarser one says that its zero level may be near."""
     from scipy import ndimage
 
     coarse_counts = -(-(counts - 1) // _REFINED) + 1
     indices = np.stack(np.meshgrid(*(np.arange(n) for n in coarse_counts), indexing="ij"), -1)
-    coarse = _evaluated(views, distances, (low + indices * (_REFINED * spacing)).reshape(-1, 3))
+    coarse = _evaluated(cameras, distances, (low + indices * (_REFINED * spacing)).reshape(-1, 3))
     coarse = np.clip(coarse, -_UNKNOWN * spacing, _UNKNOWN * spacing).reshape(coarse_counts)
     fine = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1)
     values = ndimage.map_coordinates(coarse, (fine / _REFINED).reshape(-1, 3).T, order=1, mode="nearest")
     near = np.abs(values) < 2 * _REFINED * spacing
-    values[near] = _evaluated(views, distances, low + fine.reshape(-1, 3)[near] * spacing)
+    values[near] = _evaluated(cameras, distances, low + fine.reshape(-1, 3)[near] * spacing)
     return values.reshape(counts)

@@ -10,33 +10,50 @@ import numpy as np
 from PIL import Image
 
 from unrender.backend import variant
-from unrender.capture import atlas, flips, formats, hull, overlays, problem_folder
+from unrender.capture import (
+    atlas,
+    flips,
+    formats,
+    hull,
+    overlays,
+    photometric,
+    photometric_folder,
+    problem_folder,
+    turntable,
+)
 from unrender.capture import mesh as meshes
 from unrender.capture.capture import Capture
 from unrender.capture.conventions import reinterpreted
+from unrender.capture.formats import lights
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
-from unrender.capture.unknowns import DEFAULT
-from unrender.capture.views import CapturedView, prepare
-from unrender.core import phases
+from unrender.capture.stored import StoredViews
+from unrender.capture.unknowns import DEFAULT, parse
+from unrender.capture.views import prepare
+from unrender.core import checks, phases
 from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.io import files
 from unrender.stages import stages_file
 
-__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "Imported", "Options", "check", "import_capture"]
+__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "ImportOptions", "Imported", "check", "import_capture"]
 
 CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
 """Along the longest side of the hull: memory grows with the cube."""
+TURNTABLE = (
+    "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
+)
+LIT_DEFAULT = ("colour", "normal")
 _OF_CHECK = {CHECK, SHEET}
 _OF_IMPORT = {*problem_folder.OWN, SHEET}
 
 
 @dataclass(frozen=True)
-class Options:
+class ImportOptions:
     """How a capture is read.
 
     Attributes:
@@ -53,6 +70,7 @@ class Options:
         texture: texels along the sides of the textures.
         unknowns: of the asset, of `unknowns.NAMES`.
         band: pixels along the border of masks that count little.
+        turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
     """
 
     mesh: Path | None = None
@@ -68,9 +86,16 @@ class Options:
     texture: int = 512
     unknowns: tuple[str, ...] = DEFAULT
     band: int = 0
+    turntable: bool | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.voxels <= MOST_VOXELS:
+        for name in ("mesh", "masks"):
+            given = getattr(self, name)
+            object.__setattr__(self, name, None if given is None else Path(given))
+        object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
+        for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
+            checks.integer("import", name, getattr(self, name), at_least=least)
+        if self.voxels > MOST_VOXELS:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
 
 
@@ -84,7 +109,7 @@ class Imported:
         views: count of training views.
         held_out: count of held-out views.
         size: width and height of the largest view.
-        faces: of the mesh.
+        faces: of the mesh; 0 where there is none to look at.
         overlaps: of the mesh's silhouettes with the masks, in order of the views; none where there are no masks.
         notices: one line for each thing that was left out or changed.
     """
@@ -102,23 +127,42 @@ class Imported:
 @dataclass(frozen=True)
 class _Read:
     capture: Capture
-    views: list[CapturedView]
+    views: StoredViews
     mesh: Mesh
     silhouettes: Silhouettes
     overlaps: list[float]
+    turntable: bool
     notices: tuple[str, ...]
     refusal: str
 
 
-def import_capture(folder: Path, out: Path, options: Options) -> Imported:
-    """Write the problem of a folder of posed photographs: scene.xml, problem.toml, held-out.toml, references, masks, mesh, and check.png.
+@exclusive("import_capture")
+def import_capture(
+    folder: str | Path, out: str | Path, options: ImportOptions | None = None, overwrite: bool = False
+) -> Imported:
+    """Write the problem of a folder of photographs: scene, problem files, stages, references, masks, mesh, check.png.
 
-    What stands at `out` is replaced in one instant, and only when all is written. It may be an earlier import or check, nothing else.
+    Of one camera under known lights, there are neither stages nor a mesh.
+
+    Args:
+        folder: with photographs and their cameras, or lights.
+        out: a folder to be made.
+        options: None for the defaults.
+        overwrite: whether an earlier import or check may be replaced: in one instant, and only when all is written.
+
+    Returns:
+        what was found.
 
     Raises:
         InputError: which file, and what was expected; nothing is written then.
     """
+    folder, out = Path(folder), Path(out)
+    options = options or ImportOptions()
+    if not overwrite and out.is_dir() and any(out.iterdir()):
+        raise InputError(f"import_capture: {out}: not empty; give overwrite=True to replace an earlier import")
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
+    if formats.is_lit(folder, options.kind):
+        return _import_lit(folder, out, options)
     found = _read(folder, options, unwrapped=True)
     if found.refusal:
         raise InputError(f"{folder}: {found.refusal}")
@@ -131,7 +175,15 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
         with phases.phase("problem"):
             name = folder.resolve().name
             problem_folder.write(
-                place, name, found.views, mesh, found.silhouettes, options.texture, options.unknowns, options.band
+                place,
+                name,
+                found.views,
+                mesh,
+                found.silhouettes,
+                options.texture,
+                options.unknowns,
+                options.band,
+                found.turntable,
             )
             (place / SHEET).write_bytes(
                 _sheet(
@@ -143,7 +195,24 @@ def import_capture(folder: Path, out: Path, options: Options) -> Imported:
     return _imported(found, out, mesh)
 
 
-def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
+def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
+    """One camera under known lights."""
+    variant.ensure()
+    capture = lights.read(folder, options.masks)
+    with phases.phase("photographs"):
+        views = photometric.prepare(capture, options.resolution, options.scale, options.hold_out)
+    name = folder.resolve().name
+    chosen = LIT_DEFAULT if options.unknowns == DEFAULT else options.unknowns
+    _write_folder(out, lambda place: photometric_folder.write(place, name, views, chosen))
+    held_out = sum(views.held_out)
+    notices = ["one camera under known lights: normals and colours of a plate, without shadows that it casts"]
+    if views.linear:
+        notices.append("values are taken as linear: a matt surface explains them better than as sRGB")
+    size = views.mask.shape[1], views.mask.shape[0]
+    return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
+
+
+def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
     """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
 
     Returns what was found, and in one line which convention looks wrong, "" where none does.
@@ -152,6 +221,8 @@ def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
         InputError: which file, and what was expected; nothing is written then.
     """
     _check_place(out, folder, options, _OF_CHECK)
+    if formats.is_lit(folder, options.kind):
+        raise InputError(f"{folder}: one camera under known lights has no poses to check")
     found = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:
@@ -169,7 +240,7 @@ def check(folder: Path, out: Path, options: Options) -> tuple[Imported, str]:
     return _imported(found, out, found.mesh), found.refusal
 
 
-def _check_place(out: Path, folder: Path, options: Options, own: set[str]) -> None:
+def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str]) -> None:
     """Raise `InputError` where replacing `out` would remove more than an earlier import's or check's files, `own`."""
     place = out.resolve()
     if out.name in ("", "..") or Path.cwd().is_relative_to(place):
@@ -185,7 +256,7 @@ def _check_place(out: Path, folder: Path, options: Options, own: set[str]) -> No
         raise InputError(f"--out {out}: holds other things, such as {printable(others[0])}; give a new one")
 
 
-def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
+def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     """What the folder holds, its shape and how they fit; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
     capture = formats.read(folder, options.kind, options.masks)
@@ -203,10 +274,10 @@ def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
         views, notices = prepare(
             capture, options.resolution, options.scale, options.hold_out, lambda done, count: advance(done / count)
         )
-    if given is None and any(view.mask is None for view in views):
+    masked = all(views.masked)
+    if given is None and not masked:
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
-    masked = all(view.mask is not None for view in views)
-    training = [view for view in views if not view.held_out]
+    training = views.of(held_out=False)
     with phases.phase("shape"):
         try:
             mesh = given or hull.shape(training, options.voxels, options.faces)
@@ -218,7 +289,10 @@ def _read(folder: Path, options: Options, unwrapped: bool) -> _Read:
             raise InputError(f"{folder}: {flips.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
         refusal = "" if mean >= flips.SUFFICIENT else flips.explain(capture, training, given, mean)
-    return _Read(capture, views, mesh, silhouettes, overlaps, (*capture.notices, *notices), refusal)
+    turned = turntable.stands_still(views) if options.turntable is None else options.turntable
+    if turned and options.turntable is None:
+        notices.append(TURNTABLE)
+    return _Read(capture, views, mesh, silhouettes, overlaps, turned, (*capture.notices, *notices), refusal)
 
 
 def _has_masks(capture: Capture) -> bool:
@@ -235,13 +309,14 @@ def _overlay(found: _Read, index: int) -> np.ndarray:
 def _sheet(found: _Read, thumbnails: list[Image.Image]) -> bytes:
     """Of those of `overlays.chosen`."""
     overlaps = [f"IoU {value:.3f}  " for value in found.overlaps] or [""] * len(found.views)
-    labels = [f"{overlaps[index]}{printable(found.views[index].name)}" for index in overlays.chosen(len(found.views))]
+    names = [view.name for view in found.views.bare()]
+    labels = [f"{overlaps[index]}{printable(names[index])}" for index in overlays.chosen(len(names))]
     return overlays.contact_sheet(thumbnails, labels)
 
 
 def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:
-    held_out = sum(view.held_out for view in found.views)
-    size = max((view.lens.width, view.lens.height) for view in found.views)
+    held_out = sum(view.held_out for view in found.views.bare())
+    size = max((view.lens.width, view.lens.height) for view in found.views.bare())
     counts = len(found.views) - held_out, held_out
     return Imported(out, found.capture.kind, *counts, size, len(mesh.faces), tuple(found.overlaps), found.notices)
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
+from unrender.capture.captured_view import CapturedView
 from unrender.capture.silhouettes import Silhouettes
-from unrender.capture.views import CapturedView
 from unrender.core.text import printable
 from unrender.evaluation.metrics import srgb
 

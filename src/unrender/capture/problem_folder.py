@@ -9,28 +9,37 @@ from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
-import tomli_w
 
-from unrender.backend import variant
 from unrender.capture import unknowns
+from unrender.capture.captured_view import CapturedView, CapturedViews
 from unrender.capture.mesh import Mesh, ply
 from unrender.capture.overlays import png
 from unrender.capture.silhouettes import Silhouettes
-from unrender.capture.views import CapturedView
+from unrender.capture.turntable import light_turns
+from unrender.capture.writing import (
+    MASKS,
+    REFERENCES,
+    SCENE,
+    TEXTURES,
+    add_texture,
+    add_value,
+    problem_text,
+    write_exr,
+)
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
-from unrender.io import toml_lines
 from unrender.judging.held_out import HELD_OUT
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.mitsuba import turntable_light
 from unrender.stages import stages_file
 
 __all__ = ["OWN", "PROBLEM", "to_world", "write"]
 
-PROBLEM, SCENE, MESH = "problem.toml", "scene.xml", "asset.ply"
+PROBLEM, MESH = "problem.toml", "asset.ply"
 LIGHT = "textures/light.exr"
-_FOLDERS = ("references", "masks", "textures")
+_FOLDERS = (REFERENCES, MASKS, TEXTURES)
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
 """What `write` puts into a folder."""
 _LIGHT_SIZE = 16, 32
@@ -44,12 +53,13 @@ _WHITE = 0.95
 def write(
     folder: Path,
     name: str,
-    views: Sequence[CapturedView],
+    views: CapturedViews,
     mesh: Mesh,
     silhouettes: Silhouettes,
     texture: int,
     chosen: Sequence[str] = unknowns.DEFAULT,
     band: int = 0,
+    turntable: bool = False,
 ) -> None:
     """Write the problem and its stages to an empty folder.
 
@@ -62,41 +72,55 @@ def write(
         texture: texels along the sides of the textures.
         chosen: the unknowns, of `unknowns.NAMES`.
         band: pixels along the border of the masks that count little, of training views.
+        turntable: whether the light stands still before the cameras.
 
     Raises:
         InputError: a mask leaves no whole pixel.
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
-    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen))
+    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
     for part in _FOLDERS:
         (folder / part).mkdir()
-    level, clipped = [], False
+    level, clipped, brightest = [], False, 0.0
     for view, stem in zip(views, stems, strict=True):
         mask = _loss_mask(view, silhouettes)
         level.append(float(view.values[mask].mean()))
         clipped |= bool((view.values[mask] >= _WHITE).any())
-        _write_exr(view.values, folder / "references" / f"{stem}.exr", half=True)
+        brightest = max(brightest, float(view.values.max()))
+        write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
         weights = _banded(mask, 0 if view.held_out else band)
-        (folder / "masks" / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
+        (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
     for file, values in unknowns.textures(chosen, texture).values():
-        _write_exr(values, folder / "textures" / file)
+        write_exr(values, folder / TEXTURES / file)
     # Under an even light, a surface shows its base colour times the light's radiance.
     radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
-    _write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
+    write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
     # Numbers above 1 are no photograph's of 8 or 16 bits, which end at white.
-    white = clipped and all(float(view.values.max()) <= 1.001 for view in views)
+    white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
-    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))))
+    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
+    _write_problems(folder, name, views, stems, tables, loss)
+    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
+    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
+    text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
+    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
+
+
+def _write_problems(
+    folder: Path, name: str, views: CapturedViews, stems: Sequence[str], tables: Sequence[dict], loss: Any
+) -> None:
+    """The files of the training views and of those that are held out; `tables`: of the parameters."""
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
         moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
         if sensors and moved:
-            text = _toml(name, [stems[i] for i in sensors], sensors, held_out, moved, loss)
+            listed = [
+                {"reference": f"{REFERENCES}/{stems[i]}.exr", "sensor": i, "mask": f"{MASKS}/{stems[i]}.png"}
+                for i in sensors
+            ]
+            text = problem_text(name, listed, held_out, moved, loss, _MAX_DEPTH)
             (folder / file).write_text(text, encoding="utf-8")
-    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
-    text = stages_file.text(unknowns.stages(chosen, Path(PROBLEM)), f"{note}. Written by `unrender import`.")
-    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
@@ -131,40 +155,37 @@ def _banded(mask: np.ndarray, band: int) -> np.ndarray:
     return np.where(mask, np.where(inner, 1.0, _BAND_WEIGHT), 0.0).astype(np.float32)
 
 
-def _toml(
-    name: str, stems: Sequence[str], sensors: Sequence[int], held_out: bool, parameters: Sequence[dict], loss: Any
-) -> str:
-    head = {
-        "scene": SCENE,
-        "name": f"{name} (held out)"[:200] if held_out else name[:200],
-        "max_depth": _MAX_DEPTH,
-        "loss": loss,
-    }
-    tables: list[tuple[str, dict[str, Any]]] = [("parameters", table) for table in parameters]
-    for stem, sensor in zip(stems, sensors, strict=True):
-        view = {"reference": f"references/{stem}.exr", "sensor": sensor, "mask": f"masks/{stem}.png"}
-        tables.append(("views", view))
-    what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
-    # A table under a heading of its own for each, as people write them; tomli_w would put them into one line each.
-    parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
-    parts += [toml_lines.array_table(heading, table) for heading, table in tables]
-    return "\n".join(parts)
-
-
-def _scene(views: Sequence[CapturedView], stems: Sequence[str], mesh: Mesh, chosen: Sequence[str]) -> bytes:
+def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Sequence[str], turntable: bool) -> bytes:
     root = Xml.Element("scene", version="3.0.0")
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
-    for view, stem in zip(views, stems, strict=True):
-        distance = float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0)))
-        root.append(_sensor(view, stem, max(distance - radius, radius / 100) / 10, 10 * (distance + radius)))
+    distances = [float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0))) for view in views]
+    # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
+    clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
+    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
+        sensor = _sensor(view, stem, *clip)
+        for name in ("shutter_open", "shutter_close") if turntable else ():
+            add_value(sensor, "float", name, float(index))
+        root.append(sensor)
     shape = Xml.SubElement(root, "shape", type="ply", id="asset")
-    _value(shape, "string", "filename", MESH)
+    add_value(shape, "string", "filename", MESH)
     _material(shape, chosen)
-    light = Xml.SubElement(root, "emitter", type="envmap", id="light")
-    _value(light, "string", "filename", LIGHT)
+    _light(root, views, radius, turntable)
     Xml.indent(root)
     return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
+    """An environment map; of a turntable, one that turns with the cameras."""
+    if turntable:
+        root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
+        turns = light_turns(np.array([view.camera_to_world for view in views]))
+        add_value(root, "string", "turns", turntable_light.text(turns))
+        add_value(root, "float", "distance", 1e4 * radius)
+        light = Xml.SubElement(root, "emitter", type="envmap", name="map")
+    else:
+        light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    add_value(light, "string", "filename", LIGHT)
 
 
 def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
@@ -172,53 +193,30 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
     textures = unknowns.textures(chosen, 1)
     if "normalmap" in textures:
         shape = Xml.SubElement(shape, "bsdf", type="normalmap")
-        _texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
+        add_texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
     bsdf = Xml.SubElement(shape, "bsdf", type="principled")
     for name, (file, values) in textures.items():
-        _texture(bsdf, name, file, raw=values.shape[2] == 1)
+        add_texture(bsdf, name, file, raw=values.shape[2] == 1)
     if "roughness" not in textures:
-        _value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
-
-
-def _texture(parent: Xml.Element, name: str, file: str, raw: bool) -> None:
-    texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
-    for key, value in (("filename", f"textures/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):
-        _value(texture, "string", key, value)
-    if raw:
-        _value(texture, "boolean", "raw", "true")
+        add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
 
 
 def _sensor(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
-    _value(sensor, "string", "fov_axis", "x")
-    _value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
+    add_value(sensor, "string", "fov_axis", "x")
+    add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
     # Mitsuba moves the picture against the principal point, in units of its sides.
-    _value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
-    _value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
-    _value(sensor, "float", "near_clip", near)
-    _value(sensor, "float", "far_clip", far)
+    add_value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
+    add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
+    add_value(sensor, "float", "near_clip", near)
+    add_value(sensor, "float", "far_clip", far)
     transform = Xml.SubElement(sensor, "transform", name="to_world")
     numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
     Xml.SubElement(transform, "matrix", value=numbers)
     film = Xml.SubElement(sensor, "film", type="hdrfilm")
-    _value(film, "integer", "width", lens.width)
-    _value(film, "integer", "height", lens.height)
-    _value(film, "string", "pixel_format", "rgb")
+    add_value(film, "integer", "width", lens.width)
+    add_value(film, "integer", "height", lens.height)
+    add_value(film, "string", "pixel_format", "rgb")
     Xml.SubElement(film, "rfilter", type="box")
     return sensor
-
-
-def _value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
-    text = repr(value) if isinstance(value, float) else str(value)
-    Xml.SubElement(parent, kind, name=name, value=text)
-
-
-def _write_exr(values: np.ndarray, path: Path, half: bool = False) -> None:
-    import mitsuba as mi
-
-    with variant.two_threads():
-        bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
-        if half:
-            bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False)
-        bitmap.write(str(path))

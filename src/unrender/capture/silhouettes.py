@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from unrender.capture.cameras import Lens
+from unrender.capture.captured_view import CapturedViews
 from unrender.capture.mesh import Mesh
-from unrender.capture.views import CapturedView
 
 __all__ = ["Silhouettes", "overlap"]
 
@@ -65,7 +64,7 @@ class Silhouettes:
         return mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
 
 
-def overlap(silhouettes: Silhouettes, views: Sequence[CapturedView]) -> list[float]:
+def overlap(silhouettes: Silhouettes, views: CapturedViews) -> list[float]:
     """Intersection over union of the mesh's silhouette and the mask, for each view with a mask, where the photograph shows anything."""
     found = []
     for view in views:

@@ -17,7 +17,8 @@ from unrender.stages.stages_file import Stage, Stages
 __all__ = ["DEFAULT", "NAMES", "keys", "parameters", "parse", "stages", "textures"]
 
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure")
-DEFAULT = ("colour", "light")
+DEFAULT = ("colour", "roughness", "metallic", "light")
+_MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _METALLIC = 0.1
 """Above 0, which is a bound."""
@@ -40,8 +41,8 @@ def parse(text: str) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in given)
 
 
-def keys(unknowns: Sequence[str]) -> dict[str, str]:
-    """{name: the parameter's key} of all names; under a normal map, the material is nested."""
+def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
+    """{name: the parameter's key} of all names; under a normal map, the material is nested, and so is the light of a turntable."""
     material = "asset.bsdf.nested_bsdf" if "normal" in unknowns else "asset.bsdf"
     return {
         "colour": f"{material}.base_color.data",
@@ -49,14 +50,14 @@ def keys(unknowns: Sequence[str]) -> dict[str, str]:
         "metallic": f"{material}.metallic.data",
         "normal": "asset.bsdf.normalmap.data",
         "shape": "asset.vertex_positions",
-        "light": "light.data",
+        "light": "light.map.data" if turntable else "light.data",
         "exposure": EXPOSURE,
     }
 
 
-def parameters(unknowns: Sequence[str], diagonal: float) -> list[dict[str, Any]]:
+def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False) -> list[dict[str, Any]]:
     """The [[parameters]] of a problem file. `diagonal`: of the mesh's bounding box, > 0."""
-    of = keys(unknowns)
+    of = keys(unknowns, turntable)
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
         "colour": unit,
@@ -85,17 +86,20 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
     return found
 
 
-def stages(unknowns: Sequence[str], problem: Path) -> Stages:
-    """Light and colour at low resolution, then what shines, then the shape, then all."""
-    of, found = keys(unknowns), []
+def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
+    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving."""
+    of, found = keys(unknowns, turntable), []
+    moved: list[str] = []
 
-    def add(name: str, wanted: Sequence[str], share: float, coarser: int = 1) -> None:
-        moved = [one for one in NAMES if one in unknowns and one in (*wanted, "exposure")]
-        if any(one in wanted for one in moved):
-            found.append(Stage(name, tuple(of[one] for one in moved), share, coarser))
+    def add(name: str, more: Sequence[str], share: float, coarser: int = 1) -> None:
+        given = [one for one in more if one in unknowns]
+        if given:
+            moved.extend(one for one in given if one not in moved)
+            exposed = [one for one in NAMES if one in unknowns and one in (*moved, "exposure")]
+            found.append(Stage(name, tuple(of[one] for one in exposed), share, coarser))
 
-    add("light-and-colour", ("colour", "light"), 1.0, _COARSER)
-    add("roughness", ("roughness", "metallic"), 1.0)
-    add("shape", ("shape", "normal"), 1.0)
-    add("all", NAMES, 2.0)
-    return Stages(problem, tuple(found))
+    add("coarse-materials", _MATERIALS, 1.0, _COARSER)
+    add("materials", _MATERIALS, 3.0)
+    add("normals", ("normal",), 1.0)
+    add("shape", ("shape",), 1.0)
+    return Stages(problem, tuple(found or [Stage("exposure", (of["exposure"],))]))

@@ -1,4 +1,4 @@
-"""The views of a problem: photographs without distortion, their masks, and which of them are held out."""
+"""From photographs to the views of a problem: without distortion, with their masks, and which of them are held out."""
 
 from __future__ import annotations
 
@@ -10,37 +10,16 @@ import numpy as np
 from unrender.capture import pictures
 from unrender.capture.cameras import Lens
 from unrender.capture.capture import Capture, Photograph
+from unrender.capture.captured_view import CapturedView
+from unrender.capture.stored import StoredViews
 from unrender.capture.undistortion import Resampling, pinhole
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["CapturedView", "prepare"]
+__all__ = ["prepare"]
 
 _EMPTY = 1e-4
 _FULL_BORDER = 0.5
-
-
-@dataclass(frozen=True)
-class CapturedView:
-    """One photograph, ready to be compared with a render.
-
-    Attributes:
-        name: of the photograph.
-        lens: a pinhole with square pixels.
-        camera_to_world: (4, 4), axes right, up, backwards.
-        values: (H, W, 3) float32, linear.
-        mask: (H, W) in [0, 1], which part of each pixel the object covers; None where there is no mask.
-        shown: (H, W) in [0, 1], which part of each pixel the photograph shows: less than 1 where undistorting leaves the picture.
-        held_out: whether it is for judging alone.
-    """
-
-    name: str
-    lens: Lens
-    camera_to_world: np.ndarray
-    values: np.ndarray
-    mask: np.ndarray | None
-    shown: np.ndarray
-    held_out: bool
 
 
 def prepare(
@@ -49,8 +28,8 @@ def prepare(
     scale: float | None,
     hold_out: int | None,
     progress: Callable[[int, int], None] = lambda done, count: None,
-) -> tuple[list[CapturedView], list[str]]:
-    """Read, undistort and check all photographs; only results of the chosen resolution are kept in memory.
+) -> tuple[StoredViews, list[str]]:
+    """Read, undistort and check all photographs, one by one; results of the chosen resolution wait in a temporary file.
 
     Args:
         capture: what the folder holds.
@@ -69,17 +48,18 @@ def prepare(
     if scale is not None and not 0 < scale <= 1:
         raise InputError(f"--scale {scale:g}: expected more than 0 and at most 1")
     held_out = _split(capture.photographs, hold_out)
-    views: list[CapturedView] = []
+    views, looks = StoredViews(), []
     turned: list[str] = []
     for index, photograph in enumerate(capture.photographs):
         view, was_turned = _view(photograph, resolution, scale, held_out[index])
         views.append(view)
+        looks += [] if view.mask is None else [_Mask.of(view.name, view.mask)]
         turned += [photograph.name] if was_turned else []
         progress(index + 1, len(capture.photographs))
-    without = [view.name for view in views if view.mask is None]
+    without = [view.name for view, masked in zip(views.bare(), views.masked, strict=True) if not masked]
     if without and len(without) < len(views):
         raise InputError(f"{len(without)} of {len(views)} photographs have no mask, the first {printable(without[0])}")
-    _check_masks(views)
+    _check_masks(looks)
     notices = []
     if turned:
         notices.append(f"{len(turned)} photographs turned upright as EXIF says, the first {printable(turned[0])}")
@@ -133,17 +113,27 @@ def _mask(photograph: Photograph, lens: Lens, target: Lens, orientation: int) ->
     return np.clip(Resampling(lens.scaled(width, height), target).apply(values[..., None])[0][..., 0], 0, 1)
 
 
-def _check_masks(views: Sequence[CapturedView]) -> None:
+@dataclass(frozen=True)
+class _Mask:
+    """What is checked of a mask: the shares of the picture and of its edge that it covers."""
+
+    name: str
+    share: float
+    edge: float
+
+    @classmethod
+    def of(cls, name: str, mask: np.ndarray) -> _Mask:
+        edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+        return cls(name, float(mask.mean()), float(edge.mean()))
+
+
+def _check_masks(masks: Sequence[_Mask]) -> None:
     """Raise `InputError` for masks that are empty or inverted: the object touches more than half of the picture's edge."""
-    masked = [(view.name, view.mask) for view in views if view.mask is not None]
-    empty = [name for name, mask in masked if mask.mean() < _EMPTY]
+    empty = [mask.name for mask in masks if mask.share < _EMPTY]
     if empty:
-        raise InputError(f"mask of {printable(empty[0])}: empty (black); {len(empty)} of {len(masked)} masks are so")
-    border = {name: np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]).mean() for name, m in masked}
-    full = [name for name, share in border.items() if share > _FULL_BORDER]
+        raise InputError(f"mask of {printable(empty[0])}: empty (black); {len(empty)} of {len(masks)} masks are so")
+    full = [mask for mask in masks if mask.edge > _FULL_BORDER]
     if full:
-        many = f"{len(full)} of {len(masked)} masks are so"
-        what = (
-            f"white along {100 * border[full[0]]:.0f} % of the picture's edge: inverted? expected white on the object"
-        )
-        raise InputError(f"mask of {printable(full[0])}: {what}; {many}")
+        many = f"{len(full)} of {len(masks)} masks are so"
+        what = f"white along {100 * full[0].edge:.0f} % of the picture's edge: inverted? expected white on the object"
+        raise InputError(f"mask of {printable(full[0].name)}: {what}; {many}")

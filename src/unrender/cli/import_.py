@@ -1,4 +1,4 @@
-"""`unrender import`: a folder of posed photographs as a problem."""
+"""`unrender import`: a folder of photographs as a problem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["import_"]
 
 
 _Folder = Annotated[
-    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model or poses_bounds.npy.")
+    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model, poses_bounds.npy or lights.txt.")
 ]
 _Mesh = Annotated[
     Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
@@ -37,7 +37,9 @@ _HoldOut = Annotated[
     int | None,
     typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
 ]
-_Kind = Annotated[str | None, typer.Option("--format", help="transforms, colmap or llff, where several are there.")]
+_Kind = Annotated[
+    str | None, typer.Option("--format", help="transforms, colmap, llff or lights, where several are there.")
+]
 _Axes = Annotated[str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")]
 _Direction = Annotated[
     bool | None,
@@ -51,6 +53,14 @@ _Unknowns = Annotated[
 ]
 _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
+]
+
+_Turntable = Annotated[
+    bool | None,
+    typer.Option(
+        "--turntable/--no-turntable",
+        help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
+    ),
 ]
 
 
@@ -69,8 +79,9 @@ def import_(
     voxels: _Voxels = 96,
     faces: _Faces = 10_000,
     texture: _Texture = 512,
-    unknowns: _Unknowns = "colour,light",
+    unknowns: _Unknowns = "colour,roughness,metallic,light",
     band: _Band = 0,
+    turntable: _Turntable = None,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
@@ -85,9 +96,11 @@ def import_(
     from unrender.capture.unknowns import parse
 
     names = parse(unknowns)
-    options = importing.Options(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band
+    # fmt: off
+    options = importing.ImportOptions(
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable
     )
+    # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
     place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
     refusal = ""
@@ -97,7 +110,7 @@ def import_(
             if check:
                 found, refusal = importing.check(folder, place, options)
             else:
-                found = importing.import_capture(folder, place, options)
+                found = importing.import_capture(folder, place, options, overwrite=True)
     finally:
         arguments.remove_if_empty(place)
     _tell(console, found)
@@ -106,10 +119,21 @@ def import_(
     if refusal:
         raise InputError(f"{folder}: {refusal}")
     if not check:
-        console.print(f"to look at: {place / importing.SHEET}", soft_wrap=True, markup=False)
-        console.print(f"next: unrender run {shlex.quote(str(written))} --seconds 60", soft_wrap=True, markup=False)
-        staged = place / importing.STAGES
-        console.print(f"in stages: unrender run {shlex.quote(str(staged))} --seconds 300", soft_wrap=True, markup=False)
+        _tell_next(console, place)
+
+
+def _tell_next(console: Console, place: Path) -> None:
+    from unrender.capture import importing
+
+    names = (
+        (importing.SHEET, "to look at", ""),
+        (importing.PROBLEM, "next", "60"),
+        (importing.STAGES, "in stages", "300"),
+    )
+    for file, what, seconds in names:
+        if (path := place / file).is_file():
+            command = f"unrender run {shlex.quote(str(path))} --seconds {seconds}" if seconds else path
+            console.print(f"{what}: {command}", soft_wrap=True, markup=False)
 
 
 def _tell(console: Console, found: Imported) -> None:
@@ -118,9 +142,8 @@ def _tell(console: Console, found: Imported) -> None:
     for notice in found.notices:
         console.print(f"note: {notice}", soft_wrap=True, markup=False)
     counts = f"{found.views} photographs and {found.held_out} held out"
-    console.print(
-        f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}; a mesh of {found.faces} faces", markup=False
-    )
+    shape = f"; a mesh of {found.faces} faces" if found.faces else ""
+    console.print(f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}{shape}", markup=False)
     if found.overlaps:
         worst = min(found.overlaps)
         console.print(

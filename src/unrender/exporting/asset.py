@@ -16,6 +16,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.exporting.materials import Material, check_size, read_material
+from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.description import load
 
 __all__ = ["Asset", "Camera", "Part", "read", "read_environment"]
@@ -142,15 +143,22 @@ def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np
 
 
 def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
-    """The light all around a live scene, as in `Asset`; adds a line for each light that is none. Raises `InputError` where too large."""
+    """The light all around a live scene, as in `Asset`; adds a line for each light that is none. Raises `InputError` where too large.
+
+    That of a turntable is as the first camera had it.
+    """
     found, turned = None, np.eye(3)
     for emitter in scene.emitters():
+        before = np.eye(3)
+        if turntable_light.is_turntable(emitter):
+            notices.append(f"{emitter.id() or 'light'}: a turntable's, as it stood before the first camera")
+            before, emitter = turntable_light.turns(emitter)[0], emitter.map
         values: Any = mi.traverse(emitter)
         if emitter.class_name() == "EnvironmentMapEmitter":
             pixels = np.array(values["data"])[:, 1:-1, :3]  # without the columns that Mitsuba repeats
             check_size("environment map", pixels)
             found = np.ascontiguousarray(pixels * float(np.array(values["scale"]).ravel()[0]), np.float32)
-            turned = np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+            turned = before @ np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
         elif emitter.class_name() == "ConstantBackgroundEmitter" and "radiance.value" in values:
             radiance = np.broadcast_to(np.array(values["radiance.value"], np.float32).ravel(), (3,))
             found = np.broadcast_to(radiance, (*_CONSTANT_SIZE, 3)).copy()

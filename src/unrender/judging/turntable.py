@@ -16,7 +16,9 @@ from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.evaluation.metrics import exposure, srgb
+from unrender.exporting.asset import read_environment
 from unrender.judging import scenes, videos
+from unrender.rendering.mitsuba import turntable_light
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
@@ -108,6 +110,8 @@ def turntable(
         table = _table(scene, axis, problem.name)
         if light is not None:
             scene = scenes.load_scene(path, light, scenes.turned_up(axis))
+        elif any(map(turntable_light.is_turntable, scene.emitters())):
+            scene = scenes.load_scene(path, *read_environment(scene, []))
         pictures = _frames(scene, table, frames, size, spp, elevation, problem.max_depth, BACKGROUNDS[background])
         videos.write(place, pictures, rate)
     return place

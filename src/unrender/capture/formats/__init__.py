@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from unrender.capture.capture import Capture
-from unrender.capture.formats import colmap, llff, transforms
+from unrender.capture.formats import colmap, lights, llff, transforms
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.io import bounded_files
 
-__all__ = ["FORMATS", "read"]
+__all__ = ["FORMATS", "LIGHTS", "is_lit", "read"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,17 @@ FORMATS = {
 """By name, in the order in which a folder that has several is read."""
 
 
+LIGHTS = "lights"
+"""The format of `lights`, which is no capture with poses."""
+
+
+def is_lit(folder: Path, kind: str | None) -> bool:
+    """Whether a folder holds photographs of one camera under known lights, to be read as such."""
+    if kind is not None:
+        return kind == LIGHTS and lights.recognise(folder)
+    return lights.recognise(folder) and not any(each.recognise(folder) for each in FORMATS.values())
+
+
 def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Capture:
     """The capture in a folder.
 
@@ -47,8 +58,10 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
         if given is not None and bounded_files.kind(given) != "folder":
             found = "not a folder" if bounded_files.exists(given) else "no such folder"
             raise InputError(f"{given}: {found}" if name == "FOLDER" else f"{name} {given}: {found}")
+    if kind == LIGHTS:
+        raise InputError(f"{folder}: not in the format {LIGHTS}: expected {lights.FILE}")
     if kind is not None and kind not in FORMATS:
-        raise InputError(f"--format {kind}: expected one of {', '.join(FORMATS)}")
+        raise InputError(f"--format {kind}: expected one of {', '.join((*FORMATS, LIGHTS))}")
     for name, each in FORMATS.items():
         if kind in (None, name) and each.recognise(folder):
             capture = each.read(folder, masks)
@@ -59,9 +72,9 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             return capture
     if kind is not None:
         raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
-    if (folder / "lights.txt").is_file():
-        raise InputError(f"{folder}: one camera under several lights (lights.txt) is not supported yet")
-    raise InputError(f"{folder}: no camera poses: expected {'; '.join(each.files for each in FORMATS.values())}")
+    raise InputError(
+        f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}"
+    )
 
 
 def _check_photographs(capture: Capture) -> None:

@@ -149,7 +149,7 @@ class Films:
     Attributes:
         widths, heights: of the films in pixels, `mi.UInt32`.
         aperture: whether any needs an aperture sample.
-        shutters: opening times and durations, `mi.Float`; None where none has one.
+        shutters: opening times and durations, `mi.Float`; None where all are 0.
     """
 
     widths: Any
@@ -163,8 +163,9 @@ class Films:
         sizes = [sensor.film().crop_size() for sensor in sensors]
         times = [float(sensor.shutter_open_time()) for sensor in sensors]
         shutters = None
-        if any(time > 0 for time in times):
-            shutters = mi.Float([float(sensor.shutter_open()) for sensor in sensors]), mi.Float(times)
+        openings = [float(sensor.shutter_open()) for sensor in sensors]
+        if any(time != 0 for time in (*openings, *times)):
+            shutters = mi.Float(openings), mi.Float(times)
         return cls(
             mi.UInt32([int(size[0]) for size in sizes]),
             mi.UInt32([int(size[1]) for size in sizes]),

@@ -13,7 +13,7 @@ from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 from unrender.rendering.mitsuba import description as loading
-from unrender.rendering.mitsuba import emissive
+from unrender.rendering.mitsuba import emissive, turntable_light
 from unrender.rendering.mitsuba.grid_transforms import attached_media
 
 __all__ = ["SceneDescription", "is_loaded", "load", "load_resolved", "media"]
@@ -40,6 +40,7 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
     """As `load`, and what was loaded: the file's path, or the dictionary; nothing in it for a scene that was loaded before."""
     variant.ensure()
     emissive.register()
+    turntable_light.register()
     if is_loaded(description):
         return _loaded_before(description), {}
     if callable(description):

@@ -119,7 +119,7 @@ class BoundaryIntegrator:
         sign = dr.select(number < count, -OFFSET, OFFSET)
         at = dr.gather(mi.Point2f, uv, lane) + sign * dr.gather(mi.Vector2f, normal, lane)  # pyright: ignore[reportOperatorIssue]
         both = dr.gather(mi.Bool, active, lane)
-        ray, weight = picture.sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5), both)
+        ray, weight = picture.sensor.sample_ray(picture.time, 0.5, at, mi.Point2f(0.5), both)
         near = dr.gather(mi.Float, distance, lane)
         si = _facing(picture.scene.ray_intersect(ray, both), ray, near)
         L = self._trace(picture.scene, ray, si, mi.UInt32(0), both, seed, count) * weight
@@ -130,7 +130,7 @@ class BoundaryIntegrator:
     def _shadows(self, picture: Picture, positions: Any, seed: int) -> Any:
         table, scene, count = self._table, picture.scene, picture.samples
         with dr.suspend_grad():
-            lights = EmitterPoints(scene, seed ^ 0x2545F491, min(_EMITTER_POINTS, _PAIRS // table.count))
+            lights = EmitterPoints(scene, seed ^ 0x2545F491, min(_EMITTER_POINTS, _PAIRS // table.count), picture.time)
             number = dr.arange(mi.UInt32, lights.count * table.count)
             which = number // table.count
             edges = table.at(positions, number - which * table.count)
@@ -212,7 +212,7 @@ class BoundaryIntegrator:
         )
         active = dr.gather(mi.Bool, eye.active, lane)
         origin = dr.gather(mi.Point3f, mi.Point3f(eye.first.spawn_ray(segment.direction).o), lane)
-        ray = mi.Ray3f(origin, dr.normalize(target - origin))  # pyright: ignore[reportArgumentType, reportCallIssue]
+        ray = mi.Ray3f(origin, dr.normalize(target - origin), eye.time)  # pyright: ignore[reportArgumentType, reportCallIssue]
         depth = dr.gather(mi.UInt32, eye.bounces, lane) + 1
         si = _facing(scene.ray_intersect(ray, active), ray, dr.norm(target - origin))
         emitted = si.emitter(scene, active).eval(si, active)

@@ -26,6 +26,7 @@ class Picture:
         self.size = mi.Vector2f(self.width, self.height)
         # Opaque: of a mini-batch's views the number differs from step to step, and kernels with it.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
+        self.time = dr.opaque(mi.Float, float(sensor.shutter_open()))
         self._weights = weights.array
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
@@ -96,6 +97,7 @@ class EyePath:
     """From x_a, behind an edge point, to the sensor, with a random number of vertices between.
 
     Attributes:
+        time: of the picture.
         first: x_a, `mi.SurfaceInteraction3f`.
         moved: x_a as a ray that comes from the sensor's side meets it; attached.
         throughput: importance over density.
@@ -107,7 +109,8 @@ class EyePath:
     def __init__(self, picture: Picture, segment: BoundarySegment, sampler: Any, most: int, active: Any):
         scene = picture.scene
         with dr.suspend_grad():
-            ray = mi.Ray3f(segment.outside, -segment.direction)
+            ray = mi.Ray3f(segment.outside, -segment.direction, picture.time)
+            self.time = picture.time
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             active = active & si.is_valid() & ~segment.is_behind(si.p)

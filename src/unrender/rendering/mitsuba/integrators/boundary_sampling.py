@@ -79,13 +79,14 @@ def coplanar(edge: EdgePoints) -> Any:
 
 
 class EmitterPoints:
-    """Points on emitters and directions to distant ones, the same number on each emitter."""
+    """Points on emitters and directions to distant ones, the same number on each emitter, at a time, `mi.Float`."""
 
-    def __init__(self, scene: Any, seed: int, count: int):
+    def __init__(self, scene: Any, seed: int, count: int, time: Any):
+        self._time = time
         emitters = scene.emitters()
         self._each = max(1, count // len(emitters))
         self.count = self._each * len(emitters)
-        parts = [_emitter_points(emitter, seed + 7919 * i, self._each) for i, emitter in enumerate(emitters)]
+        parts = [_emitter_points(emitter, seed + 7919 * i, self._each, time) for i, emitter in enumerate(emitters)]
         self._p, self._n, self._d = (
             type(first)(*(dr.concat([part[k][c] for part in parts]) for c in range(3)))
             for k, first in enumerate(parts[0][:3])
@@ -132,7 +133,7 @@ class EmitterPoints:
         ds.dist, ds.pdf, ds.delta = distance, 1.0, False  # pyright: ignore[reportAttributeAccessIssue]
         ds.emitter = dr.gather(mi.EmitterPtr, self._emitters, which)
         it = dr.zeros(mi.Interaction3f, dr.width(point))
-        it.p = point
+        it.p, it.time = point, self._time
         value = ds.emitter.eval_direction(it, ds, active)
         return dr.select(active, value * self.measure(point, which, distance, direction), 0)
 
@@ -142,11 +143,12 @@ class EmitterPoints:
         return lambda near: dr.select(far, 1, distance / (near + distance))
 
 
-def _emitter_points(emitter: Any, seed: int, count: int) -> tuple[Any, ...]:
+def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any, ...]:
     """Points, normals, directions, texture coordinates, densities, kinds and the emitter, `count` lanes."""
     sampler = lane_sampler(seed & 0xFFFFFFFF, count, count)
     sample = sampler.next_2d()
     it = dr.zeros(mi.Interaction3f, count)
+    it.time = time
     shape = emitter.get_shape()
     zero = dr.zeros(mi.Float, count)
     pointer = dr.repeat(mi.EmitterPtr(emitter), count)

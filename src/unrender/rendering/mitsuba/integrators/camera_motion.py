@@ -158,7 +158,7 @@ class CameraMotion:
     def _look(self, picture: Picture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
         """What is seen at `uv`; lanes a period apart share random numbers."""
         sensor, scene = picture.sensor, picture.scene
-        ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
+        ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
         si = scene.ray_intersect(ray, active)
         view = MirroredView(si, mi.Ray3f(ray), dr.norm(si.p - film.origin), self._max_depth)
         if self._mirrors:
@@ -190,7 +190,7 @@ class CameraMotion:
             pixel = dr.gather(mi.UInt32, view.pixels, index)
             row = pixel // picture.width
             uv = (mi.Vector2f(pixel - row * picture.width, row) + sampler.next_2d()) / picture.size  # pyright: ignore[reportOperatorIssue]
-            ray, weight = sensor.sample_ray(0.0, 0.5, mi.Point2f(uv), mi.Point2f(0.5), True)
+            ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), True)
             si = scene.ray_intersect(ray)
             weight *= mi.Spectrum(*(dr.gather(mi.Float, view.values, index * 3 + c) for c in range(3)))
             active = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Glossy)

@@ -1,0 +1,77 @@
+"""Elements of the scenes and problem files that imports write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import tomli_w
+
+from unrender.backend import variant
+from unrender.io import toml_lines
+
+__all__ = ["MASKS", "REFERENCES", "SCENE", "TEXTURES", "add_texture", "add_value", "problem_text", "write_exr"]
+
+SCENE = "scene.xml"
+REFERENCES, MASKS, TEXTURES = "references", "masks", "textures"
+"""Folders of an import."""
+
+
+def problem_text(
+    name: str, views: Sequence[dict[str, Any]], held_out: bool, parameters: Sequence[dict], loss: Any, max_depth: int
+) -> str:
+    """A problem file. `views`, `parameters`: its tables; `loss`: as it has it; `held_out`: whether it is for judging alone."""
+    head = {
+        "scene": SCENE,
+        "name": f"{name} (held out)"[:200] if held_out else name[:200],
+        "max_depth": max_depth,
+        "loss": loss,
+    }
+    tables = [("parameters", table) for table in parameters] + [("views", view) for view in views]
+    what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
+    # A table under a heading of its own for each, as people write them; tomli_w would put them into one line each.
+    parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
+    parts += [toml_lines.array_table(heading, table) for heading, table in tables]
+    return "\n".join(parts)
+
+
+def add_value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
+    """A property of a plugin; `kind`: "string", "float", ..."""
+    text = repr(value) if isinstance(value, float) else str(value)
+    Xml.SubElement(parent, kind, name=name, value=text)
+
+
+def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bool = False) -> None:
+    """A picture as the property `name` of a BSDF.
+
+    Args:
+        parent: the BSDF.
+        name: of the property.
+        file: below the folder of textures.
+        raw: whether it holds other things than colours.
+        pixels: whether texels are pixels of a picture, whose first row is at v = 1: then nothing is interpolated.
+    """
+    texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
+    for key, value in (("filename", f"{TEXTURES}/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):
+        add_value(texture, "string", key, value)
+    if raw:
+        add_value(texture, "boolean", "raw", "true")
+    if pixels:
+        add_value(texture, "string", "filter_type", "nearest")
+        transform = Xml.SubElement(texture, "transform", name="to_uv")
+        Xml.SubElement(transform, "scale", x="1", y="-1")
+        Xml.SubElement(transform, "translate", x="0", y="1")
+
+
+def write_exr(values: np.ndarray, path: Path, half: bool = False) -> None:
+    """(H, W, C) as OpenEXR, 32 bits, or 16."""
+    import mitsuba as mi
+
+    with variant.two_threads():
+        bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
+        if half:
+            bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False)
+        bitmap.write(str(path))
