@@ -251,6 +251,7 @@ def test_values_come_in_several_forms() -> None:
         (lambda: ur.Renderer(scene(), KEYS, groups=2, coupled=True), "coupled=True goes with groups=1"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=Uniform(8), coupled=True), r"use pixels=unrender.pixels.All\(\)"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=Adaptive(8)), "Adaptive draws pixels by their loss derivative; give ref"),
+        (lambda: ur.Renderer(scene(), KEYS, pixels=ur.pixels.AdaptiveCounts()), "which only optimize\\(\\) knows"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=8), "pixels must be one of unrender.pixels"),  # pyright: ignore[reportArgumentType]
         (lambda: ur.Renderer(scene(), KEYS, image=CV), "image must be one of unrender.images"),  # pyright: ignore[reportArgumentType]
         (lambda: ur.Renderer(scene(), KEYS, sensor=3), "sensor must be 0, the only one, got 3"),
