@@ -26,7 +26,7 @@ class Picture:
         self.size = mi.Vector2f(self.width, self.height)
         # Opaque: of a mini-batch's views the number differs from step to step, and kernels with it.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
-        self.time = dr.opaque(mi.Float, float(sensor.shutter_open()))
+        self.time: Any = dr.opaque(mi.Float, float(sensor.shutter_open()))
         self._weights = weights.array
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
