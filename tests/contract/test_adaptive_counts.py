@@ -231,7 +231,7 @@ def test_what_makes_no_sense_is_refused(make: Any, message: str) -> None:
 def test_losses_of_whole_images_and_views_of_workers_are_refused() -> None:
     @dataclasses.dataclass(frozen=True)
     class Whole(ur.losses.L2):
-        pixelwise = False
+        pixelwise = False  # pyright: ignore[reportAssignmentType]
 
     asked = problem()
     asked.loss = Whole()

@@ -83,7 +83,7 @@ class FieldRenderer:
     def array(self, values: np.ndarray) -> np.ndarray:
         return np.array(values, np.float64)
 
-    def prepare(self, keys: list[str], space: Space | None, derivatives: bool = True) -> FieldRenderer:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Any = True) -> FieldRenderer:
         self.at(self.field.shape).prepare(keys, space, derivatives)
         return self
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -38,13 +39,13 @@ def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_p
     assert len(run.meshes[STATUE].first_faces) == 320
     before, after = (result.image_errors[f"view0/{which}"][0] for which in ("initial", "result"))
     assert after < before
-    written = trimesh.load(tmp_path / "run/meshes/statue.ply", process=False)
+    written: Any = trimesh.load(tmp_path / "run/meshes/statue.ply", process=False)
     np.testing.assert_array_equal(written.vertices.astype(np.float32).reshape(-1), result.parameters[STATUE])
     # What is exported renders what the last picture shows.
     moved = problem.remeshed({STATUE: _mesh(run)})
     exported = ur.export((moved, result.parameters), tmp_path / "scene", formats=["mitsuba", "ply", "obj"])
     for path in (tmp_path / "scene/ply/statue.ply", tmp_path / "scene/obj/asset.obj"):
-        again = trimesh.load(path, process=False, maintain_order=True)
+        again: Any = trimesh.load(path, process=False, maintain_order=True)
         np.testing.assert_allclose(np.sort(again.vertices, axis=0), np.sort(written.vertices, axis=0), atol=1e-6)
         assert len(again.faces) == 1280
     picture = np.array(mi.render(mi.load_file(str(exported.scene)), sensor=0, spp=256))

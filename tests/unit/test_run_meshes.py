@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +27,13 @@ OF, CUT, UV = meshes.unrolled(POINTS, FACES)
 
 def written(folder: Path, **more: np.ndarray) -> Path:
     """A run folder of a sphere that has grown by a tenth, and whose truth is twice as large."""
-    start = np.float32(POINTS.reshape(-1))
-    arrays = {f"{KEY}/faces": FACES, f"{KEY}/true_vertices": 2 * POINTS, f"{KEY}/true_faces": FACES, **more}
+    start = POINTS.reshape(-1).astype(np.float32)
+    arrays: dict[str, Any] = {
+        f"{KEY}/faces": FACES,
+        f"{KEY}/true_vertices": 2 * POINTS,
+        f"{KEY}/true_faces": FACES,
+        **more,
+    }
     path = write_run(folder, truth={}, initial={KEY: start}, parameters={KEY: start * 1.1})
     np.savez(path / "meshes.npz", **{name: value for name, value in arrays.items() if value is not None})
     return path
@@ -36,14 +42,14 @@ def written(folder: Path, **more: np.ndarray) -> Path:
 def test_ply_and_obj_are_read_again_as_they_were() -> None:
     vertices = POINTS[OF].astype(np.float32)
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    found = trimesh.load(io.BytesIO(mesh_writing.ply(vertices, CUT, normals, UV)), file_type="ply", process=False)
+    found: Any = trimesh.load(io.BytesIO(mesh_writing.ply(vertices, CUT, normals, UV)), file_type="ply", process=False)
     np.testing.assert_array_equal(found.vertices.astype(np.float32), vertices)
     np.testing.assert_array_equal(found.faces, CUT)
     np.testing.assert_allclose(found.vertex_normals, normals, atol=1e-6)
     np.testing.assert_allclose(found.visual.uv, np.stack([UV[:, 0], 1 - UV[:, 1]], 1), atol=1e-6)
     for uv in (None, UV):
         text = mesh_writing.obj(vertices, CUT, uv)
-        found = trimesh.load(io.BytesIO(text), file_type="obj", process=False, maintain_order=True)
+        found: Any = trimesh.load(io.BytesIO(text), file_type="obj", process=False, maintain_order=True)
         np.testing.assert_array_equal(found.vertices.astype(np.float32), vertices)
         np.testing.assert_array_equal(found.faces, CUT)
         if uv is not None:
