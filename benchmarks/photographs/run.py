@@ -92,7 +92,7 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
                     integrator=integrator,
                     spp=1 if warm else spp,
                     seed=mi.UInt32(number),
-                    seed_grad=mi.UInt32(number + 1),
+                    seed_grad=number + 1,
                 )
                 loss += problem.loss_value(int(view), image)
             dr.backward(loss)
