@@ -13,7 +13,8 @@ def table(record: Record) -> str:
     labels = sorted(found, key=lambda label: 0 if label == "none" else len(label))
     settings = record["settings"]
     about = (
-        f"Errors after {settings['seconds']:g} s of the processor, relative to the start: median of {settings['seeds']} seeds "
+        "Errors after the budget of processor time, relative to the start: "
+        f"median of {settings['seeds']} seeds "
         "[least, greatest]. i: a memory of images, g: of gradients, x: mini-batches of pixels, p: the pose by perturbed renders."
     )
     rows = [[label, *(_cell(entry["methods"].get(label)) for entry in problems.values())] for label in labels]

@@ -81,7 +81,7 @@ class HybridGradient:
 
     Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
     gradient, which is what a meta-estimate has of as many samples. By the variance alone, which is small where perturbations agree,
-    `MetaAdam` would take steps many times as long as its learning rate. The loss is that of `path`.
+    `MetaAdam` would take steps longer than its learning rate. The loss is that of `path`.
 
     Args:
         path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
