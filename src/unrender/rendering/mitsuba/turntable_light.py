@@ -10,7 +10,6 @@ its first or last row. `distance`, 10^6 where it is not given, is how far away t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -40,33 +39,17 @@ def is_turntable(emitter: Any) -> bool:
 
 def text(rotations: np.ndarray) -> str:
     """Rotations (N, 3, 3), from the map's axes to the world's, as the plugin's `turns`."""
-    return ", ".join(" ".join(f"{x:.9g}" for x in _quaternion(matrix)) for matrix in rotations)
+    from scipy.spatial.transform import Rotation
+
+    quaternions = np.roll(Rotation.from_matrix(np.asarray(rotations, float)).as_quat(), 1, axis=-1)
+    return ", ".join(" ".join(f"{x:.9g}" for x in row) for row in quaternions)
 
 
 def turns(emitter: Any) -> np.ndarray:
     """The rotations of a live emitter, (N, 3, 3)."""
-    return np.stack([_matrix(row) for row in emitter.rows])
+    from scipy.spatial.transform import Rotation
 
-
-def _quaternion(matrix: np.ndarray) -> np.ndarray:
-    """w, x, y, z of a rotation: the eigenvector of Bar-Itzhack's matrix with the largest eigenvalue."""
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, float)
-    k = np.array(
-        [[a - e - i, b + d, c + g, h - f], [0, e - a - i, f + h, c - g], [0, 0, i - a - e, d - b], [0, 0, 0, a + e + i]]
-    )
-    x, y, z, w = np.linalg.eigh(np.triu(k) + np.triu(k, 1).T)[1][:, -1]
-    return np.array([w, x, y, z])
-
-
-def _matrix(q: Sequence[float]) -> np.ndarray:
-    w, x, y, z = (float(part) for part in q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(np.roll(emitter.rows, -1, axis=-1)).as_matrix()
 
 
 def _rows(properties: Any) -> np.ndarray:
