@@ -132,6 +132,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
         trust_radius=0.1, curvature=0.5, history=20, inner_optimizer=OPTIMIZERS["Adam"]()
     ),
     "CMAES": lambda: ur.optimizers.CMAES(sigma0=0.1),
+    "Partitioned": lambda: ur.optimizers.Partitioned((), OPTIMIZERS["SGD"](), OPTIMIZERS["ScheduleFree"]()),
 }
 OPTIMIZERS |= others("optimizer")
 FITTING = [

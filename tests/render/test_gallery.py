@@ -60,6 +60,7 @@ POSES = {
 PLATEAUS = ["box2", "box10", "mug", "shadow"]
 WITHOUT_RENDERER = ["exponential", "quad"]
 DRAWN = ["mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caustic"]  # see test_gallery_adaptive.py
+MESHES = ["sphere-to-mesh", "sphere-to-bunny", "shadow-art", "statue"]  # see test_shapes.py, test_mesh_runs.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 
@@ -106,7 +107,7 @@ def limit(count: int, level: float = 1e-4) -> float:
 
 def test_the_first_problem_is_the_one_to_begin_with():
     assert NAMES[0] == "indirect-room"
-    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, "sphere-to-mesh", "camera"} == set(NAMES)
+    assert {*RENDERED, *POSES, *WITHOUT_RENDERER, *DRAWN, *VOLUMES, *MESHES, "camera"} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -17,6 +17,7 @@ from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather, prepared
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
 from unrender.problem.problem import Problem
@@ -307,7 +308,8 @@ class MetaEstimator:
         """A gradient of pixels of its own, and the pixel sampler's next state. Where it is not the `first` of a step, that state stays: the
         step has been counted, and its gradient observed."""
         draw_key = key.fold(PIXELS)
-        if not isinstance(self.pixels, All) and self._whole(parameters, state):
+        drawn = not isinstance(self.pixels, (All, AdaptiveCounts))
+        if drawn and self._whole(parameters, state):
             batch, pixels = MiniBatch(None), state.pixels
         elif first or not isinstance(self.pixels, RepeatableSampler):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
@@ -317,10 +319,12 @@ class MetaEstimator:
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
             pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
-            if batch.sample is None and not isinstance(self.pixels, All):
+            if drawn and batch.sample is None:
                 step = replace(step, image=prepared(problem, self.image, step.image))
         return step, pixels
 
     def _whole(self, parameters: Tree, state: MetaState) -> bool:
         """Whether a step renders whole views: all do, or the image estimator needs them."""
-        return isinstance(self.pixels, All) or self.image.needs_whole_views(parameters, state.image, state.batches)
+        if isinstance(self.pixels, (All, AdaptiveCounts)):
+            return True
+        return self.image.needs_whole_views(parameters, state.image, state.batches)
