@@ -27,18 +27,10 @@ __all__ = ["HeldParameters", "PartialDerivatives"]
 
 
 @dataclass(frozen=True, eq=False)
-class PartialDerivatives:
-    """A renderer that changes all parameters and differentiates all but some: the derivatives by these are returned as 0.
-
-    They need not be differentiable: of all others the gradient is exact, to the renderer, at whatever values these have.
-
-    Args:
-        inner: what renders the scene.
-        constant: keys of the parameters whose derivatives are 0.
-    """
+class _View:
+    """What both views leave to the renderer."""
 
     inner: Renderer
-    constant: frozenset[str]
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
         """See `Renderer.parameters`."""
@@ -55,6 +47,20 @@ class PartialDerivatives:
     def array(self, values: np.ndarray) -> Array:
         """See `Renderer.array`."""
         return self.inner.array(values)
+
+
+@dataclass(frozen=True, eq=False)
+class PartialDerivatives(_View):
+    """A renderer that changes all parameters and differentiates all but some: the derivatives by these are returned as 0.
+
+    They need not be differentiable: of all others the gradient is exact, to the renderer, at whatever values these have.
+
+    Args:
+        inner: what renders the scene.
+        constant: keys of the parameters whose derivatives are 0.
+    """
+
+    constant: frozenset[str]
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
@@ -109,7 +115,7 @@ class _PartialSession:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldParameters:
+class HeldParameters(_View):
     """A renderer of the scene with some parameters at given values: what renders others at many values, and differentiates nothing.
 
     Args:
@@ -117,24 +123,7 @@ class HeldParameters:
         held: {key: array} of the parameters that do not change.
     """
 
-    inner: Renderer
     held: Tree
-
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
-        return self.inner.parameters()
-
-    def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`."""
-        return self.inner.values(keys)
-
-    def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
-        return self.inner.resolutions()
-
-    def array(self, values: np.ndarray) -> Array:
-        """See `Renderer.array`."""
-        return self.inner.array(values)
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
