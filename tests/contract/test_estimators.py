@@ -78,7 +78,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "coupled, control variate, adaptive pixels": lambda: ur.MetaEstimator(
         coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none")
     ),
-    "hybrid": lambda: hybrid(ur.PathGradient(spp=2)),
+    "hybrid": lambda: hybrid(ur.PathGradient(spp=6)),
     "hybrid, all four": lambda: hybrid(
         ur.MetaEstimator(coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none"))
     ),
