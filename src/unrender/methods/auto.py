@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -347,8 +348,8 @@ def _radius(positions: np.ndarray) -> float:
 
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
-    values, or the share itself where they are 0; over the number of unknown textures of its material, which all answer the same residuals
-    and would together go too far. With a parameterisation, that of u which is such a step in the middle or at that size."""
+    values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
+    residuals and would together go too far. With a parameterisation, that of u which is such a step in the middle or at that size."""
     found: dict[str, float] = {}
     initial = problem.initial_values()
     maps = Counter(_owner(key) for key, value in initial.items() if key.endswith(_TEXELS) and value.ndim == _TEXTURE)
@@ -362,7 +363,7 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = _MESH_SHARE * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
-        size /= maps[_owner(key)] if key.endswith(_TEXELS) and value.ndim == _TEXTURE else 1
+        size /= math.sqrt(maps[_owner(key)]) if key.endswith(_TEXELS) and value.ndim == _TEXTURE else 1.0
         if key in problem.coordinates.transforms:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
             size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))
