@@ -80,6 +80,9 @@ def test_sobolev_gradients_on_a_mesh_are_near_the_dense_root_and_its_square(weld
     weaker = bound.scaled(1 / 16)
     assert np.std(weaker.apply(g.reshape(-1))) > 1.5 * np.std(smooth)
     assert weaker == Sobolev(2.5)
+    np.testing.assert_allclose(
+        Sobolev(0.0).on_mesh(MeshTopology.of(*sheet(12), False)).apply(g[:156, 0]), g[:156, 0], rtol=1e-6
+    )
 
 
 def test_schedule_free_smooths_values_at_vertices_where_the_problem_knows_their_mesh() -> None:

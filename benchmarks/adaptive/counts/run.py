@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.adaptive.over_uniform.run import FOREIGN, GALLERY, rough_box
-from benchmarks.internals import Key, Tree, element_scales
+from benchmarks.adaptive.over_uniform.run import FOREIGN, GALLERY, Kept, rough_box, spread
+from benchmarks.internals import Key, element_scales
 from benchmarks.races import Entrant, Runs, over, race, reached, tenths
 from benchmarks.suite.scenes import problem as foreign_problem
 
@@ -35,7 +35,6 @@ IMAGES = {"plain": ur.images.Plain, "rcv": ur.images.RecursiveControlVariate}
 EQUAL, ADAPTIVE = (2, 4, 8), (4, 8)
 """Samples per pixel that race."""
 RATES = (0.01, 0.03)
-PARTS = 8
 MERGE = ("variance.*", "races.*", "seconds_per_path.*")
 QUICK = {
     "problem": ("mirror-trio",),
@@ -49,30 +48,6 @@ QUICK = {
 }
 
 
-@dataclass(frozen=True)
-class Kept:
-    """An estimator that keeps the parameters and its state before some steps."""
-
-    inner: ur.PathGradient
-    at: tuple[int, ...]
-    before: dict[int, tuple[Tree, Any]] = field(default_factory=dict)
-
-    @property
-    def provides(self) -> Any:
-        """See `Estimator.provides`."""
-        return self.inner.provides
-
-    def init(self, problem: ur.Problem, parameters: Tree) -> Any:
-        """See `Estimator.init`."""
-        return self.inner.init(problem, parameters)
-
-    def estimate(self, problem: ur.Problem, parameters: Tree, state: Any, key: Key) -> Any:
-        """See `Estimator.estimate`."""
-        if state.step in self.at:
-            self.before[state.step] = parameters, state
-        return self.inner.estimate(problem, parameters, state, key)
-
-
 def rows(problem: ur.Problem, kept: Kept, step: int, runs: int, equal: bool) -> np.ndarray:
     """(runs, n) gradients of a state that was kept, in the coordinates of the descent; with equal numbers of samples or its own."""
     at, state = kept.before[step]
@@ -84,13 +59,6 @@ def rows(problem: ur.Problem, kept: Kept, step: int, runs: int, equal: bool) -> 
         pulled = problem.coordinates.pull_back(estimate.gradient, problem.coordinates.slopes(at))
         found.append(np.concatenate([np.array(g).ravel() for g in pulled.values()]))
     return np.array(found, np.float32)
-
-
-def spread(gradients: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """The weighted sum of the variances, and its relative standard error, from eighths."""
-    parts = [np.var(part, axis=0, ddof=1, dtype=np.float64) @ weights for part in np.array_split(gradients, PARTS)]
-    mean = float(np.var(gradients, axis=0, ddof=1, dtype=np.float64) @ weights)
-    return mean, float(np.std(parts, ddof=1) / np.sqrt(PARTS) / max(mean, 1e-300))
 
 
 def cost(problem: ur.Problem, sampler: ur.pixels.AdaptiveCounts, state: Any, spp: int) -> float:

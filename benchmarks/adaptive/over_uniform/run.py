@@ -97,6 +97,7 @@ class Kept:
     """An estimator that keeps the parameters and its state before some steps."""
 
     inner: ur.PathGradient
+    at: tuple[int, ...]
     before: dict[int, tuple[Tree, Any]] = field(default_factory=dict)
 
     @property
@@ -110,7 +111,7 @@ class Kept:
 
     def estimate(self, problem: ur.Problem, parameters: Tree, state: Any, key: Key) -> Any:
         """See `Estimator.estimate`."""
-        if state.step in STEPS:
+        if state.step in self.at:
             self.before[state.step] = parameters, state
         return self.inner.estimate(problem, parameters, state, key)
 
@@ -176,7 +177,7 @@ def point(
 def descent(problem: ur.Problem, label: str, settings: dict[str, int], seed: int) -> list[dict[str, Any]]:
     """Ratios at each of `STEPS`."""
     sampler = ur.pixels.Adaptive(settings["count"], **SAMPLERS[label])
-    kept = Kept(ur.PathGradient(pixels=sampler, spp=2))
+    kept = Kept(ur.PathGradient(pixels=sampler, spp=2), STEPS)
     ur.optimize(problem, kept, ur.optimizers.Adam(0.01), steps=STEPS[-1] + 1, seed=seed)
     return [
         point(problem, sampler, at, state.pixels, settings, step, label == "adaptive")

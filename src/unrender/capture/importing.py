@@ -20,6 +20,7 @@ from unrender.capture import (
     photometric_folder,
     problem_folder,
     turntable,
+    writing,
 )
 from unrender.capture import mesh as meshes
 from unrender.capture.capture import Capture
@@ -41,7 +42,7 @@ from unrender.stages import stages_file
 __all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "ImportOptions", "Imported", "check", "import_capture"]
 
 CHECK, SHEET = "check", "check.png"
-PROBLEM, STAGES = problem_folder.PROBLEM, stages_file.FILE
+PROBLEM, STAGES = writing.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
 """Along the longest side of the hull: memory grows with the cube."""
 TURNTABLE = (

@@ -18,6 +18,7 @@ from unrender.capture.overlays import png
 from unrender.capture.photometric import LitViews, least_squares
 from unrender.capture.writing import (
     MASKS,
+    PROBLEM,
     REFERENCES,
     SCENE,
     TEXTURES,
@@ -36,7 +37,6 @@ __all__ = ["NAMES", "OWN", "write"]
 
 NAMES = ("colour", "normal", "exposure")
 """The unknowns that such a problem may have."""
-PROBLEM = "problem.toml"
 _COLOUR, _NORMAL = "base-colour.exr", "normal.exr"
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, TEXTURES})
 """What `write` puts into a folder."""

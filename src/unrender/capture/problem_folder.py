@@ -18,6 +18,7 @@ from unrender.capture.silhouettes import Silhouettes
 from unrender.capture.turntable import light_turns
 from unrender.capture.writing import (
     MASKS,
+    PROBLEM,
     REFERENCES,
     SCENE,
     TEXTURES,
@@ -35,9 +36,9 @@ from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba import turntable_light
 from unrender.stages import stages_file
 
-__all__ = ["OWN", "PROBLEM", "to_world", "write"]
+__all__ = ["OWN", "to_world", "write"]
 
-PROBLEM, MESH = "problem.toml", "asset.ply"
+MESH = "asset.ply"
 LIGHT = "textures/light.exr"
 _FOLDERS = (REFERENCES, MASKS, TEXTURES)
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})

@@ -14,10 +14,9 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Variance
-from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, gather, prepared
+from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, draws_pixels, gather, prepared
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
-from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
 from unrender.problem.problem import Problem
@@ -308,7 +307,7 @@ class MetaEstimator:
         """A gradient of pixels of its own, and the pixel sampler's next state. Where it is not the `first` of a step, that state stays: the
         step has been counted, and its gradient observed."""
         draw_key = key.fold(PIXELS)
-        drawn = not isinstance(self.pixels, (All, AdaptiveCounts))
+        drawn = draws_pixels(self.pixels)
         if drawn and self._whole(parameters, state):
             batch, pixels = MiniBatch(None), state.pixels
         elif first or not isinstance(self.pixels, RepeatableSampler):
@@ -325,6 +324,4 @@ class MetaEstimator:
 
     def _whole(self, parameters: Tree, state: MetaState) -> bool:
         """Whether a step renders whole views: all do, or the image estimator needs them."""
-        if isinstance(self.pixels, (All, AdaptiveCounts)):
-            return True
-        return self.image.needs_whole_views(parameters, state.image, state.batches)
+        return not draws_pixels(self.pixels) or self.image.needs_whole_views(parameters, state.image, state.batches)

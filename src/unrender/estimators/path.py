@@ -12,11 +12,10 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
-from unrender.estimators.sample_groups import PIXELS, check_pixels, gather, leave_one_out_groups, prepared
+from unrender.estimators.sample_groups import PIXELS, check_pixels, draws_pixels, gather, leave_one_out_groups, prepared
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
-from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, learned
 from unrender.problem.problem import Problem
@@ -130,8 +129,8 @@ class PathGradient:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
         the info of the image estimator, per view that was rendered whole, "pixel_probability" per view of a mini-batch."""
         batch, pixels = MiniBatch(None), state.pixels
-        whole_views = isinstance(self.pixels, (All, AdaptiveCounts))
-        if whole_views or not self.image.needs_whole_views(parameters, state.image, state.batches):
+        drawn = draws_pixels(self.pixels)
+        if not drawn or not self.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         step = gather(
             problem,
@@ -148,7 +147,7 @@ class PathGradient:
         pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
         pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         whole, image = batch.sample is None, step.image
-        if whole and not whole_views:
+        if whole and drawn:
             image = prepared(problem, self.image, image)
         next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1)
         arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)

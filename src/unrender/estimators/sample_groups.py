@@ -114,6 +114,11 @@ def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
     return 1 if adjoint_spp is not None else max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
 
 
+def draws_pixels(pixels: PixelSampler) -> bool:
+    """Whether a pixel sampler has mini-batches; the others render whole views at each step."""
+    return not isinstance(pixels, (All, AdaptiveCounts))
+
+
 def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, adjoint_spp: int | None = None) -> None:
     """Raise `InputError` for what is no pixel sampler, for mini-batches or counts where the image estimator needs whole views of equal
     counts, or where the samples are too few to be counted out.

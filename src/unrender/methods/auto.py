@@ -265,16 +265,15 @@ class AutoMethod(Options):
 
 def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:
     """Where two states of the parameters share samples, and why nowhere; "" where they do."""
-    keys = list(problem.shapes())
-    try:
-        problem.renderer.prepare(keys, "path")
-    except InputError:
+    obstacle = ""
+    for space in ("path", "primary"):
         try:
-            problem.renderer.prepare(keys, "primary")
+            problem.renderer.prepare(list(problem.shapes()), space)
         except InputError as error:
-            return "primary", str(error)
-        return "primary", ""
-    return "path", ""
+            obstacle = str(error)
+        else:
+            return space, ""
+    return "primary", obstacle
 
 
 def _is_of_cameras(problem: Problem) -> bool:
@@ -352,7 +351,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     residuals and would together go too far. With a parameterisation, that of u which is such a step in the middle or at that size."""
     found: dict[str, float] = {}
     initial = problem.initial_values()
-    maps = Counter(_owner(key) for key, value in initial.items() if key.endswith(_TEXELS) and value.ndim == _TEXTURE)
+    materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
+    textures = Counter(materials.values())
     for key, value in initial.items():
         low, high = problem.bounds[key]
         if low is not None and high is not None:
@@ -363,7 +363,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = _MESH_SHARE * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
-        size /= math.sqrt(maps[_owner(key)]) if key.endswith(_TEXELS) and value.ndim == _TEXTURE else 1.0
+        if key in materials:
+            size /= math.sqrt(textures[materials[key]])
         if key in problem.coordinates.transforms:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
             size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))

@@ -8,7 +8,6 @@ what is cut there are neighbours.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -135,52 +134,54 @@ class MeshSpectrum:
 
     Args:
         topology: of the mesh.
-        strongest: λ, > 0.
+        strongest: λ, >= 0.
+
+    Attributes:
+        topology: as given.
     """
 
     def __init__(self, topology: MeshTopology, strongest: float):
-        self._topology = topology
-        count = 1 + max(0, math.ceil(math.log(max(strongest, _WEAKEST_POLE) / _WEAKEST_POLE, _POLE_FACTOR)))
+        self.topology = topology
+        strongest = max(strongest, _WEAKEST_POLE)
+        count = 1 + math.ceil(math.log(strongest / _WEAKEST_POLE, _POLE_FACTOR))
         self._poles = (0.0, *(strongest * _POLE_FACTOR ** -np.arange(count, dtype=float)))
         self._largest = max(1.0, 2.0 * float((topology.laplacian.diagonal() / topology.copies).max(initial=0.0)))
-        self._roots: dict[float, np.ndarray] = {}
+        self._weights: dict[tuple[float, float], np.ndarray] = {}
 
     def solved(self, x: np.ndarray) -> np.ndarray:
         """Of all poles, (poles, P, n): (C + λ_k L)^-1 x, x (P, n)."""
         return np.stack(
             [
-                x / self._topology.copies[:, None],
-                *(self._topology.solver(pole).solve_places(x) for pole in self._poles[1:]),
+                x / self.topology.copies[:, None],
+                *(self.topology.solver(pole).solve_places(x) for pole in self._poles[1:]),
             ]
         )
 
-    def weights(self, function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """w, (poles,), >= 0 and of sum 1, of a function of the eigenvalues that is 1 at 0."""
+    def weights(self, strength: float, power: float) -> np.ndarray:
+        """w, (poles,), >= 0 and of sum 1, of (1 + λ x)^-power; λ up to the strongest, power up to 1."""
         from scipy.optimize import nnls
 
-        x = np.geomspace(1e-3 / self._poles[1], self._largest, _SAMPLES)
-        wanted = function(x)
-        basis = 1.0 / (1.0 + np.outer(x, self._poles))
-        found, _ = nnls(basis / wanted[:, None], np.ones(len(x)))
-        return found / found.sum()
+        if (strength, power) not in self._weights:
+            x = np.geomspace(1e-3 / self._poles[1], self._largest, _SAMPLES)
+            basis = 1.0 / (1.0 + np.outer(x, self._poles))
+            found, _ = nnls(basis * ((1.0 + strength * x) ** power)[:, None], np.ones(len(x)))
+            self._weights[strength, power] = found / found.sum()
+        return self._weights[strength, power]
 
     def root(self, strength: float, x: np.ndarray) -> np.ndarray:
         """Near B C^-1/2 (I + λ C^-1/2 L C^-1/2)^-1/2 C^-1/2 Bᵀ x, of the shape of x, (V, n) float32."""
-        if strength not in self._roots:
-            self._roots[strength] = self.weights(lambda x: 1.0 / np.sqrt(1.0 + strength * x))
-        found = np.tensordot(self._roots[strength], self.solved(self._topology.gathered(x)), 1)
-        return np.asarray(found[self._topology.places], np.float32)
+        found = np.tensordot(self.weights(strength, 0.5), self.solved(self.topology.gathered(x)), 1)
+        return np.asarray(found[self.topology.places], np.float32)
 
     def descents(self, strength: float, smooth: np.ndarray, gradient: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """See `Sobolev.descents`; smooth, gradient: (V, n)."""
-        topology = self._topology
+        topology = self.topology
         places = np.zeros((len(topology.copies), smooth.shape[1]))
         places[topology.places] = self.root(strength, smooth)  # (C + λ L)^-1 Bᵀ g
         first = topology.copies[:, None] * places + strength * (topology.laplacian @ places)
         second, solved = topology.gathered(gradient), self.solved(first)
         sums = np.einsum("kpn,spn->sk", solved, np.stack([second, first]))
-        weights = [self.weights(lambda x, share=share: 1.0 / (1.0 + share * strength * x)) for share in shares]
-        return sums @ np.transpose(weights)
+        return sums @ np.transpose([self.weights(share * strength, 1.0) for share in shares])
 
 
 def _edges(corners: np.ndarray) -> np.ndarray:

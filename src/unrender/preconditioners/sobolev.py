@@ -46,7 +46,6 @@ class Sobolev:
     strength: float | None = None
     wrap: bool | tuple[bool, ...] = False
     correlation: float = 1 / 8
-    _mesh: MeshTopology | None = field(default=None, init=False, repr=False, compare=False)
     _spectrum: MeshSpectrum | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
@@ -57,21 +56,19 @@ class Sobolev:
 
     def on_mesh(self, topology: MeshTopology) -> Sobolev:
         """See `MeshPreconditioner.on_mesh`."""
-        bound = replace(self)
-        strongest = bound._strength_on(topology)
-        return bound._bound(topology, MeshSpectrum(topology, strongest))
+        return replace(self)._bound(MeshSpectrum(topology, self._strength_on(topology)))
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""
-        if self._mesh is not None:
+        if self._spectrum is not None:
             return
         grid.check("Sobolev", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
         """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
-        if self._mesh is not None and self._spectrum is not None:
-            values = self._mesh.split("Sobolev", arrays.numpy(x))
-            return arrays.like(self._spectrum.root(self._strength_on(self._mesh), values).reshape(-1), x)
+        if (spectrum := self._spectrum) is not None:
+            values = spectrum.topology.split("Sobolev", arrays.numpy(x))
+            return arrays.like(spectrum.root(self._strength_on(spectrum.topology), values).reshape(-1), x)
         shape = arrays.shape(x)
         self.check("parameter", shape)
         solver = grid.square_root_solver(self.strength_of(shape), shape[:-1], self._wraps(shape))
@@ -79,8 +76,8 @@ class Sobolev:
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
         """λ for a texture or grid of this shape; of its mesh, where it has one."""
-        if self._mesh is not None:
-            return self._strength_on(self._mesh)
+        if self._spectrum is not None:
+            return self._strength_on(self._spectrum.topology)
         cells = shape[:-1]
         if self.strength is not None:
             return float(self.strength)
@@ -92,7 +89,7 @@ class Sobolev:
             found = replace(self, correlation=self.correlation * math.sqrt(share))
         else:
             found = replace(self, strength=self.strength * share)
-        return found._bound(self._mesh, self._spectrum)
+        return found._bound(self._spectrum)
 
     def descents(self, smooth: Array, gradient: Array, shares: np.ndarray) -> np.ndarray:
         """With `shares` s of λ and S_s = (I + s λ L)^(-1/2), of two estimates g and g' of a gradient: S_s g · S_s g' and |S_s g|².
@@ -105,9 +102,9 @@ class Sobolev:
         Returns:
             (2, n), float64: sums over all elements.
         """
-        if self._mesh is not None and self._spectrum is not None:
-            first, second = (self._mesh.split("Sobolev", arrays.numpy(x)) for x in (smooth, gradient))
-            return self._spectrum.descents(self._strength_on(self._mesh), first, second, shares)
+        if (spectrum := self._spectrum) is not None:
+            first, second = (spectrum.topology.split("Sobolev", arrays.numpy(x)) for x in (smooth, gradient))
+            return spectrum.descents(self._strength_on(spectrum.topology), first, second, shares)
         shape = arrays.shape(gradient)
         transform = grid.transform(shape[:-1], self._wraps(shape))
         strength, eigenvalues = self.strength_of(shape), transform.eigenvalues
@@ -117,8 +114,7 @@ class Sobolev:
         gains = [1.0 / (1.0 + share * strength * eigenvalues[..., 0]) for share in shares]
         return np.array([[np.vdot(gain, part) for gain in gains] for part in sums])
 
-    def _bound(self, mesh: MeshTopology | None, spectrum: MeshSpectrum | None) -> Sobolev:
-        object.__setattr__(self, "_mesh", mesh)
+    def _bound(self, spectrum: MeshSpectrum | None) -> Sobolev:
         object.__setattr__(self, "_spectrum", spectrum)
         return self
 

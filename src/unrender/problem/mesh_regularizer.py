@@ -93,12 +93,12 @@ class _Mesh:
         topology = MeshTopology.of(positions, faces)
         if not len(topology.neighbours):
             raise InputError("its mesh has no edges")
-        _, first, copies = np.unique(topology.places, return_index=True, return_counts=True)
+        _, first = np.unique(topology.places, return_index=True)
         i, j = topology.neighbours.T
         valence = np.maximum(np.bincount(np.concatenate([i, j]), minlength=len(first)), 1)
         at = positions[first].astype(np.float64)
         length = float(np.linalg.norm(at[i] - at[j], axis=1).mean())
-        return cls(topology.places, first, copies, topology.neighbours, valence, length)
+        return cls(topology.places, first, topology.copies, topology.neighbours, valence, length)
 
 
 def of(given: Any) -> MeshRegularizer:

@@ -39,6 +39,7 @@ from unrender.problem.validation import (
     check_sequence,
     check_truth,
     check_view,
+    mesh_topology,
     open_renderer,
     renderer_notices,
 )
@@ -202,8 +203,7 @@ class Problem:
 
     def topology(self, key: str) -> MeshTopology | None:
         """Of the mesh at whose vertices a parameter has values, (n V,); None for textures, grids and numbers."""
-        info = self.renderer.parameters()[key]
-        return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
+        return mesh_topology(self.renderer.parameters()[key])
 
     def preconditioned(self, given: Mapping[str, Preconditioner]) -> Problem:
         """The same problem with these preconditioners for the parameters that have none of their own. Raises `InputError` for one that does

@@ -43,6 +43,7 @@ __all__ = [
     "check_sequence",
     "check_truth",
     "check_view",
+    "mesh_topology",
     "open_renderer",
     "renderer_notices",
 ]
@@ -225,12 +226,17 @@ def check_parameterisation(
     return made, made.transform(bounds, initial)
 
 
+def mesh_topology(info: ParameterInfo) -> MeshTopology | None:
+    """Of the mesh at whose vertices a parameter has values; None where it has none."""
+    return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
+
+
 def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
     """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
-    if isinstance(preconditioner, MeshPreconditioner) and info.mesh is not None:
-        preconditioner = preconditioner.on_mesh(MeshTopology.of(*info.mesh(), info.welded))
+    if isinstance(preconditioner, MeshPreconditioner) and (topology := mesh_topology(info)) is not None:
+        preconditioner = preconditioner.on_mesh(topology)
     try:
         preconditioner.check(key, info.shape)
     except InputError as error:

@@ -119,9 +119,8 @@ class MitsubaSession:
             keys = [*keys, *(key for key in poses if key in derivatives)]
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
         if fixed:
-            pair.loaded().set_parameters(
-                {}
-            )  # path gradients of an earlier session may have left shapes where it moved them
+            # Path gradients of an earlier session may have left shapes where it moved them.
+            pair.loaded().set_parameters({})
         self._posed = PosedScene(pair.current, fixed) if fixed else None
         self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
