@@ -27,7 +27,7 @@ from unrender.capture import importing
 from unrender.judging.measures import measure
 
 METHODS: dict[str, dict[str, Any]] = {
-    "auto": {"pixels": 16384, "spp": 8},
+    "auto": {},
     "adaptive": {"pixels": 16384, "spp": 8, "learning_rate": 0.02},
     "plain": {"spp": 2, "learning_rate": 0.02},
     "rcv": {"spp": 2, "learning_rate": 0.02},

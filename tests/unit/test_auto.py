@@ -154,13 +154,18 @@ def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "_PATHS", paths)
         assert chosen(problem())[0].spp == spp, paths
     assert chosen(problem(), spp=5)[0].spp == 5
+    assert chosen(problem())[1].wiener
 
 
 def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MOST_PIXELS", 10)
-    estimator, _ = chosen(problem(losses.L1()))
+    monkeypatch.setattr(module, "_DRAWN", 5)
+    monkeypatch.setattr(module, "_DRAWN_PATHS", 20)
+    estimator, optimizer = chosen(problem(losses.L1()))
     assert estimator.pixels == pixels.Uniform(5)
+    assert estimator.spp == 4
     assert estimator.image == images.Plain()
+    assert not optimizer.wiener
     assert chosen(problem(), pixels=7)[0].pixels == pixels.Uniform(7)
 
 

@@ -54,6 +54,8 @@ _MANY_VIEWS, _MOST_VIEWS = 4, 8
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
 """An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
 product, and the extinction, whose range is open, has further to go."""
+_NORMALS, _NORMALS_SHARE = ".normalmap.", 0.1
+"""A normal map moves by this part of a tenth of its range, or its surface by ten degrees a step, and highlights jump."""
 _TEXELS = ".data"
 """End of the key of a texture's texels."""
 _TOLERANCE = 2.0
@@ -75,7 +77,9 @@ _SIGMA, _STEP = 0.2, 0.5
 _PERTURBED, _PERTURBED_SPP, _ANNEALING = 16, 2, (25.0, 0.1)
 """Perturbed renders per view and step, their samples per pixel, and half-life and floor of their width."""
 _MOST_PIXELS = 1 << 19
-"""Of all views, that a step renders whole; where there are more, it draws half as many of them."""
+"""Of all views, that a step renders whole."""
+_DRAWN, _DRAWN_PATHS = 1 << 15, 1 << 17
+"""Where there are more: the pixels that a step draws of them, and its paths."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +107,11 @@ class AutoMethod(Options):
         None, description="what the loss sees: a fresh rendering, or rcv's; none chooses by their noise"
     )
     spp: PositiveInt | None = Field(
-        None, description="samples per pixel; none for some 32768 paths a step, from 2 to 16"
+        None,
+        description="samples per pixel; none for some 32768 paths a step, 131072 of drawn pixels, from 2 to 16 per pixel",
     )
     pixels: PositiveInt | None = Field(
-        None, description="pixels a step, drawn from all views; none for all pixels, or 262144 where views are large"
+        None, description="pixels a step, drawn from all views; none for all pixels, or 32768 where there are more than 524288"
     )
     tolerance: NonNegativeFloat = Field(
         _TOLERANCE, description="times its noise, within which L1 and Huber count a residual by its size, not its sign"
@@ -180,6 +185,7 @@ class AutoMethod(Options):
             {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
             preconditioner=Sobolev() if smoothed else None,
             preconditioned=smoothed,
+            wiener=not isinstance(sampler, pixels.Uniform),
             parameterisations=moved,
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
@@ -243,13 +249,14 @@ class AutoMethod(Options):
             return pixels.Views(taken), f"{taken} of {views} views a step: moving borders cost each view alike"
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
-        drawn = _MOST_PIXELS // 2
+        drawn = _DRAWN
         return pixels.Uniform(drawn), f"{drawn} of all {count} pixels a step"
 
     def _samples(self, problem: Problem, sampler: PixelSampler) -> int:
         """Per pixel: the power of two that comes nearest to the paths of a step from below."""
-        count = sampler.count if isinstance(sampler, pixels.Uniform) else problem.pixels
-        return self.spp or min(max(1 << ((_PATHS // count).bit_length() - 1 if count <= _PATHS else 0), _FEWEST), _MOST)
+        draws = isinstance(sampler, pixels.Uniform)
+        count, paths = (sampler.count, _DRAWN_PATHS) if draws else (problem.pixels, _PATHS)
+        return self.spp or min(max(1 << ((paths // count).bit_length() - 1 if count <= paths else 0), _FEWEST), _MOST)
 
     def _smoothed(self, problem: Problem) -> tuple[str, ...]:
         """Textures, grids and values at vertices, but for positions, that have no preconditioner of their own."""
@@ -363,6 +370,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = _MESH_SHARE * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
+        if _NORMALS in key:
+            size *= _NORMALS_SHARE
         if key in materials:
             size /= math.sqrt(textures[materials[key]])
         if key in problem.coordinates.transforms:

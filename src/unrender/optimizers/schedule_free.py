@@ -54,7 +54,7 @@ class ScheduleFreeState:
         second_moment: weighted mean of the squared gradient, not debiased.
         gradient: the last one, preconditioned.
         product, square: exponentially weighted sums of g_t g_{t-1}, and of the mean of the squares of both, per element of the
-            preconditioned parameters.
+            preconditioned parameters, with `wiener`.
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor that the rate has fallen by}.
         strengths: {key: how strongly the gradient is smoothed}, where that is fitted.
@@ -125,7 +125,9 @@ class ScheduleFree:
     with means ⟨·⟩ over the last steps and the channels of a cell, and S² over its neighbours: two gradients share the signal, not the
     noise. Where estimates tell what fresh samples do not confirm of that product (`FreshGradient`), that is noise remembered: product and
     ρ count by the share confirmed (`StrengthFit`). Adam's division lets all elements walk alike, and those that the images tell little of
-    would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps.
+    would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps. So have all without `wiener`: where
+    steps draw few of the pixels, two gradients hardly share a pixel, and their share of signal is small everywhere; there only the mean over
+    many steps tells signal from noise, and the falling rate sees to that.
 
     Parameters that bounds have moved take their iterates along. Where smoothing changes, v̂ becomes as large as the gradients of then.
     Where it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
@@ -143,6 +145,7 @@ class ScheduleFree:
             preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
             The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
+        wiener: whether the steps of these parameters are shortened by the share of signal.
         parameterisations: {key: name}, such as "log", of the parameters that move by another variable, whose size tells nothing of how
             far they have come; given to those that have none of their own. See `unrender.parameterisations`.
     """
@@ -157,6 +160,7 @@ class ScheduleFree:
     schedule: Schedule | None = None
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
+    wiener: bool = True
     parameterisations: Mapping[str, str] = field(default_factory=dict)
     _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -209,8 +213,9 @@ class ScheduleFree:
         for key in self.parameterisations:
             if key not in parameters:
                 raise InputError(f'ScheduleFree: parameterisations: unknown parameter "{key}"')
-        near = {} if smooth is None else {key: zeros[key] for key in self.preconditioned}
-        fits = dict.fromkeys(near if isinstance(smooth, Sobolev) else {}, StrengthFit())
+        smoothed = () if smooth is None else self.preconditioned
+        near = {key: zeros[key] for key in smoothed} if self.wiener else {}
+        fits = dict.fromkeys(smoothed if isinstance(smooth, Sobolev) else (), StrengthFit())
         sizes = {
             key: max(_size(x, arrays.number(arrays.total(x * x))) or 1.0, own[key]) for key, x in parameters.items()
         }
@@ -248,9 +253,11 @@ class ScheduleFree:
             root = arrays.sqrt(second[key]) * arrays.scalar(debias, g)
             direction = g / (root + self.epsilon)
             if key in maps:
+                direction = maps[key].apply(direction)
+            if key in product:
                 cells = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
                 share = signal_share(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed, cells)
-                direction = maps[key].apply(direction) * arrays.like(share, g)
+                direction = direction * arrays.like(share, g)
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             tolerance = state.learning_rates[key] * _PROJECTED
             before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
