@@ -111,7 +111,8 @@ class AutoMethod(Options):
         description="samples per pixel; none for some 32768 paths a step, 131072 of drawn pixels, from 2 to 16 per pixel",
     )
     pixels: PositiveInt | None = Field(
-        None, description="pixels a step, drawn from all views; none for all pixels, or 32768 where there are more than 524288"
+        None,
+        description="pixels a step, drawn from all views; none for all pixels, or 32768 where there are more than 524288",
     )
     tolerance: NonNegativeFloat = Field(
         _TOLERANCE, description="times its noise, within which L1 and Huber count a residual by its size, not its sign"

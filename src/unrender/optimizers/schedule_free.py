@@ -125,9 +125,9 @@ class ScheduleFree:
     with means ⟨·⟩ over the last steps and the channels of a cell, and S² over its neighbours: two gradients share the signal, not the
     noise. Where estimates tell what fresh samples do not confirm of that product (`FreshGradient`), that is noise remembered: product and
     ρ count by the share confirmed (`StrengthFit`). Adam's division lets all elements walk alike, and those that the images tell little of
-    would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps. So have all without `wiener`: where
-    steps draw few of the pixels, two gradients hardly share a pixel, and their share of signal is small everywhere; there only the mean over
-    many steps tells signal from noise, and the falling rate sees to that.
+    would walk at random. Parameters that are not in `preconditioned` have no neighbours, and whole steps. So have all without `wiener`:
+    where steps draw few of the pixels, two gradients hardly share a pixel, and the share of signal is small everywhere; there only the
+    mean over many steps tells signal from noise, and the falling rate sees to that.
 
     Parameters that bounds have moved take their iterates along. Where smoothing changes, v̂ becomes as large as the gradients of then.
     Where it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
