@@ -81,6 +81,10 @@ def test_inclusion_probabilities() -> None:
 def test_views_of_which_nothing_is_known_or_seen_are_equally_likely() -> None:
     """Also where nothing but zeros, or values that are not finite, were seen; one black view among others is drawn now and then."""
     asked, sampler = weighted(), Views(2, by="gradients")
+    one = ur.PathGradient(pixels=Views(1, by="gradients"), spp=2)
+    assert np.isfinite(
+        flat(one.estimate(asked, asked.initial(), one.init(asked, asked.initial()), Key(0))[0].gradient)
+    ).all()
     state = sampler.init(asked, asked.initial())
     assert state is not None
     for value in (0.0, np.nan, np.inf):
