@@ -21,7 +21,7 @@ MERGE = ("problems.*",)
 QUICK = {"problem": ("quad",), "spp": (1, 2), "runs": 4, "steps": 3, "resolution": 16}
 RATE = 0.005
 """Length of a step along the line, in each element."""
-PROBLEMS = ("ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "mug", "plain-and-textured", "glossy-room")
+PROBLEMS = ("ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room")
 
 
 def line(problem: ur.Problem, steps: int) -> list[dict[str, Any]]:
