@@ -1,12 +1,14 @@
 """All four methods at once: every combination of the ingredients on six problems, at equal time.
 
-The ingredients: a memory of images (recursive control variates), a memory of gradients (coupled meta-estimation), mini-batches
-of a quarter of the pixels (adaptive), and, where there is a pose, perturbed renders for that alone (`HybridGradient`); without,
-it has path gradients like the textures. Sixteen combinations where there is a pose, eight elsewhere. Two samples a pixel;
-primary space where there is a pose, else path space. Adam, or MetaAdam with a memory of gradients; the learning rate of each
-combination is tuned on a seed of its own at the whole budget, a pose's in proportion. The budget is of processor time, of all
-threads of the process, which other work on the machine changes little. The error is each parameter's RMSE relative to where it
-began, averaged over parameters, at the end of the budget: median over seeds.
+The ingredients: a memory of images (recursive control variates), a memory of gradients (coupled meta-estimation), samples where
+the gradient's variance is, and, where there is a pose, perturbed renders for that alone (`HybridGradient`); without, it has path
+gradients like the textures. The third is mini-batches of pixels (`Adaptive()`) or, with a memory of images, which learns from whole
+views, numbers of samples (`AdaptiveCounts`, three a pixel on average, its least). Sixteen combinations where there is a pose, eight
+elsewhere. Otherwise two samples a pixel; primary space where there is a pose, else path space. Adam, or MetaAdam with a memory of
+gradients; the learning rate of each combination is tuned on a seed of its own at the whole budget; that of a pose is a tenth of
+the smoothing's width. The budget is of processor time, of all threads of the process, which other work on the machine changes
+little, twice as much where there is a pose. The error is each parameter's RMSE relative to where it began, averaged over parameters,
+at the end of the budget: median over seeds.
 
 Poses: the angle of `mug` with an unknown label; the place of the pot in `ajar`, beside its three textures, in light that comes
 round a corner; with assets, the place of the published tray beside its base colour.
@@ -45,12 +47,10 @@ POSES: dict[str, dict[str, float]] = {
 """Unknown coordinates that are added, and where they start; 0 in truth."""
 SIGMA = {"mug, label": 0.6, "ajar, pot": 0.1, TRAY: 0.3}
 """Width of the smoothing where there is a pose."""
-POSE_RATE = 5.0
-"""Learning rate of a pose as a share of its sigma, over that of textures."""
-RATES, META_RATES = (0.01, 0.03), (0.002, 0.006)
-SPP, SAMPLES = 2, 8
-WHOLE_VIEWS = 2
-"""Mini-batches between steps of whole views, where an image has a memory."""
+POSE_RATE, POSE_TIME = 0.1, 2.0
+"""Learning rate of a pose as a share of its sigma; the budget where there is one, over that of the others."""
+RATES, META_RATES = (0.01, 0.02), (0.002, 0.004)
+SPP, COUNTED_SPP, SAMPLES = 2, 3, 8
 MERGE = ("problems.*.methods",)
 QUICK = {
     "problem": ("mug, label", "caustic"),
@@ -103,11 +103,13 @@ def estimator(problem: ur.Problem, combination: tuple[bool, ...], sigma: float) 
     poses = pose_keys(problem)
     image = ur.images.Plain()
     if images:
-        image = ur.images.RecursiveControlVariate("primary" if poses else "path", whole_views=WHOLE_VIEWS)
-    sampler = ur.pixels.Adaptive(max(1, problem.pixels // 4)) if pixels else ur.pixels.All()
-    path: Any = ur.PathGradient(image, sampler, SPP)
+        image = ur.images.RecursiveControlVariate("primary" if poses else "path")
+    sampler, spp = ur.pixels.All(), SPP
+    if pixels:
+        sampler, spp = (ur.pixels.AdaptiveCounts(), COUNTED_SPP) if images else (ur.pixels.Adaptive(), SPP)
+    path: Any = ur.PathGradient(image, sampler, spp)
     if gradients:
-        path = ur.MetaEstimator(coupled=True, spp=SPP, image=image, pixels=sampler)
+        path = ur.MetaEstimator(coupled=True, spp=spp, image=image, pixels=sampler)
     if not perturbed:
         return path
     annealed = ur.schedules.Exponential(25, 0.1)
@@ -126,7 +128,7 @@ def entrants(problem: ur.Problem, name: str, only: tuple[str, ...] | None) -> li
         kind = ur.optimizers.MetaAdam if combination[1] else ur.optimizers.Adam
 
         def optimizer(rate: float, kind: Any = kind) -> Any:
-            return kind({"*": rate, **dict.fromkeys(poses, POSE_RATE * sigma * rate)})
+            return kind({"*": rate, **dict.fromkeys(poses, POSE_RATE * sigma)})
 
         rates = META_RATES if combination[1] else RATES
         found.append(Entrant(named or "none", named, estimator(problem, combination, sigma), optimizer, rates))
@@ -226,7 +228,7 @@ def run(
     Args:
         problem: of the gallery, some with an unknown pose; the tray where assets are given
         assets: folder of the scenes of others
-        seconds: budget of every run, of the processor
+        seconds: budget of every run, of the processor; twice that where there is a pose
         seeds: of the races
         only: combinations of i (images), g (gradients), x (pixels) and p (perturbed); none for all
         resolution: film size, none for the problem's own
@@ -237,5 +239,6 @@ def run(
             print(f"{TRAY}: left out, without assets", flush=True)
             continue
         made = opened(name, resolution, gallery_reference_spp, assets)
-        methods = race(made, entrants(made, name, only), seeds, seconds)
-        yield {"problems": {name: {"poses": list(pose_keys(made)), "seconds": seconds, "methods": methods}}}
+        budget = seconds * (POSE_TIME if pose_keys(made) else 1.0)
+        methods = race(made, entrants(made, name, only), seeds, budget)
+        yield {"problems": {name: {"poses": list(pose_keys(made)), "seconds": budget, "methods": methods}}}

@@ -15,7 +15,7 @@ def table(record: Record) -> str:
     about = (
         "Errors after the budget of processor time, relative to the start: "
         f"median of {settings['seeds']} seeds "
-        "[least, greatest]. i: a memory of images, g: of gradients, x: mini-batches of pixels, p: the pose by perturbed renders."
+        "[least, greatest]. i: a memory of images, g: of gradients, x: pixels by their variance, p: the pose by perturbed renders."
     )
     rows = [[label, *(_cell(entry["methods"].get(label)) for entry in problems.values())] for label in labels]
     parts = [about, markdown.table(["", *problems], rows)]

@@ -198,3 +198,11 @@ def test_a_parameter_that_no_pixel_knows_of_changes_nothing_for_the_others() -> 
     assert not found[-1].gradient["y"].any()
     assert np.isfinite(found[-1].gradient["x"]).all()
     assert np.ptp(state.pixels.shares) > 0.5
+
+
+def test_the_size_of_a_mini_batch_without_a_number() -> None:
+    from unrender.pixels.adaptive import default_count
+
+    assert default_count(few_pixels(views=2)) == 128
+    found, _ = steps(few_pixels(), ur.PathGradient(pixels=ur.pixels.Adaptive(denoiser="none"), spp=2), 1)
+    assert found[0].info["samples"] >= 2 * 64

@@ -494,8 +494,43 @@ def test_a_control_variate_found_at_whole_views_now_and_then() -> None:
         found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
         whole.append(bool(found.info["images"]))
     assert whole == [True, False, False, False, False] * 2 + [True]
-    rendered = np.concatenate([memory.image.reshape(-1, 3) for memory in state.image.views])
+    rendered = np.concatenate(
+        [memory.image.reshape(-1, 3) for memory in state.image.views]
+    )  # after a step of whole views
     np.testing.assert_array_equal(state.image.snapshot.image, rendered)
+
+
+@pytest.mark.parametrize("planted", [False, True])
+def test_a_snapshot_remembers_what_mini_batches_render_of_its_state(planted: bool) -> None:
+    """Its image stays unbiased, of its own state, with the variance that the recurrence says; that of the present state would not do."""
+    asked = problem(noise=0.5)
+    renderer, start = asked.renderer, asked.initial()
+    assert isinstance(renderer, AnalyticRenderer)
+    moved = {key: value + 0.2 for key, value in start.items()}
+    image = ur.images.RecursiveControlVariate()
+    rows, last = np.random.default_rng(0).integers(0, asked.pixels, 40), {}
+    drawn = PixelSample(np.zeros(40, np.uint32), rows.astype(np.uint32), np.ones((40, 1)))
+    found: dict[bool, list[np.ndarray]] = {False: [], True: []}
+    for seed in range(400):
+        _, kept = image.estimate(asked, start, image.init(asked, start), WholeView(asked, 0), 2, 2, Key(seed))
+        state = image.prepare(asked, image.advance(start, image.init(asked, start), (kept,)))
+        at = start if not planted else moved
+        state = dataclasses.replace(state, parameters=at)
+        _, told = image.estimate(asked, moved, state, PixelBatch(asked, drawn), 2, 2, Key(seed, 1))
+        after = image.learn(asked, state, drawn, told)
+        for learnt, each in ((False, state), (True, after)):
+            found[learnt].append(np.asarray(each.snapshot.image))
+        last = after.snapshot
+    learnt, exact = np.array(found[True]), renderer.exact(start).reshape(-1, 3)
+    error = np.sqrt(learnt.var(0, ddof=1) / len(learnt))
+    worst = np.abs((learnt.mean(0) - exact) / error).max()
+    assert (worst > 4.2) == planted
+    if planted:
+        return
+    times = np.bincount(rows, minlength=asked.pixels)
+    np.testing.assert_allclose(last.relative_variance, np.repeat(1 / (1 + times[:, None]), 3, axis=1))
+    ratio = (learnt.var(0) / np.array(found[False]).var(0)).mean(1)
+    assert abs(np.mean(ratio * (1 + times)) - 1) < 0.1
 
 
 @pytest.mark.slow
@@ -524,6 +559,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         (ur.pixels.Uniform, {"count": 0}, "count"),
         (ur.pixels.Uniform, {"count": 2.5}, "count"),
         (ur.pixels.Adaptive, {"count": -1}, "count"),
+        (ur.pixels.Adaptive, {"count": 0}, "count"),
         (ur.pixels.Adaptive, {"count": 8, "levels": -1}, "levels"),
         (ur.pixels.Adaptive, {"count": 8, "refresh": 0}, "refresh"),
         (ur.pixels.Adaptive, {"count": 8, "uniform": 0.0}, "uniform"),

@@ -34,7 +34,9 @@ ESTIMATORS = {
     "rcv": lambda: ur.PathGradient(RCV(), spp=2, fresh_from=8),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=2, image=RCV()),
     "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(40, refresh=5, samples=256, denoiser="none"), spp=2),
-    "rcv of mini-batches": lambda: ur.PathGradient(RCV(whole_views=3), pixels=ur.pixels.Uniform(40), spp=2),
+    "rcv of mini-batches": lambda: ur.PathGradient(
+        RCV(whole_views=3, learn_from_draws=False), pixels=ur.pixels.Uniform(40), spp=2
+    ),
     "filtered": lambda: ur.FilteredGradient(ur.PathGradient(RCV(), spp=2)),
 }
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -17,7 +18,7 @@ from unrender.estimators.coordinates import by_coordinates
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
 from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.problem.upsampling import SQUARES, Upsampler, restarted, upsampled
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
@@ -25,6 +26,9 @@ __all__ = ["HybridGradient", "HybridState", "beyond_paths"]
 
 _PERTURBED = 1 << 33
 """The stream of a step's key that draws the perturbed renders; path gradients have those below."""
+
+_MEAN, _SQUARE = 0.9, 0.999
+"""Decays of the running means of the gradient by the second parameters and of its square: Adam's."""
 
 
 def beyond_paths(known: Mapping[str, ParameterInfo], keys: Sequence[str]) -> tuple[str, ...]:
@@ -44,18 +48,32 @@ class HybridState:
     Attributes:
         path: of the path gradients.
         perturbed: of the smoothed derivatives.
+        mean, square: running means of the gradient by the second parameters, and of its square, not debiased; {} where `path` provides no
+            variance.
+        step: estimates made so far, since these began.
     """
 
     path: Any
     perturbed: SmoothedState
+    mean: Tree = field(default_factory=dict)
+    square: Tree = field(default_factory=dict)
+    step: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> HybridState:
         """See `Upsamplable`."""
-        return HybridState(upsampled(self.path, upsampler), self.perturbed.upsampled(upsampler))
+        return replace(
+            self,
+            path=upsampled(self.path, upsampler),
+            perturbed=self.perturbed.upsampled(upsampler),
+            mean=upsampler.tree(self.mean, 1.0),
+            square=upsampler.tree(self.square, SQUARES),
+        )
 
     def restarted(self, fresh: HybridState) -> HybridState:
         """See `Restartable`."""
-        return HybridState(restarted(self.path, fresh.path), self.perturbed.restarted(fresh.perturbed))
+        return replace(
+            fresh, path=restarted(self.path, fresh.path), perturbed=self.perturbed.restarted(fresh.perturbed)
+        )
 
 
 @register
@@ -79,9 +97,10 @@ class HybridGradient:
 
     The two kinds of steps have no common scale: give the second learning rates of their own.
 
-    Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
-    gradient, which is what a meta-estimate has of as many samples. By the variance alone, which is small where perturbations agree,
-    `MetaAdam` would take steps longer than its learning rate. The loss is that of `path`.
+    Provides a gradient, and its variance where `path` does: for the second parameters then the running mean of the gradients of about ten
+    steps, and as variance that of their squares, debiased, so that `MetaAdam` takes Adam's steps there. Differences of the smoothed loss
+    between two steps, which a memory of path gradients follows, are not rendered: such a mean lags behind by some steps. The
+    loss is that of `path`.
 
     Args:
         path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
@@ -124,10 +143,9 @@ class HybridGradient:
         """See `Estimator.init`. Raises `InputError` where one of the two estimators would have no parameter, or refuses its own."""
         own = self._perturbed(problem.renderer, parameters)
         path, perturbed = self._problems(problem, parameters, own)
-        return HybridState(
-            self.path.init(path, parameters),
-            self.perturbed.init(perturbed, {key: parameters[key] for key in own}),
-        )
+        part = {key: parameters[key] for key in own}
+        nothing = trees.zeros_like(part) if Variance.name in self.provides else {}
+        return HybridState(self.path.init(path, parameters), self.perturbed.init(perturbed, part), nothing, nothing)
 
     def estimate(
         self, problem: Problem, parameters: Tree, state: HybridState, key: Key
@@ -141,6 +159,9 @@ class HybridGradient:
         moved, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, key.fold(_PERTURBED))
         if found.preconditioned:
             moved = by_coordinates(moved, _of(problem, own), part)
+        moments = state
+        if state.mean:
+            moved, moments = _averaged(moved, state)
         gradient = {name: moved.gradient[name] if name in own else g for name, g in found.gradient.items()}
         info = {
             **found.info,
@@ -148,7 +169,8 @@ class HybridGradient:
             "perturbed_loss": moved.loss,
         }
         whole = replace(found, gradient=gradient, capabilities=_merged(found, moved, own), info=info)
-        return whole, HybridState(path_state, perturbed_state)
+        arrays.evaluate(moments.mean, moments.square)
+        return whole, replace(moments, path=path_state, perturbed=perturbed_state)
 
     def _problems(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> tuple[Problem, Problem]:
         """As each of the two estimators sees it."""
@@ -194,6 +216,17 @@ def _of(problem: Problem, keys: Sequence[str]) -> Problem:
     return found
 
 
+def _averaged(perturbed: Estimate, state: HybridState) -> tuple[Estimate, HybridState]:
+    """The debiased running mean of the gradient, with its debiased mean square for variance; the state with both."""
+    step = state.step + 1
+    mean = trees.map(lambda m, g: _MEAN * m + (1.0 - _MEAN) * g, state.mean, perturbed.gradient)
+    square = trees.map(lambda v, g: _SQUARE * v + (1.0 - _SQUARE) * (g * g), state.square, perturbed.gradient)
+    gradient = {key: x * arrays.scalar(1.0 / (1.0 - _MEAN**step), x) for key, x in mean.items()}
+    variance = {key: x * arrays.scalar(1.0 / (1.0 - _SQUARE**step), x) for key, x in square.items()}
+    found = replace(perturbed, gradient=gradient, capabilities=(Variance(variance),))
+    return found, replace(state, mean=mean, square=square, step=step)
+
+
 def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Capability, ...]:
     """What both tell: the variance of both, and the fresh gradient, which the perturbed one always is."""
     found: list[Capability] = []
@@ -201,8 +234,7 @@ def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Ca
         match capability:
             case Variance(values):
                 other = perturbed.require("HybridGradient", Variance).values
-                squares = {key: other[key] + perturbed.gradient[key] * perturbed.gradient[key] for key in own}
-                found.append(Variance({key: squares.get(key, v) for key, v in values.items()}))
+                found.append(Variance({key: other[key] if key in own else v for key, v in values.items()}))
             case FreshGradient(values):
                 fresh = {key: perturbed.gradient[key] if key in own else g for key, g in values.items()}
                 found.append(FreshGradient(fresh))

@@ -19,7 +19,7 @@ from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
-from unrender.problem.batches import Frame, PixelBatch, WholeView, whole_views
+from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import RenderSession, SampleRequest
@@ -189,9 +189,19 @@ def gather(
         images=images,
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
         info=info,
-        image=image.advance(parameters, state, tuple(part.kept for part in parts)) if sample is None else state,
+        image=_image_state(problem, request, sample, parts),
         draws=_joined([part.draws for part in parts if part.draws is not None]),
     )
+
+
+def _image_state(
+    problem: Problem, request: GatherRequest, sample: PixelSample | None, parts: list[FrameGradient]
+) -> Any:
+    """The image estimator's next."""
+    image, state = request.image, request.state
+    if sample is not None:
+        return image.learn(problem, state, sample, parts[0].kept)
+    return image.advance(request.parameters, state, tuple(part.kept for part in parts))
 
 
 def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:

@@ -10,7 +10,7 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.problem.batches import Frame
+from unrender.problem.batches import Frame, PixelSample
 from unrender.problem.problem import Problem
 from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import Space
@@ -142,6 +142,10 @@ class ImageEstimator(Protocol):
 
     def prepare(self, problem: Problem, state: Any) -> Any:
         """The state after a step that rendered whole views, prepared for pixel mini-batches."""
+        ...
+
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, kept: Any) -> Any:
+        """The state after a step with a mini-batch, from its contribution."""
         ...
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:

@@ -16,7 +16,7 @@ from unrender.evaluation import denoising
 from unrender.evaluation.denoising import Denoiser
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import Plain
-from unrender.problem.batches import Frame
+from unrender.problem.batches import Frame, PixelSample
 from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
 
@@ -97,6 +97,11 @@ class Denoised:
     def prepare(self, problem: Problem, state: Any) -> Any:
         """See `ImageEstimator.prepare`."""
         del problem
+        return state
+
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, kept: Any) -> Any:
+        """See `ImageEstimator.learn`."""
+        del problem, sample, kept
         return state
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:

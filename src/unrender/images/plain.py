@@ -9,7 +9,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
-from unrender.problem.batches import Frame, WholeView
+from unrender.problem.batches import Frame, PixelSample, WholeView
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
@@ -78,6 +78,11 @@ class Plain:
     def prepare(self, problem: Problem, state: PlainState) -> PlainState:
         """See `ImageEstimator.prepare`."""
         del problem
+        return state
+
+    def learn(self, problem: Problem, state: PlainState, sample: PixelSample, kept: Any) -> PlainState:
+        """See `ImageEstimator.learn`."""
+        del problem, sample, kept
         return state
 
     def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:

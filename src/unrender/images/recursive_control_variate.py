@@ -5,8 +5,11 @@ Nicolet et al. 2023, "Recursive Control Variates for Inverse Rendering".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from unrender import statistics
 from unrender.core import arrays, checks, trees
@@ -16,7 +19,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
-from unrender.problem.batches import Frame, PixelBatch, WholeView
+from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView
 from unrender.problem.problem import Problem
 from unrender.problem.sample_counts import SampleCounts
 from unrender.problem.upsampling import Upsampler
@@ -25,6 +28,9 @@ from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 
 __all__ = ["RecursiveControlVariate", "RecursiveControlVariateState", "Snapshot", "ViewMemory"]
+
+_MOST_PIXELS = 64
+"""Of all views for each of a mini-batch's, for its samples to be remembered: to add them takes time by the number of all."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +58,12 @@ class Snapshot:
     Attributes:
         image: the control variate.
         weight: w of each pixel, from the statistics at the time of the snapshot.
+        relative_variance: of `image`; see `ViewMemory`.
     """
 
     image: Array
     weight: Array
+    relative_variance: Array
 
 
 @dataclass(frozen=True)
@@ -94,11 +102,14 @@ class RecursiveControlVariate:
         alpha: decay of the running means, in [0, 1).
         beta: decay of the running (co)variances, in [0, 1).
         whole_views: with pixel mini-batches, every so many of them are followed by a step that renders whole views, >= 1.
+        learn_from_draws: remember what mini-batches render, too, not whole views alone.
         update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
 
     With pixel mini-batches the control variate is a snapshot, since pixels outside the batch are not updated: a step that renders whole
     views updates image and statistics, and until the next one each mini-batch uses ⟨F_n⟩ + w (⟨F_s⟩_CV − ⟨F_s⟩_n) against that
-    step s. Steps of whole views have their full cost; large images afford few.
+    step s. Steps of whole views have their full cost; large images afford few. What a mini-batch renders of the state of step s is
+    independent of ⟨F_s⟩_CV: after use both are averaged, by their variances (`learn_from_draws`). Not where a mini-batch has less than
+    a 64th of all pixels, or views are dealt to workers.
 
     The state starts anew when a parameter changes its shape.
 
@@ -116,6 +127,7 @@ class RecursiveControlVariate:
     beta: float = 0.999
     update_before_use: bool = False
     whole_views: int = 20
+    learn_from_draws: bool = True
 
     def __post_init__(self):
         checks.integer("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
@@ -142,9 +154,52 @@ class RecursiveControlVariate:
     def prepare(self, problem: Problem, state: RecursiveControlVariateState) -> RecursiveControlVariateState:
         """See `ImageEstimator.prepare`."""
         del problem
-        parts = [(memory.image, self._weight(memory)) for memory in state.views]
-        image, weight = (arrays.concatenate([arrays.rows(part[n]) for part in parts]) for n in range(2))
-        return replace(state, snapshot=Snapshot(image, weight))
+        parts = [(memory.image, self._weight(memory), memory.relative_variance) for memory in state.views]
+        return replace(
+            state, snapshot=Snapshot(*(arrays.concatenate([arrays.rows(part[n]) for part in parts]) for n in range(3)))
+        )
+
+    def learn(
+        self, problem: Problem, state: RecursiveControlVariateState, sample: PixelSample, kept: Array | None
+    ) -> RecursiveControlVariateState:
+        """See `ImageEstimator.learn`: the image of the snapshot, at its own parameters, with the mini-batch's renders at these.
+
+        A pixel that was drawn k times, with the mean H of these, and whose image has the relative variance r: it becomes the mean of least
+        variance of both, image + r k / (1 + r k) (H - image), and r becomes r / (1 + r k). Its weight follows.
+        """
+        snapshot = state.snapshot
+        if not self.learn_from_draws or kept is None or snapshot is None:
+            return state
+        count = int(arrays.shape(snapshot.image)[0])
+        if count > _MOST_PIXELS * int(arrays.shape(kept)[0]):
+            return state
+        row = arrays.numpy(problem.references.rows(sample.views, sample.pixels)).astype(np.int64)
+        order = np.argsort(row, kind="stable")
+        drawn, starts, numbers = np.unique(row[order], return_index=True, return_counts=True)
+        sums = arrays.segment_sums(
+            arrays.gather_rows(kept, arrays.like_integers(order, kept)),
+            arrays.like_integers(starts, kept),
+            arrays.like_integers(numbers, kept),
+        )
+        times = arrays.like(np.repeat(numbers[:, None], 3, axis=1).astype(np.float32), kept)
+        where = arrays.like_integers(drawn, kept)
+        total, number = (arrays.add_rows(x, where, count) for x in (sums, times))
+        past = snapshot.relative_variance
+        after = past / (1.0 + past * number)
+        image = snapshot.image + after * (total - number * snapshot.image)
+        weight = arrays.minimum(snapshot.weight * (1.0 + past) / (1.0 + after), 1.0)
+        return replace(state, snapshot=Snapshot(image, weight, after))
+
+    def _learnt(self, state: RecursiveControlVariateState, view: int) -> ViewMemory:
+        """A view's memory, with what mini-batches have told since."""
+        memory, snapshot = state.views[view], state.snapshot
+        if snapshot is None or not self.learn_from_draws:
+            return memory
+        sizes = [arrays.shape(other.image) for other in state.views]
+        first = sum(math.prod(size[:2]) for size in sizes[:view])
+        rows = slice(first, first + math.prod(sizes[view][:2]))
+        image, relative = (arrays.reshape(x[rows], sizes[view]) for x in (snapshot.image, snapshot.relative_variance))
+        return replace(memory, image=image, relative_variance=relative)
 
     def estimate(
         self,
@@ -156,7 +211,7 @@ class RecursiveControlVariate:
         groups: int,
         key: Key,
         pair_request: PairRequest | None = None,
-    ) -> tuple[ImageEstimate, ViewMemory | None]:
+    ) -> tuple[ImageEstimate, ViewMemory | Array]:
         """See `ImageEstimator.estimate`. Group g's image takes F and H from group g's samples alone.
 
         The previous state is always rendered, in the own space; its image H + w (⟨F_{n-1}⟩_CV − H) has the error of the current
@@ -182,14 +237,15 @@ class RecursiveControlVariate:
             case PixelBatch():
                 if first or state.snapshot is None:
                     raise InputError("RecursiveControlVariate: a pixel mini-batch needs an earlier step of whole views")
-                return self._combine_pixels(problem, state.snapshot, frame, rendering, asked), None
+                told = arrays.mean_over_first(rendering.previous)
+                return self._combine_pixels(problem, state.snapshot, frame, rendering, asked), told
             case WholeView():
                 if first:
                     images, previous_images, counts = rendering.images, rendering.previous, frame.counts
                     variance = variance_of_mean(images, counts)
                     estimate = ImageEstimate(images, rendering.paths, {}, previous_images, variance, counts=counts)
                     return estimate, self._start(estimate.mean(), counts)
-                return self._combine_view(state.views[frame.view], rendering, asked, frame)
+                return self._combine_view(self._learnt(state, frame.view), rendering, asked, frame)
         raise InputError(f"RecursiveControlVariate: expected a whole view or a pixel mini-batch, got {frame!r}")
 
     @staticmethod

@@ -132,6 +132,8 @@ class Stream:
         if batch.sample is None:
             after, count = options.image.advance(parameters, state.image, tuple(kept)), 0
             after = after if options.all_pixels else options.image.prepare(problem, after)
+        else:
+            after = options.image.learn(problem, after, batch.sample, kept[0])
         self.state = replace(state, image=after, pixels=pixels, batches=count)
         image = images[0] if options.all_pixels else self._as_rows(images)
         arrays.evaluate(image, self.state)

@@ -21,6 +21,27 @@ from unrender.problem.problem import Problem
 __all__ = ["Adaptive"]
 
 
+_FEWEST = 4096
+"""Pixels of a mini-batch whose paths take as long as the rest of a step: on 2 cores, with 2 samples a pixel of `caustic`."""
+
+
+def default_count(problem: Problem) -> int:
+    """How many pixels a mini-batch has where that is not given."""
+    return min(problem.pixels, max(problem.pixels // 4, _FEWEST))
+
+
+@dataclass(frozen=True)
+class _Options:
+    """See `GuidedOptions`."""
+
+    count: int
+    refresh: int
+    samples: int | None
+    uniform: float | None
+    stratified: bool
+    denoiser: MapDenoiser
+
+
 @register
 @dataclass(frozen=True)
 class Adaptive:
@@ -47,7 +68,8 @@ class Adaptive:
     `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False, by_cost=False)`.
 
     Args:
-        count: pixels a step, >= 1, drawn with replacement from all pixels of all views.
+        count: pixels a step, >= 1, drawn with replacement from all pixels of all views. None for a quarter of these, but for 4096 at least
+            where there are as many: on a processor the fixed cost of a step is that of so many pixels, so fewer are hardly faster.
         levels: D, >= 0.
         refresh: steps between importance-map updates, >= 1.
         samples: paths of an update, >= 1, which also sets how fine the tiles are: one path in each, or several where tiles are
@@ -67,7 +89,7 @@ class Adaptive:
             variance times cost of a step, since a path into the sky costs little. λ follows the cost, too. Otherwise c_j = 1.
     """
 
-    count: int
+    count: int | None = None
     levels: int = 0
     refresh: int = 20
     samples: int | None = None
@@ -79,36 +101,39 @@ class Adaptive:
     by_cost: bool = True
 
     def __post_init__(self):
-        self._sampler.check()
+        self._sampler(_FEWEST if self.count is None else self.count).check()
 
-    @property
-    def _sampler(self) -> GuidedSampler:
-        return GuidedSampler("Adaptive", self, _GradientVariance(self.levels, self.learn_from_draws, self.by_cost))
+    def _sampler(self, count: int) -> GuidedSampler:
+        options = _Options(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
+        return GuidedSampler("Adaptive", options, _GradientVariance(self.levels, self.learn_from_draws, self.by_cost))
+
+    def _of(self, problem: Problem) -> GuidedSampler:
+        return self._sampler(default_count(problem) if self.count is None else self.count)
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         """See `PixelSampler.init`."""
         del parameters
-        return self._sampler.init(problem)
+        return self._of(problem).init(problem)
 
     def draw(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
         """See `PixelSampler.draw`."""
-        return self._sampler.draw(problem, parameters, state, key)
+        return self._of(problem).draw(problem, parameters, state, key)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
         """See `RepeatableSampler.redraw`."""
-        return self._sampler.redraw(problem, state, key)
+        return self._of(problem).redraw(problem, state, key)
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
         """See `LearningSampler.learn`."""
-        return self._sampler.learn(problem, state, sample, draws)
+        return self._of(problem).learn(problem, state, sample, draws)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
         """Update the mean square of the gradient's elements, where variances are `relative`."""
-        return self._sampler.observe(problem, state, gradient) if self.relative else state
+        return self._of(problem).observe(problem, state, gradient) if self.relative else state
 
 
 @dataclass(frozen=True)
