@@ -71,6 +71,7 @@ class ScenePair:
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
+        self._moved: dict[str, mi.UInt32] = {}
         self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
@@ -144,6 +145,21 @@ class ScenePair:
                 "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
             }
         return self._tables
+
+    def moved_tables(self, moving: AbstractSet[str]) -> dict[str, Any]:
+        """The tables of `MovedPair.sample`, for the values that both scenes hold now; `moving`: ids of the meshes that may move."""
+        if not self._moved:
+            current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
+            self._moved = {"shape": _table(current, previous), "shape_back": _table(previous, current)}
+        ids = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr()).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+        triangles, first, ratios = np.zeros(int(ids.max(initial=0)) + 1, np.uint32), 1, [mi.Float(1)]
+        with dr.suspend_grad():
+            for number, now, before in zip(ids, self.current.shapes(), self.previous.shapes(), strict=True):
+                if now.id() in moving:
+                    triangles[number] = first
+                    ratios.append(_areas(before) / _areas(now))
+                    first += now.face_count()
+            return {**self._moved, "triangles": mi.UInt32(triangles), "area_ratios": dr.concat(ratios)}
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current
@@ -292,6 +308,13 @@ class ScenePair:
 
 def _media_ids(scene: mi.Scene) -> mi.UInt32:
     return mi.UInt32([0, *(medium_id(medium) for medium in media(scene))])
+
+
+def _areas(mesh: Any) -> Any:
+    """Twice the area of each of a mesh's triangles."""
+    corners = dr.unravel(mi.Point3u, mesh.faces_buffer())
+    a, b, c = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), corner) for corner in corners)
+    return dr.norm(dr.cross(b - a, c - a))
 
 
 def _table(current: Any, previous: Any) -> mi.UInt32:
