@@ -37,7 +37,7 @@ __all__ = [
     "VerticesPass",
 ]
 
-Kernel = PathPair | VolumePair | PrbKernel | MovedPair
+Kernel = PathPair | VolumePair | PrbKernel
 """What traces paths."""
 
 Tables = dict[str, Any]
@@ -213,9 +213,11 @@ class MovedPairPass(Pass):
 
     Attributes:
         moving: ids of the meshes that move.
+        tracer: what traces both.
     """
 
     moving: frozenset[str]
+    tracer: MovedPair
 
     def scene(self, pair: ScenePair) -> Any:
         """Both."""
@@ -228,9 +230,8 @@ class MovedPairPass(Pass):
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
-        """See `Pass.function`. Each state has the rays of its own sensors."""
-        assert isinstance(kernel, MovedPair)
-        assert posed is None
+        """See `Pass.function`. Each state has the rays of its own sensors; the kernel is its own."""
+        del kernel, posed
 
         def launch(scenes, loaded, tables, seeds, pixels, sensors):
             del loaded
@@ -244,7 +245,7 @@ class MovedPairPass(Pass):
                     rays.append(ray)
                     weights.append(weight)
                 choices = independent(numbers, size.pixels * size.spp)
-                found = kernel.sample(scenes, tables, numbers, choices, (rays[0], rays[1]))
+                found = self.tracer.sample(scenes, tables, numbers, choices, (rays[0], rays[1]))
                 return tuple(L * weight for L, weight in zip(found, weights, strict=True))
 
         return launch

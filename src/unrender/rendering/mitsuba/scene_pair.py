@@ -71,7 +71,7 @@ class ScenePair:
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
-        self._moved: dict[str, mi.UInt32] = {}
+        self._moved: dict[frozenset[str], dict[str, mi.UInt32]] = {}
         self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
@@ -148,18 +148,28 @@ class ScenePair:
 
     def moved_tables(self, moving: AbstractSet[str]) -> dict[str, Any]:
         """The tables of `MovedPair.sample`, for the values that both scenes hold now; `moving`: ids of the meshes that may move."""
-        if not self._moved:
-            current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
-            self._moved = {"shape": _table(current, previous), "shape_back": _table(previous, current)}
-        ids = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr()).numpy()  # pyright: ignore[reportAttributeAccessIssue]
-        triangles, first, ratios = np.zeros(int(ids.max(initial=0)) + 1, np.uint32), 1, [mi.Float(1)]
-        with dr.suspend_grad():
-            for number, now, before in zip(ids, self.current.shapes(), self.previous.shapes(), strict=True):
-                if now.id() in moving:
+        meshes = [
+            (now, before)
+            for now, before in zip(self.current.shapes(), self.previous.shapes(), strict=True)
+            if now.id() in moving
+        ]
+        if frozenset(moving) not in self._moved:
+            current: Any = self.current.shapes_dr()
+            previous: Any = self.previous.shapes_dr()
+            ids: Any = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+            triangles, first = np.zeros(int(ids.max(initial=0)) + 1, np.uint32), 1
+            for number, shape in zip(ids, self.current.shapes(), strict=True):
+                if shape.id() in moving:
                     triangles[number] = first
-                    ratios.append(_areas(before) / _areas(now))
-                    first += now.face_count()
-            return {**self._moved, "triangles": mi.UInt32(triangles), "area_ratios": dr.concat(ratios)}
+                    first += shape.face_count()
+            self._moved[frozenset(moving)] = {
+                "shape": _table(current, previous),
+                "shape_back": _table(previous, current),
+                "triangles": mi.UInt32(triangles),
+            }
+        with dr.suspend_grad():
+            ratios = [_areas(before) / _areas(now) for now, before in meshes]
+            return {**self._moved[frozenset(moving)], "area_ratios": dr.concat([mi.Float(1), *ratios])}
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current

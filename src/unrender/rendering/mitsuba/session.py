@@ -149,6 +149,10 @@ class MitsubaSession:
     def _geometry_kernel(self) -> Kernel:
         return PrbKernel(self._max_depth)
 
+    @cached_property
+    def _moved_kernel(self) -> MovedPair:
+        return MovedPair(self._max_depth)
+
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
@@ -201,7 +205,7 @@ class MitsubaSession:
             radiance = self._run(ImagePass(), request)
             radiance_previous = self._run(ImagePass(previous=True), request)
         else:
-            task = MovedPairPass(self._moving) if self._geometric else ImagePairPass()
+            task = MovedPairPass(self._moving, self._moved_kernel) if self._geometric else ImagePairPass()
             radiance, radiance_previous = self._run(task, request)
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, request), self._develop(radiance_previous, request)
@@ -337,13 +341,7 @@ class MitsubaSession:
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
         return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, *own)
 
-    @cached_property
-    def _moved_kernel(self) -> Kernel:
-        return MovedPair(self._max_depth)
-
     def _kernel_of(self, task: Pass) -> Kernel:
-        if isinstance(task, MovedPairPass):
-            return self._moved_kernel
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
 
 

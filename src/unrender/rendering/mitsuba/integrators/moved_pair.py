@@ -1,13 +1,13 @@
 """Two states of a scene whose shapes move, on related paths.
 
-Every connection of the previous state's path leads either to where its own random numbers lead (primary sample space), or to the point of the
-current state's path, carried along with the shape that it lies on: the same triangle, the same barycentric coordinates (a shift by
-reconnection, as of gradient-domain path tracing). Which of both is drawn, with a known probability, and the direction is weighted by
-the density of the mixture of both (one-sample MIS with the balance heuristic). So the shift needs no inverse: where the carried
-point is hidden in the previous state, it has no part in it, and where the current state's path could not have come, the density is that of the other
-technique alone.
+Every connection of the previous state's path leads either to where its own random numbers lead (primary sample space), or to the
+point of the current state's path, carried along with the shape that it lies on: the same triangle, the same barycentric coordinates
+(a shift by reconnection, as in gradient-domain path tracing). Which of both is drawn, with a known probability, and the direction is
+weighted by the density of the mixture of both (one-sample MIS with the balance heuristic). So the shift needs no inverse: a carried
+point that is hidden in the previous state has no part in it, and where the current state's path could not have come, the density is
+that of the other technique alone.
 
-Symbols as in `path.py`; a prime (ₚ) is the previous state.
+Symbols as in `path.py`; a subscript (ₚ) is the previous state.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class _State:
         L: radiance gathered so far.
         β: throughput.
         η: relative index of refraction.
-        si: the vertex that the path has come to.
+        ray: on which the path has come to its vertex.
+        pi: the primitive there; of rays that meet nothing, not valid.
         last: the vertex before.
         active: lanes whose path goes on.
     """
@@ -46,7 +47,8 @@ class _State:
     L: Spectrum
     β: Spectrum
     η: Float
-    si: mi.SurfaceInteraction3f
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
     last: ScatteringVertex
     active: Bool
 
@@ -70,13 +72,14 @@ class _Direction:
     """Where one state's path may go on from a vertex.
 
     Attributes:
-        bsdf: there.
+        si, bsdf: there.
         bs, weight: a sample of it.
         ray: in that direction.
         delta: lanes that sampled a perfectly specular lobe.
         active: lanes that have a vertex from which the path may go on.
     """
 
+    si: Any
     bsdf: Any
     bs: mi.BSDFSample3f
     weight: Spectrum
@@ -90,14 +93,15 @@ class _Continuation:
     """Where the previous state's path does go on.
 
     Attributes:
-        si: the next vertex.
+        ray, pi: to the next vertex, and the primitive there.
         weight: of the direction to it, 0 where it is not to be reached.
         pdf: solid angle density with which the BSDF alone samples that direction.
         delta: lanes whose direction is perfectly specular.
         η: relative index of refraction of the step.
     """
 
-    si: mi.SurfaceInteraction3f
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
     weight: Spectrum
     pdf: Float
     delta: Bool
@@ -124,7 +128,7 @@ class MovedPair:
 
     def sample(
         self,
-        scenes: tuple[mi.Scene, mi.Scene],
+        scenes: tuple[Any, Any],
         tables: Mapping[str, Any],
         sampler: Any,
         choices: Any,
@@ -146,15 +150,16 @@ class MovedPair:
         """
         states = []
         for scene, ray in zip(scenes, rays, strict=True):
-            si = scene.ray_intersect(mi.Ray3f(ray), ray_flags=mi.RayFlags.All, coherent=True, active=mi.Bool(True))
-            last = ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True))
-            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), si, last, mi.Bool(True)))
+            plain, every = mi.Ray3f(ray), mi.Bool(True)
+            pi = scene.ray_intersect_preliminary(plain, coherent=True, active=every)
+            last = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every)
+            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), plain, pi, last, every))
         path = self._trace(scenes, tables, _PairState(mi.UInt32(0), *states), sampler, choices)
         return path.current.L, path.previous.L
 
     @dr.syntax
     def _trace(
-        self, scenes: tuple[mi.Scene, mi.Scene], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
     ) -> _PairState:
         while dr.hint(
             path.current.active | path.previous.active, max_iterations=self.max_depth, label="moved path pair"
@@ -163,7 +168,7 @@ class MovedPair:
         return path
 
     def _bounce(
-        self, scenes: tuple[mi.Scene, mi.Scene], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
     ) -> _PairState:
         """The vertices that both paths have come to, and where they go on from there."""
         scene, sceneₚ = scenes
@@ -186,25 +191,26 @@ class MovedPair:
 
         # ----------------- The current path's next vertex -----------------
         # Where it has ended, it may still tell the other where to go.
-        hit = _Hit(scene, out.ray, going | (carried & (out.bs.pdf > 0)))
+        following = going | (carried & (out.bs.pdf > 0))
+        pi = scene.ray_intersect_preliminary(out.ray, coherent=False, active=following)
 
         # ----------------- The previous path's next vertex -----------------
-        way = self._continue(scenes, tables, path, (out, outₚ), hit, share, carried)
+        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried)
         beforeβ = before.β * way.weight
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
-        path.current = _State(
-            now.L, nowβ, now.η * out.bs.eta, hit.si, ScatteringVertex(now.si, out.bs.pdf, out.delta), going
-        )
-        last = ScatteringVertex(before.si, way.pdf, way.delta)
-        path.previous = _State(before.L, beforeβ, before.η * way.η, way.si, last, outₚ.active & survivesₚ)
+        last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
+        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going)
+        last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
+        path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ)
         path.depth += 1
         return path
 
     def _scatter(self, scene: Any, path: _State, numbers: tuple[Any, Any, Any], deeper: Bool) -> _Direction:
         """What one state gathers at its vertex, and a direction off it."""
-        ctx, si, last = mi.BSDFContext(), path.si, path.last
+        ctx, last = mi.BSDFContext(), path.last
         number, number_lobe, number_bsdf = numbers
+        si: Any = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)  # pyright: ignore[reportArgumentType]
         bsdf = si.bsdf()
 
         # ---------------------- Direct emission ----------------------
@@ -224,68 +230,52 @@ class MovedPair:
         # ---------------------- BSDF sampling ----------------------
         bs, weight = bsdf.sample(ctx, si, number_lobe, number_bsdf, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return _Direction(bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
+        return _Direction(si, bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
 
     def _continue(
         self,
         scenes: tuple[Any, Any],
         tables: Mapping[str, Any],
-        path: _PairState,
         out: tuple[_Direction, _Direction],
-        hit: _Hit,
+        pi: Any,
         share: Float,
         carried: Bool,
     ) -> _Continuation:
-        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, `hit`, as it was."""
+        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was."""
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
-        at, atₚ = path.current.si, path.previous.si
         own = before.active & ~carried
+        piₚ: Any = sceneₚ.ray_intersect_preliminary(before.ray, coherent=False, active=own)
+        if self.max_depth <= 2:
+            bs = before.bs
+            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta)
         asked = own & (share > 0)
+        mixed = carried | asked
 
-        # ------------ The next vertex by either, and in the other state ------------
-        hitₚ = _Hit(sceneₚ, before.ray, own)
-        there = hit.carried(remap(tables["shape"], hit.pi.shape), carried)
-        back = hitₚ.carried(shape := remap(tables["shape_back"], hitₚ.pi.shape), asked)
-        link, link_back = _Link(atₚ, there, hit), _Link(at, back, hitₚ)
+        link = _Link(tables, (now, before), (pi, piₚ), carried, mixed)
 
-        # ---------------- Densities of both, over solid angle ----------------
-        wo = dr.select(carried, now.bs.wo, at.to_local(link_back.direction))
-        woₚ = dr.select(carried, atₚ.to_local(link.direction), before.bs.wo)
-        forward = now.bsdf.pdf(ctx, at, wo, carried | asked)
-        value, pdf = before.bsdf.eval_pdf(ctx, atₚ, woₚ, carried | asked)
+        # ------------- Whether either technique could have come there -------------
+        wo = dr.select(carried, now.bs.wo, now.si.to_local(link.direction))
+        woₚ = dr.select(carried, before.si.to_local(link.direction), before.bs.wo)
+        forward = now.bsdf.pdf(ctx, now.si, wo, mixed)
+        value, pdf = before.bsdf.eval_pdf(ctx, before.si, woₚ, mixed)
         free = carried & (forward > 0) & (dr.max(value) > 0)
-        free &= ~sceneₚ.ray_test(link.ray, free)
+        free &= ~sceneₚ.ray_test(link.ray(before.si), free)
         seen = asked & (forward > 0)
-        seen &= ~scene.ray_test(link_back.ray, seen)
-        ratio = self._area_ratio(
-            tables,
-            dr.select(carried, hit.pi.shape, shape),
-            dr.select(carried, hit.pi.prim_index, hitₚ.pi.prim_index),
-        )
-        near = dr.select(carried, hit.per_area, link_back.per_area)
-        nearₚ = dr.select(carried, link.per_area, hitₚ.per_area)
-        finite = dr.select(carried, hit.valid, hitₚ.valid)
-        forward = dr.select(carried | seen, forward * dr.select(finite, near / (ratio * nearₚ), 1), 0)
+        seen &= ~scene.ray_test(link.ray(now.si), seen)
+        change = link.density_ratio() * (link.area_ratio(tables) if self.areas else 1)
+        forward = dr.select(carried | seen, forward * dr.select(link.valid, change, 1), 0)
 
         # ------------------------------ Mixture ------------------------------
         weight = value / (share * forward + (1 - share) * pdf)
-        weight = dr.select(carried & ~free | ~dr.isfinite(dr.sum(weight)), 0, weight)
-        mixed = carried | asked
-        there.wi, there.t = there.to_local(-link.direction), link.distance
+        weight = dr.select((carried & ~free) | ~dr.isfinite(dr.sum(weight)), 0, weight)
         return _Continuation(
-            dr.select(carried, dr.select(hit.valid, there, hit.si), hitₚ.si),
+            dr.select(carried, before.si.spawn_ray(link.direction), before.ray),
+            dr.select(carried, link.image, piₚ),
             dr.select(mixed, weight, before.weight),
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
         )
-
-    def _area_ratio(self, tables: Mapping[str, Any], shape: Any, triangle: UInt32) -> Float:
-        """Area of a triangle in the previous over that in the current state; `shape` is the current scene's."""
-        if not self.areas:
-            return mi.Float(1)
-        first = dr.gather(mi.UInt32, tables["triangles"], registry_id(shape))
-        return dr.gather(mi.Float, tables["area_ratios"], dr.select(first > 0, first + triangle, 0))
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
         """Which lanes go on, and their throughput."""
@@ -295,56 +285,54 @@ class MovedPair:
         return (most != 0) & (~asked | (number < q)), β * dr.select(asked, dr.rcp(q), 1)
 
 
-class _Hit:
-    """What a ray meets.
-
-    Attributes:
-        ray: itself.
-        pi: the primitive.
-        si: the vertex; of rays that meet nothing, the way out.
-        valid: lanes that meet something.
-        per_area: solid angle per area there.
-    """
-
-    def __init__(self, scene: Any, ray: Any, active: Bool):
-        self.ray = ray
-        self.pi: Any = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        self.si: Any = self.pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        self.valid = active & self.pi.is_valid()
-        self.per_area = _per_area(self.si, ray.d, self.si.t)
-
-    def carried(self, shape: Any, active: Bool) -> Any:
-        """The vertex on another scene's shape, at the same primitive and barycentric coordinates.
-
-        Points of meshes follow from these; where other shapes, which stand still, were met, the ray tells it.
-        """
-        pi = mi.PreliminaryIntersection3f(self.pi)
-        pi.shape = shape
-        return pi.compute_surface_interaction(self.ray, mi.RayFlags.All, active & self.valid)
-
-
 class _Link:
-    """A connection from a vertex to a carried point or, where the ray met nothing, in the ray's direction.
+    """The vertex that a path has found in one state, its image in the other one, and the connection of that state's path to it.
+
+    Points of meshes follow from barycentric coordinates. Where other shapes were met, which stand still, the ray tells them.
 
     Attributes:
-        direction: normalized.
-        distance: inf where the ray met nothing.
-        per_area: solid angle at the vertex per area at the point.
-        ray: to test whether it is free.
+        valid: lanes whose ray met something; the others' is connected to infinity.
+        image: the image's primitive and the distance to it.
+        direction: to the image, from the last vertex of its state.
     """
 
-    def __init__(self, vertex: mi.SurfaceInteraction3f, point: Any, hit: _Hit):
-        to = point.p - vertex.p
-        distance = dr.norm(to)
-        self.direction = dr.select(hit.valid, to / distance, hit.ray.d)
-        self.distance = dr.select(hit.valid, distance, dr.inf)
-        self.per_area = _per_area(point, self.direction, distance)
-        self.ray = dr.select(hit.valid, vertex.spawn_ray_to(point.p), vertex.spawn_ray(hit.ray.d))
+    def __init__(
+        self,
+        tables: Mapping[str, Any],
+        out: tuple[_Direction, _Direction],
+        hits: tuple[Any, Any],
+        carried: Bool,
+        active: Bool,
+    ):
+        (now, before), (pi, piₚ) = out, hits
+        found = dr.select(carried, pi, piₚ)
+        self._carried, self._triangle, self._from = carried, found.prim_index, dr.select(carried, now.ray, before.ray)
+        back = remap(tables["shape_back"], piₚ.shape)
+        self._shape = dr.select(carried, pi.shape, back)
+        self.valid = active & found.is_valid()
+        self.image = mi.PreliminaryIntersection3f(found)
+        self.image.shape = dr.select(carried, remap(tables["shape"], pi.shape), back)
+        self._si = found.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)
+        self._there: Any = self.image.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)  # pyright: ignore[reportArgumentType]
+        to = self._there.p - dr.select(carried, before.si.p, now.si.p)
+        self._distance: Any = dr.norm(to)
+        self.direction = dr.select(self.valid, to / self._distance, self._from.d)
+        self.image.t = dr.select(self.valid, self._distance, found.t)
 
+    def ray(self, vertex: Any) -> Any:
+        """From the last vertex of the image's state, up to the image."""
+        return dr.select(self.valid, vertex.spawn_ray_to(self._there.p), vertex.spawn_ray(self.direction))
 
-def _per_area(si: Any, direction: Any, distance: Float) -> Float:
-    """Solid angle per area of what is met at `si`."""
-    return dr.abs_dot(si.n, direction) / dr.square(distance)
+    def density_ratio(self) -> Float:
+        """Solid angle of a small area at the current state's point, seen from its path, over that at the previous state's."""
+        here = dr.abs_dot(self._si.n, self._from.d) / dr.square(self._si.t)
+        there = dr.abs_dot(self._there.n, self.direction) / dr.square(self._distance)
+        return dr.select(self._carried, here / there, there / here)
+
+    def area_ratio(self, tables: Mapping[str, Any]) -> Float:
+        """Area of the triangle in the current over that in the previous state."""
+        first = dr.gather(mi.UInt32, tables["triangles"], registry_id(self._shape))
+        return dr.rcp(dr.gather(mi.Float, tables["area_ratios"], dr.select(first > 0, first + self._triangle, 0)))
 
 
 def _is_diffuse(bsdf: mi.BSDFPtr) -> Bool:
