@@ -17,6 +17,6 @@ def plot(record: Record) -> Figure:
         for method, of in found.items():
             if "runs" in of:
                 axis.plot(grid, np.median([np.interp(grid, *run["curve"]) for run in of["runs"]], axis=0), label=method)
-        axis.set(xlabel="seconds", ylabel="surface error / at the start", yscale="log", title=name)
+        axis.set(xlabel="processor seconds", ylabel="surface error / at the start", yscale="log", title=name)
         axis.legend()
     return figure

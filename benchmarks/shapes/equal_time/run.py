@@ -4,12 +4,14 @@ The stock loop is that of Mitsuba's tutorial on shapes: `mi.render` with `prb_pr
 or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps` (λ 19). It is tuned on a seed of its own over rates, and
 over whether the boundary of indirect light is sampled, with its guide, or not. Textures, where there are any, move by the same Adam.
 Errors are distances between surfaces, and root mean square differences of pictures from their references, relative to the start.
+Time is the processor's, of all threads, so that other work on the machine does not count.
 """
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +50,7 @@ class StockShapes:
         self._integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
 
     def run(self, seconds: float, seed: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """(seconds, parameters) along a run; two steps of warm-up and the keeping of parameters are left out of the clock."""
+        """(processor seconds, parameters) along a run; two steps of warm-up and the keeping of parameters are left out of the clock."""
         self._steps(0.0, seed, 2)
         return self._steps(seconds, seed, None)
 
@@ -71,7 +73,7 @@ class StockShapes:
                 others[key] = self.parameters[key]
         clock, step, next_at, found = 0.0, 0, 0.0, []
         while step < steps if steps is not None else clock < seconds:
-            began = time.perf_counter()
+            began = time.process_time()
             self.parameters[self.mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
             for key in others.keys():  # noqa: SIM118 (iterating gives pairs)
                 low, high = self.problem.bounds[key]
@@ -95,7 +97,7 @@ class StockShapes:
             others.step()
             dr.eval(vertices["u"])
             dr.sync_thread()
-            clock += time.perf_counter() - began
+            clock += time.process_time() - began
             step += 1
             if steps is None and (clock >= next_at or clock >= seconds):
                 next_at = clock + seconds / _POINTS
@@ -107,16 +109,23 @@ class StockShapes:
 
 
 class _Kept(ur.Callback):
-    """Parameters along a run of ours."""
+    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
 
     def __init__(self, seconds: float):
         self.found: list[tuple[float, dict[str, np.ndarray]]] = []
-        self._every, self._next = seconds / _POINTS, 0.0
+        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
+        self._since: float | None = None
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        if run.clock >= self._next:
-            self._next = run.clock + self._every
-            self.found.append((run.clock, run.full()))
+        now = time.process_time()
+        # The first step is only known by what the others take.
+        self._clock += 0.0 if self._since is None else now - self._since
+        if self._clock >= self._next or self._clock >= self._seconds:
+            self._next = self._clock + self._seconds / _POINTS
+            self.found.append((self._clock, run.full()))
+        if self._clock >= self._seconds:
+            run.stop()
+        self._since = time.process_time()
 
 
 def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
@@ -141,8 +150,10 @@ def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> flo
 def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given."""
     kept = _Kept(seconds)
-    result = ur.optimize(problem, seconds=seconds, seed=seed, callbacks=[kept])
-    return measured(problem, [*kept.found, (result.seconds, result.parameters)])
+    blind = copy.copy(problem)
+    blind.surfaces, blind.truth = {}, {}  # errors are no part of a run's time
+    ur.optimize(blind, seconds=100 * seconds, seed=seed, callbacks=[kept])  # a limit of the clock, never reached
+    return measured(problem, kept.found)
 
 
 def time_to(curve: Sequence[Sequence[float]], level: float) -> float | None:
@@ -182,17 +193,17 @@ def race(
 def run(
     seconds: float = 60.0,
     seeds: int = 3,
-    problems: Sequence[str] = ("sphere-to-bunny", "statue"),
+    problems: tuple[str, ...] = ("sphere-to-bunny", "statue"),
     resolution: int = 64,
     subdivisions: int = 4,
     views: int = 6,
-    rates: Sequence[float] = (0.003, 0.01, 0.03, 0.1),
-    indirect: Sequence[int] = (0, 2),
-) -> dict[str, Any]:
+    rates: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1),
+    indirect: tuple[int, ...] = (0, 2),
+) -> Iterator[dict[str, Any]]:
     """Every problem.
 
     Args:
-        seconds: of a run
+        seconds: of a run, of the processor
         seeds: of the runs that count
         problems: of the gallery, whose surfaces are known
         resolution: of the views
@@ -206,4 +217,4 @@ def run(
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, views=views)
         found[name] = race(problem, seconds, seeds, rates, indirect)
         print(name, found[name]["seconds to the stock loops' best"], flush=True)
-    return {"problems": found}
+        yield {"problems": found}

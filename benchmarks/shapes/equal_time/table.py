@@ -30,5 +30,5 @@ def table(record: Record) -> str:
         "at the best stock loop's end after",
     ]
     settings = record["settings"]
-    said = f"Of the start's, after {settings['seconds']:g} s, {settings['seeds']} seeds: median (least to greatest)."
+    said = f"Of the start's, after {settings['seconds']:g} s of the processor, {settings['seeds']} seeds: median (least to greatest)."
     return said + "\n\n" + markdown.table(head, rows)
