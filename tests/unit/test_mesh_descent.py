@@ -19,7 +19,7 @@ from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.problem import remeshing
-from unrender.problem.mesh_checks import check_regularizer, check_surfaces, mesh_notices
+from unrender.problem.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
 from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.remeshing import Remeshing
 from unrender.runs.mesh_guard import guarded
@@ -290,6 +290,16 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     assert "the mesh folds over at" in line
     run.parameters[key] = 2 * POINTS.reshape(-1)
     assert watch.warnings(descent) == []  # type: ignore
+
+
+def test_what_to_do_with_self_intersections_is_checked() -> None:
+    mesh, colour = "ball.vertex_positions", "ball.bsdf.reflectance.value"
+    given = [ur.Parameter(mesh, self_intersection="prevent"), ur.Parameter(colour)]
+    assert check_self_intersections(given, {mesh: FACES}) == {mesh: "prevent"}
+    with pytest.raises(ur.InputError, match='expected "warn", "prevent" or "ignore", got \'never\''):
+        check_self_intersections([ur.Parameter(mesh, self_intersection="never")], {mesh: FACES})  # type: ignore
+    with pytest.raises(ur.InputError, match="it is of the vertex positions of a mesh"):
+        check_self_intersections([ur.Parameter(colour, self_intersection="prevent")], {mesh: FACES})
 
 
 def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
