@@ -108,7 +108,7 @@ class StockShapes:
         return found
 
 
-class _Kept(ur.Callback):
+class Kept(ur.Callback):
     """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
 
     def __init__(self, seconds: float):
@@ -126,6 +126,13 @@ class _Kept(ur.Callback):
         if self._clock >= self._seconds:
             run.stop()
         self._since = time.process_time()
+
+
+def blind(problem: ur.Problem) -> ur.Problem:
+    """The same without the truth: errors are no part of a run's time."""
+    found = copy.copy(problem)
+    found.surfaces, found.truth = {}, {}
+    return found
 
 
 def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
@@ -149,10 +156,10 @@ def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> flo
 
 def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given."""
-    kept = _Kept(seconds)
-    blind = copy.copy(problem)
-    blind.surfaces, blind.truth = {}, {}  # errors are no part of a run's time
-    ur.optimize(blind, seconds=100 * seconds, seed=seed, callbacks=[kept])  # a limit of the clock, never reached
+    kept = Kept(seconds)
+    ur.optimize(
+        blind(problem), seconds=100 * seconds, seed=seed, callbacks=[kept]
+    )  # a limit of the clock, never reached
     return measured(problem, kept.found)
 
 
