@@ -2,7 +2,7 @@
 
 The stock loop is that of Mitsuba's tutorial on shapes: `mi.render` with `prb_projective`, `dr.backward`, and `mi.ad.Adam` on the vertices,
 or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps` (λ 19). It is tuned on a seed of its own over rates, and
-over whether the boundary of indirect light is sampled, with its guide, or not. Textures, where there are any, move by the same Adam.
+over whether the boundary of shadows and indirect light is sampled or not; without a guide, whose octree takes seconds at every step. Textures, where there are any, move by the same Adam.
 Errors are distances between surfaces, and root mean square differences of pictures from their references, relative to the start.
 Time is the processor's, of all threads, so that other work on the machine does not count.
 """
@@ -39,14 +39,14 @@ class StockShapes:
         problem: of the gallery.
         kind: of `STOCK`.
         rate: of the vertices.
-        indirect: samples per pixel of the boundary of indirect light.
+        indirect: samples per pixel of the boundary of shadows and indirect light.
     """
 
     def __init__(self, problem: ur.Problem, kind: str, rate: float, indirect: int):
         self.problem, self.kind, self.rate = problem, kind, rate
         self.scene, self.parameters = stock_scene(problem)
         (self.mesh,) = problem.faces
-        counts = {"sppc": _SPP, "sppp": _SPP, "sppi": indirect}
+        counts = {"sppc": _SPP, "sppp": _SPP, "sppi": indirect, "guiding": "none"}
         self._integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
 
     def run(self, seconds: float, seed: int) -> list[tuple[float, dict[str, np.ndarray]]]:
@@ -217,7 +217,7 @@ def run(
         subdivisions: of the sphere
         views: how many
         rates: of the stock loops, tried on a seed of its own
-        indirect: samples per pixel of the stock loops' boundary of indirect light, likewise
+        indirect: samples per pixel of the stock loops' boundary of shadows and indirect light, likewise
     """
     found = {}
     for name in problems:
