@@ -2,9 +2,9 @@
 
 The stock loop is that of Mitsuba's tutorial on shapes: `mi.render` with `prb_projective`, `dr.backward`, and `mi.ad.Adam` on the vertices,
 or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps` (λ 19). It is tuned on a seed of its own over rates, and
-over whether the boundary of shadows and indirect light is sampled or not; without a guide, whose octree takes seconds at every step. Textures, where there are any, move by the same Adam.
-Errors are distances between surfaces, and root mean square differences of pictures from their references, relative to the start.
-Time is the processor's, of all threads, so that other work on the machine does not count.
+over whether the boundary of shadows and indirect light is sampled or not; without a guide, whose octree takes seconds at every step.
+Textures, where there are any, move by the same Adam. Errors are distances between surfaces, and root mean square differences of pictures
+from their references, relative to the start. Time is the processor's, of all threads, so that other work on the machine does not count.
 """
 
 from __future__ import annotations
