@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "benchmarks"
 ORDER = (
     "speed", "own_loop", "rcv.fig9_reconstruction", "real_input", "rcv", "meta", "higher_order", "adaptive", "together",
-    "volumes", "coarse_to_fine", "checkpoints", "durability", "sweeps", "watch", "workers",
+    "volumes", "shapes", "coarse_to_fine", "checkpoints", "durability", "sweeps", "watch", "workers",
 )  # fmt: skip
 """The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""
 

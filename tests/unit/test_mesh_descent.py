@@ -12,13 +12,14 @@ import unrender as ur
 from unrender.core import tables
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate
+from unrender.evaluation.self_intersections import crossing_triangles
 from unrender.evaluation.surfaces import Surface, folds, surface_error
 from unrender.gallery import blobs, meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.problem import remeshing
-from unrender.problem.mesh_checks import check_regularizer, check_surfaces, mesh_notices
+from unrender.problem.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
 from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.remeshing import Remeshing
 from unrender.runs.mesh_guard import guarded
@@ -117,6 +118,49 @@ def test_no_triangle_turns_over_in_a_step() -> None:
         joined[COPY] = found
         np.testing.assert_array_equal(joined[COPY], found.astype(float))  # seams stay closed
     assert np.abs(found - start.reshape(-1, 3)).max() >= 0
+
+
+def test_triangles_that_cross_are_found_as_by_solving_for_each_pair() -> None:
+    rng = np.random.default_rng(0)
+    vertices, faces = rng.normal(size=(40, 3)), np.stack([rng.choice(40, 3, replace=False) for _ in range(40)])
+
+    def crosses(one: np.ndarray, two: np.ndarray) -> bool:
+        """Whether a side of `two` that has no vertex of `one` passes through `one`."""
+        a, b, c = vertices[one]
+        for side in two[[0, 1]], two[[1, 2]], two[[2, 0]]:
+            if set(side) & set(one):
+                continue
+            p, q = vertices[side]
+            along, u, v = np.linalg.solve(np.stack([p - q, b - a, c - a], -1), p - a)
+            if 0 < along < 1 and min(u, v, 1 - u - v) > 0:
+                return True
+        return False
+
+    expected = [
+        (i, j)
+        for i in range(40)
+        for j in range(i + 1, 40)
+        if len(set(faces[i]) & set(faces[j])) < 2 and (crosses(faces[i], faces[j]) or crosses(faces[j], faces[i]))
+    ]
+    assert len(expected) > 10
+    assert crossing_triangles(vertices, faces).tolist() == [list(pair) for pair in expected]
+    assert len(crossing_triangles(POINTS, FACES)) == 0
+    assert len(crossing_triangles(POINTS, FACES[:1])) == 0
+
+
+def test_steps_into_a_self_intersection_are_shortened_where_asked_for() -> None:
+    """Two plates, one of which is to move through the other: no triangle turns over."""
+    plate, two = np.array([[0, 0, 0], [1, 0, 0.1], [0, 1, 0.0]]), np.array([[0, 1, 2], [3, 4, 5]])
+    start = np.concatenate([plate, plate @ [[1, 0, 0], [0, 1, 0], [0, 0, -1.0]] + [0.1, 0.1, 1.0]])
+    end = start - np.where(np.arange(6) >= 3, 0.95, 0.0)[:, None] * [0, 0, 1]
+    before, after = (x.reshape(-1).astype(np.float32) for x in (start, end))
+    assert guarded(before, after, two) is after
+    assert len(crossing_triangles(end, two)) == 1
+    found = guarded(before, after, two, crossing=False)
+    assert len(crossing_triangles(found.reshape(-1, 3), two)) == 0
+    np.testing.assert_allclose(found, (before + after) / 2, atol=1e-6)
+    onward = (end + [0, 0, 0.01]).reshape(-1).astype(np.float32)
+    assert guarded(after, onward, two, crossing=False) is onward  # it passed through itself before
 
 
 def test_two_optimizers_side_by_side_do_what_each_does_alone() -> None:
@@ -233,6 +277,7 @@ def test_unusual_meshes_have_a_line() -> None:
 def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     key = "ball.vertex_positions"
     problem = SimpleNamespace(faces={key: FACES}, initial_values=lambda: {key: POINTS.reshape(-1)})
+    problem.self_intersections = {key: "ignore"}
     crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
     run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
     descent, watch = SimpleNamespace(run=run), MeshWatch()
@@ -245,6 +290,36 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     assert "the mesh folds over at" in line
     run.parameters[key] = 2 * POINTS.reshape(-1)
     assert watch.warnings(descent) == []  # type: ignore
+
+
+def test_what_to_do_with_self_intersections_is_checked() -> None:
+    mesh, colour = "ball.vertex_positions", "ball.bsdf.reflectance.value"
+    given = [ur.Parameter(mesh, self_intersection="prevent"), ur.Parameter(colour)]
+    assert check_self_intersections(given, {mesh: FACES}) == {mesh: "prevent"}
+    with pytest.raises(ur.InputError, match='expected "warn", "prevent" or "ignore", got \'never\''):
+        check_self_intersections([ur.Parameter(mesh, self_intersection="never")], {mesh: FACES})  # type: ignore
+    with pytest.raises(ur.InputError, match="it is of the vertex positions of a mesh"):
+        check_self_intersections([ur.Parameter(colour, self_intersection="prevent")], {mesh: FACES})
+
+
+def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
+    key, away = "ball.vertex_positions", np.repeat([0.0, 3.0], len(POINTS))[:, None] * [1.0, 0, 0]
+    vertices, faces = np.concatenate([POINTS, POINTS]), np.concatenate([FACES, FACES + len(POINTS)])
+    problem = SimpleNamespace(
+        faces={key: faces}, initial_values=lambda: {key: vertices + away}, self_intersections={key: "warn"}
+    )
+    run = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], step=25, stopped="")
+    watch, estimate = MeshWatch(), Estimate(0.0, {key: np.ones(vertices.size)})
+    problem.self_intersections[key] = "ignore"
+    watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
+    assert run.warnings == []
+    problem.self_intersections[key] = "warn"
+    for run.step in (24, 25, 50):
+        watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
+    (line,) = run.warnings
+    assert line.startswith(f"step 25: {key}: the mesh passes through itself at ")
+    run.stopped = "steps"
+    assert watch.warnings(SimpleNamespace(run=run)) == []  # type: ignore
 
 
 def test_whole_views_are_drawn_evenly() -> None:

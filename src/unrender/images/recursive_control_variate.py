@@ -97,8 +97,8 @@ class RecursiveControlVariate:
     unchanging parameters the image converges to the exact one.
 
     Args:
-        space: "path" shares paths between the two states (one trace; materials and emitters); "primary" shares random
-            numbers (two traces; any parameter, less correlation).
+        space: "path" shares paths between the two states (one trace; materials and emitters), and relates those of meshes that move
+            (two traces); "primary" shares random numbers (two traces; any parameter, less correlation).
         alpha: decay of the running means, in [0, 1).
         beta: decay of the running (co)variances, in [0, 1).
         whole_views: with pixel mini-batches, every so many of them are followed by a step that renders whole views, >= 1.

@@ -228,7 +228,7 @@ class AutoMethod(Options):
         if self.image == "plain":
             return _Image("plain", Plain(), "as asked for")
         if self.image is None and deforms:
-            return _Image("plain", Plain(), "a mesh moves, and no path serves two of its shapes")
+            return _Image("plain", Plain(), "a mesh moves (--set image=rcv uses earlier samples again)")
         if self.image is None and not whole:
             return _Image("plain", Plain(), "control variates need whole views")
         if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:

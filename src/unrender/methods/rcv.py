@@ -21,7 +21,8 @@ class RecursiveControlVariateMethod(PathOptions):
 
     spp: PositiveInt = Field(2, description="samples per pixel; from 2 on, the adjoint shares their paths")
     space: Literal["path", "primary"] = Field(
-        "path", description="what two steps share: paths (materials, emitters), or random numbers (any parameter)"
+        "path",
+        description="what two steps share: paths (materials, emitters, meshes), or random numbers (any parameter)",
     )
     alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
     beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")

@@ -71,6 +71,8 @@ def _take(problem: Problem) -> dict[str, str]:
             found[f"parameter {key}: regularizer"] = repr(problem.regularizers[key])
         if key in problem.remeshings:
             found[f"parameter {key}: remeshing"] = repr(problem.remeshings[key])
+        if parameter.self_intersection == "prevent":
+            found[f"parameter {key}: self_intersection"] = "prevent"
         if key in problem.coarse_to_fine:
             found[f"parameter {key}: coarse_to_fine"] = repr(problem.coarse_to_fine[key])
     for index, view in enumerate(problem.views):

@@ -17,7 +17,9 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.remeshing import Remeshing
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["check_regularizer", "check_remeshings", "check_surfaces", "mesh_notices"]
+__all__ = ["check_regularizer", "check_remeshings", "check_self_intersections", "check_surfaces", "mesh_notices"]
+
+_SELF_INTERSECTIONS = ("warn", "prevent", "ignore")
 
 
 def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
@@ -54,6 +56,23 @@ def check_remeshings(
             place = ("parameters", index, "remeshing")
             raise FieldError(place, str(error), f"parameter {key}: remeshing") from error
     return found
+
+
+def check_self_intersections(parameters: Sequence[Parameter], faces: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """{key: what is done where its mesh passes through itself} of those that are vertex positions; see `Parameter`. Raises `FieldError`.
+
+    Args:
+        parameters: of a problem.
+        faces: of their meshes.
+    """
+    for index, parameter in enumerate(parameters):
+        given, place = parameter.self_intersection, ("parameters", index, "self_intersection")
+        name = f"parameter {parameter.key}: self_intersection"
+        if given not in _SELF_INTERSECTIONS:
+            raise FieldError(place, f'expected "warn", "prevent" or "ignore", got {given!r}', name)
+        if given != "warn" and parameter.key not in faces:
+            raise FieldError(place, "expected none: it is of the vertex positions of a mesh", name)
+    return {parameter.key: parameter.self_intersection for parameter in parameters if parameter.key in faces}
 
 
 def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str]:

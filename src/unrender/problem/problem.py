@@ -24,7 +24,12 @@ from unrender.problem import notebook
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
-from unrender.problem.mesh_checks import check_remeshings, check_surfaces, mesh_notices
+from unrender.problem.mesh_checks import (
+    check_remeshings,
+    check_self_intersections,
+    check_surfaces,
+    mesh_notices,
+)
 from unrender.problem.parameter import Parameter
 from unrender.problem.references import References
 from unrender.problem.validation import (
@@ -86,6 +91,7 @@ class Problem:
         coarse_to_fine: {key: `CoarseToFine`} of the parameters that are coarse at first.
         parameterisations: {key: parameterisation} of the parameters that were given one.
         remeshings: {key: `Remeshing`} of the parameters that have one.
+        self_intersections: {key: "warn", "prevent" or "ignore"} of the parameters that are vertex positions.
         regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
         references: values and weights of single pixels of the references.
@@ -156,6 +162,7 @@ class Problem:
         self.surfaces = dict(surfaces or {})
         check_surfaces(self.surfaces, self.faces)
         self.remeshings = check_remeshings(self.parameters, known, self.texture_coordinates)
+        self.self_intersections = check_self_intersections(self.parameters, self.faces)
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
         self._references: dict[int, Array] = {}

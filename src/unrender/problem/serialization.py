@@ -83,6 +83,8 @@ def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Array
         table["regularizer"] = tables.fields(problem.regularizers[parameter.key])
     if parameter.key in problem.remeshings:
         table["remeshing"] = tables.fields(problem.remeshings[parameter.key])
+    if parameter.self_intersection != "warn":
+        table["self_intersection"] = parameter.self_intersection
     if parameter.key in problem.truth:
         table |= store.field("truth", problem.truth[parameter.key], f"parameter{index}-truth")
     return table

@@ -27,7 +27,7 @@ Paths are relative to the file. Only `scene`, `key` and `reference` are required
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
@@ -70,6 +70,9 @@ class _Parameter(Table):
     remeshing: list[StrictInt] | dict[str, Any] | None = Field(
         None,
         description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
+    )
+    self_intersection: Literal["warn", "prevent", "ignore"] = Field(
+        "warn", description='of vertex positions, "warn", "prevent" or "ignore"'
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
@@ -149,6 +152,7 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
     given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
+    given["self_intersection"] = model.self_intersection
     return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
 
 

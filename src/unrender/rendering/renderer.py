@@ -46,7 +46,8 @@ class ParameterInfo:
     Attributes:
         shape: of the array that stands for it.
         differentiable: whether `adjoint` can return its gradient.
-        shares_paths: whether one set of paths serves two values of it (path space).
+        shares_paths: whether one set of paths serves two values of it (path space). Of meshes that move it does not, but a renderer may
+            relate the paths of two values, so that their images have path space all the same.
         reason: one line; why it is not differentiable or cannot share paths, else "".
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
@@ -145,7 +146,7 @@ class RenderSession(Protocol):
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """Render two states with the same samples: one set of paths (`"path"`) or one set of random numbers
-        (`"primary"`). Both images are unbiased."""
+        (`"primary"`). Where shapes move, the former are related paths. Both images are unbiased."""
         ...
 
     def adjoint(self, parameters: Tree, paths: Any, weights: Array) -> Tree:
@@ -159,7 +160,8 @@ class RenderSession(Protocol):
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Any, weights: Array, weights_previous: Array
     ) -> tuple[Tree, Tree]:
-        """`adjoint` of both states of an `image_pair`, on its paths and in its space: the gradient of sum(weights[g] * images[g])
+        """`adjoint` of both states of an `image_pair`, on its paths and in its space (of moving shapes, the previous state's from the same
+        random numbers): the gradient of sum(weights[g] * images[g])
         with respect to `current`, and of sum(weights_previous[g] * previous[g]) with respect to `previous`.
         """
         ...

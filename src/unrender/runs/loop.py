@@ -213,7 +213,8 @@ def _warn_of_skipping(run: Run, culprit: str) -> None:
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
     """Warn of steps of meshes that are shortened, once for each."""
     for key in keys:
-        line = f"{key}: triangles would have turned over; such steps are shortened"
+        also = " or passed through others" if run.problem.self_intersections[key] == "prevent" else ""
+        line = f"{key}: triangles would have turned over{also}; such steps are shortened"
         if not any(known.endswith(line) for known in run.warnings):
             run.warnings.append(f"step {run.step}: {line}")
 
@@ -250,7 +251,8 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     shortened = []
     for key, faces in problem.faces.items():
         wanted = arrays.numpy(bounded[key])
-        allowed = guarded(arrays.numpy(parameters[key]), wanted, faces)
+        crossing = problem.self_intersections[key] != "prevent"
+        allowed = guarded(arrays.numpy(parameters[key]), wanted, faces, crossing)
         if allowed is not wanted:
             bounded[key] = arrays.like(allowed, bounded[key])
             shortened.append(key)

@@ -15,9 +15,10 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
-from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+from unrender.rendering.mitsuba.integrators.volpath import VolumePair, independent
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
@@ -29,6 +30,7 @@ __all__ = [
     "ImagePass",
     "Kernel",
     "LaunchSize",
+    "MovedPairPass",
     "Pass",
     "PosesPass",
     "TangentPass",
@@ -203,6 +205,54 @@ class ImagePairPass(Pass):
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """The radiance of each lane, of the current and of the previous state."""
         return paths.radiance()
+
+
+@dataclass(frozen=True)
+class MovedPairPass(Pass):
+    """Both states' radiance per lane where shapes move, on related paths.
+
+    Attributes:
+        moving: ids of the meshes that move.
+        tracer: what traces both.
+    """
+
+    moving: frozenset[str]
+    tracer: MovedPair
+
+    def scene(self, pair: ScenePair) -> Any:
+        """Both."""
+        return pair.current, pair.previous
+
+    def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
+        """See `MovedPair.sample`."""
+        return pair.moved_tables(self.moving)
+
+    def function(
+        self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
+    ) -> Callable[..., Any]:
+        """See `Pass.function`. Each state has the rays of its own sensors; the kernel is its own."""
+        del kernel, posed
+
+        def launch(scenes, loaded, tables, seeds, pixels, sensors):
+            del loaded
+            seed, positions = seeds
+            with dr.suspend_grad():
+                rays, weights = [], []
+                for scene in scenes:  # equal numbers
+                    whole = positions is None
+                    numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
+                    ray, weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
+                    rays.append(ray)
+                    weights.append(weight)
+                choices = independent(numbers, size.pixels * size.spp)
+                found = self.tracer.sample(scenes, tables, numbers, choices, (rays[0], rays[1]))
+                return tuple(L * weight for L, weight in zip(found, weights, strict=True))
+
+        return launch
+
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
+        """Never called: `function` traces both."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,12 @@ class MitsubaRenderer:
             target: sensor_obstacle(self.pair, target) for target in targets & sensors
         }
 
+    def _carries(self, key: str) -> bool:
+        """Whether paths of two values of a parameter, which moves a mesh, can be related: see `MovedPair`."""
+        scene = self.pair.loaded()
+        kinds = {shape.class_name() for shape in scene.scene.shapes()}
+        return bool(moved_shape(scene, key)) and not moved_sensor(scene, key) and not kinds & {"Instance", "ShapeGroup"}
+
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
         if key not in self._info:
             raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
@@ -147,7 +153,7 @@ class MitsubaRenderer:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
         if not info.perturbable:
             raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")
-        if space == "path" and not info.shares_paths:
+        if space == "path" and not (info.shares_paths or (derivatives and self._carries(key))):
             instead = ", --method plain or --method smoothed" if info.rigid else ""
             raise InputError(
                 f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"{instead}'

@@ -71,6 +71,7 @@ class ScenePair:
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
+        self._moved: dict[frozenset[str], dict[str, mi.UInt32]] = {}
         self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
@@ -144,6 +145,31 @@ class ScenePair:
                 "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
             }
         return self._tables
+
+    def moved_tables(self, moving: AbstractSet[str]) -> dict[str, Any]:
+        """The tables of `MovedPair.sample`, for the values that both scenes hold now; `moving`: ids of the meshes that may move."""
+        meshes = [
+            (now, before)
+            for now, before in zip(self.current.shapes(), self.previous.shapes(), strict=True)
+            if now.id() in moving
+        ]
+        if frozenset(moving) not in self._moved:
+            current: Any = self.current.shapes_dr()
+            previous: Any = self.previous.shapes_dr()
+            ids: Any = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+            triangles, first = np.zeros(int(ids.max(initial=0)) + 1, np.uint32), 1
+            for number, shape in zip(ids, self.current.shapes(), strict=True):
+                if shape.id() in moving:
+                    triangles[number] = first
+                    first += shape.face_count()
+            self._moved[frozenset(moving)] = {
+                "shape": _table(current, previous),
+                "shape_back": _table(previous, current),
+                "triangles": mi.UInt32(triangles),
+            }
+        with dr.suspend_grad():
+            ratios = [_areas(before) / _areas(now) for now, before in meshes]
+            return {**self._moved[frozenset(moving)], "area_ratios": dr.concat([mi.Float(1), *ratios])}
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current
@@ -292,6 +318,13 @@ class ScenePair:
 
 def _media_ids(scene: mi.Scene) -> mi.UInt32:
     return mi.UInt32([0, *(medium_id(medium) for medium in media(scene))])
+
+
+def _areas(mesh: Any) -> Any:
+    """Twice the area of each of a mesh's triangles."""
+    corners = dr.unravel(mi.Point3u, mesh.faces_buffer())
+    a, b, c = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), corner) for corner in corners)
+    return dr.norm(dr.cross(b - a, c - a))
 
 
 def _table(current: Any, previous: Any) -> mi.UInt32:

@@ -18,6 +18,7 @@ from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
 from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
@@ -29,6 +30,7 @@ from unrender.rendering.mitsuba.passes import (
     ImagePass,
     Kernel,
     LaunchSize,
+    MovedPairPass,
     Pass,
     PosesPass,
     TangentPass,
@@ -100,6 +102,7 @@ class MitsubaSession:
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
+        self._moving: frozenset[str] = frozenset()
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
             # Path gradients move the shapes and sensors of the scene itself.
@@ -112,6 +115,7 @@ class MitsubaSession:
                     f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
                 )
             shapes = {moved_shape(pair.loaded(), key) for key in everything if key not in cameras} - {""}
+            self._moving = frozenset(shapes)
             self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
             self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
@@ -144,6 +148,10 @@ class MitsubaSession:
     @cached_property
     def _geometry_kernel(self) -> Kernel:
         return PrbKernel(self._max_depth)
+
+    @cached_property
+    def _moved_kernel(self) -> MovedPair:
+        return MovedPair(self._max_depth)
 
     # ------------------------------------------------------------------ rendering
 
@@ -197,7 +205,8 @@ class MitsubaSession:
             radiance = self._run(ImagePass(), request)
             radiance_previous = self._run(ImagePass(previous=True), request)
         else:
-            radiance, radiance_previous = self._run(ImagePairPass(), request)
+            task = MovedPairPass(self._moving, self._moved_kernel) if self._geometric else ImagePairPass()
+            radiance, radiance_previous = self._run(task, request)
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, request), self._develop(radiance_previous, request)
         return Rendering(*images, Paths(request, radiance, radiance_previous, space, previous))
@@ -220,15 +229,19 @@ class MitsubaSession:
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
     ) -> tuple[Tree, Tree]:
-        """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space each on its own.
-        See `RenderSession.adjoint_pair`."""
+        """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space, and where shapes move,
+        each on its own, from the same random numbers. See `RenderSession.adjoint_pair`."""
         self._set_parameters(current)
         self._set_parameters(previous, previous=True)
         request = paths.request
-        if paths.space == "primary":
+        if paths.space == "primary" or self._geometric:
             gradient = self.adjoint(current, Paths(request, paths.radiance), weights)
             if self._replays:
-                self._run(AdjointPass(previous=True), request, paths.radiance_previous, weights_previous)
+                radiance = paths.radiance_previous
+                if paths.space == "path":  # of other paths than `prb` would replay
+                    radiance = self._run(ImagePass(previous=True), request)
+                    dr.eval(radiance)
+                self._run(AdjointPass(previous=True), request, radiance, weights_previous)
             else:
                 self._pair.clear_gradients()
             return gradient, self._gradients(request, weights_previous, previous=True)

@@ -1,0 +1,227 @@
+"""Meshes from pictures at equal time: `auto` against the stock loop with `prb_projective`, tuned.
+
+The stock loop is that of Mitsuba's tutorial on shapes: `mi.render` with `prb_projective`, `dr.backward`, and `mi.ad.Adam` on the vertices,
+or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps` (λ 19). It is tuned on a seed of its own over rates, and
+over whether the boundary of shadows and indirect light is sampled or not; without a guide, whose octree takes seconds at every step.
+Textures, where there are any, move by the same Adam. Errors are distances between surfaces, and root mean square differences of pictures
+from their references, relative to the start. Time is the processor's, of all threads, so that other work on the machine does not count.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
+from benchmarks.races import TUNING_SEED, search
+from benchmarks.stock_loop import step_seed
+
+QUICK: dict[str, Any] = {
+    "seconds": 0.5, "seeds": 1, "problems": ["sphere-to-bunny"], "resolution": 8, "subdivisions": 1, "views": 2, "rates": [0.01],
+    "indirect": [0],
+}  # fmt: skip
+_SPP, _PICTURE_SPP = 2, 64
+_POINTS = 40
+_TEXTURE_RATE = 0.02
+LAMBDA = 19.0
+STOCK = ("Adam", "LargeSteps")
+
+
+class StockShapes:
+    """The stock loop on a problem whose unknowns are the vertices of one mesh, and maybe textures.
+
+    Args:
+        problem: of the gallery.
+        kind: of `STOCK`.
+        rate: of the vertices.
+        indirect: samples per pixel of the boundary of shadows and indirect light.
+    """
+
+    def __init__(self, problem: ur.Problem, kind: str, rate: float, indirect: int):
+        self.problem, self.kind, self.rate = problem, kind, rate
+        self.scene, self.parameters = stock_scene(problem)
+        (self.mesh,) = problem.faces
+        counts = {"sppc": _SPP, "sppp": _SPP, "sppi": indirect, "guiding": "none"}
+        self._integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
+
+    def run(self, seconds: float, seed: int) -> list[tuple[float, dict[str, np.ndarray]]]:
+        """(processor seconds, parameters) along a run; two steps of warm-up and the keeping of parameters are left out of the clock."""
+        self._steps(0.0, seed, 2)
+        return self._steps(seconds, seed, None)
+
+    def _steps(self, seconds: float, seed: int, steps: int | None) -> list[tuple[float, dict[str, np.ndarray]]]:
+        start = self.problem.initial()
+        for key, value in start.items():
+            self.parameters[key] = from_tensor(value, self.parameters[key])
+        self.parameters.update()
+        large = None
+        if self.kind == "LargeSteps":
+            faces = self.parameters[f"{self.mesh.rpartition('.')[0]}.faces"]
+            large = mi.ad.LargeSteps(self.parameters[self.mesh], faces, LAMBDA)
+        vertices = mi.ad.Adam(lr=self.rate, uniform=large is not None)
+        vertices["u"] = (
+            self.parameters[self.mesh] if large is None else large.to_differential(self.parameters[self.mesh])
+        )
+        others = mi.ad.Adam(lr=_TEXTURE_RATE)
+        for key in start:
+            if key != self.mesh:
+                others[key] = self.parameters[key]
+        clock, step, next_at, found = 0.0, 0, 0.0, []
+        while step < steps if steps is not None else clock < seconds:
+            began = time.process_time()
+            self.parameters[self.mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
+            for key in others.keys():  # noqa: SIM118 (iterating gives pairs)
+                low, high = self.problem.bounds[key]
+                others[key] = project(others[key], low, high)
+                self.parameters[key] = others[key]
+            self.parameters.update()
+            loss: Any = 0.0
+            for index, view in enumerate(self.problem.views):
+                number = step_seed(seed, step, index)
+                image = mi.render(
+                    self.scene,
+                    self.parameters,
+                    sensor=view.sensor,
+                    integrator=self._integrator,
+                    seed=number,
+                    seed_grad=number + 1,
+                )
+                loss += self.problem.loss_value(index, image)
+            dr.backward(loss)
+            vertices.step()
+            others.step()
+            dr.eval(vertices["u"])
+            dr.sync_thread()
+            clock += time.process_time() - began
+            step += 1
+            if steps is None and (clock >= next_at or clock >= seconds):
+                next_at = clock + seconds / _POINTS
+                now = dr.detach(vertices["u"] if large is None else large.from_differential(vertices["u"]))
+                kept = {self.mesh: np.array(now)}
+                kept |= {key: np.array(dr.detach(others[key])) for key in start if key != self.mesh}
+                found.append((clock, {key: kept[key].reshape(start[key].shape).astype(np.float32) for key in start}))
+        return found
+
+
+class Kept(ur.Callback):
+    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
+
+    def __init__(self, seconds: float):
+        self.found: list[tuple[float, dict[str, np.ndarray]]] = []
+        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
+        self._since: float | None = None
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        now = time.process_time()
+        # The first step is only known by what the others take.
+        self._clock += 0.0 if self._since is None else now - self._since
+        if self._clock >= self._next or self._clock >= self._seconds:
+            self._next = self._clock + self._seconds / _POINTS
+            self.found.append((self._clock, run.full()))
+        if self._clock >= self._seconds:
+            run.stop()
+        self._since = time.process_time()
+
+
+def blind(problem: ur.Problem) -> ur.Problem:
+    """The same without the truth: errors are no part of a run's time."""
+    found = copy.copy(problem)
+    found.surfaces, found.truth = {}, {}
+    return found
+
+
+def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
+    """The curve of the surface's error over seconds, and what was reached in the end."""
+    (key,) = problem.faces
+    start = problem.parameter_error(problem.initial())[key]
+    curve = [(0.0, 1.0), *((seconds, problem.parameter_error(values)[key] / start) for seconds, values in found)]
+    first, last = _picture_error(problem, problem.initial_values()), _picture_error(problem, found[-1][1])
+    return {"curve": [list(x) for x in zip(*curve, strict=True)], "surface": curve[-1][1], "pictures": last / first}
+
+
+def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
+    """Of two halves of the samples, so that their noise does not count."""
+    found = 0.0
+    for index, view in enumerate(problem.views):
+        one, two = (ur.render(problem, values, index, spp=_PICTURE_SPP, seed=seed) for seed in (1, 2))
+        reference = np.asarray(view.reference)
+        found += float(np.mean((one - reference) * (two - reference)))
+    return float(np.sqrt(max(found / len(problem.views), 0.0)))
+
+
+def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
+    """`auto`, no option given."""
+    kept = Kept(seconds)
+    ur.optimize(
+        blind(problem), seconds=100 * seconds, seed=seed, callbacks=[kept]
+    )  # a limit of the clock, never reached
+    return measured(problem, kept.found)
+
+
+def time_to(curve: Sequence[Sequence[float]], level: float) -> float | None:
+    """Seconds at which an error first is at most `level`; None where it never is."""
+    return next((seconds for seconds, error in zip(*curve, strict=True) if error <= level), None)
+
+
+def race(
+    problem: ur.Problem, seconds: float, seeds: int, rates: Sequence[float], indirect: Sequence[int]
+) -> dict[str, Any]:
+    """All methods on one problem, the stock loops tuned first."""
+    found: dict[str, Any] = {"auto": {"runs": []}}
+    for kind in STOCK:
+        best: tuple[float, float, int] | None = None
+        for spp in indirect:
+
+            def final(rate: float, kind: str = kind, spp: int = spp) -> float:
+                run = StockShapes(problem, kind, rate, spp).run(seconds, TUNING_SEED)
+                return problem.parameter_error(run[-1][1])[next(iter(problem.faces))]
+
+            rate, tried = search(tuple(rates), final)
+            least = min(one["error"] for one in tried)
+            if best is None or least < best[0]:
+                best = (least, rate, spp)
+        assert best is not None
+        found[kind] = {"rate": best[1], "indirect": best[2], "runs": []}
+    for seed in range(seeds):
+        found["auto"]["runs"].append(ours(problem, seconds, seed))
+        for kind in STOCK:
+            loop = StockShapes(problem, kind, found[kind]["rate"], found[kind]["indirect"])
+            found[kind]["runs"].append(measured(problem, loop.run(seconds, seed)))
+    best_final = min(float(np.median([run["surface"] for run in found[kind]["runs"]])) for kind in STOCK)
+    found["seconds to the stock loops' best"] = [time_to(run["curve"], best_final) for run in found["auto"]["runs"]]
+    return found
+
+
+def run(
+    seconds: float = 60.0,
+    seeds: int = 3,
+    problems: tuple[str, ...] = ("sphere-to-bunny", "statue"),
+    resolution: int = 64,
+    subdivisions: int = 4,
+    views: int = 6,
+    rates: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1),
+    indirect: tuple[int, ...] = (0, 2),
+) -> Iterator[dict[str, Any]]:
+    """Every problem.
+
+    Args:
+        seconds: of a run, of the processor
+        seeds: of the runs that count
+        problems: of the gallery, whose surfaces are known
+        resolution: of the views
+        subdivisions: of the sphere
+        views: how many
+        rates: of the stock loops, tried on a seed of its own
+        indirect: samples per pixel of the stock loops' boundary of shadows and indirect light, likewise
+    """
+    found = {}
+    for name in problems:
+        problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, views=views)
+        found[name] = race(problem, seconds, seeds, rates, indirect)
+        print(name, found[name]["seconds to the stock loops' best"], flush=True)
+        yield {"problems": found}

@@ -1,0 +1,34 @@
+"""Table."""
+
+import numpy as np
+
+from benchmarks import markdown
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """What was left of the errors, and when `auto` was where the stock loops ended."""
+    rows = []
+    for name, found in record["problems"].items():
+        for method, of in found.items():
+            if "runs" not in of:
+                continue
+            finals = [
+                markdown.median_range((float(np.median(values)), min(values), max(values)))
+                for values in ([run[what] for run in of["runs"]] for what in ("surface", "pictures"))
+            ]
+            tuned = f"{of['rate']:g}, {of['indirect']}" if "rate" in of else ""
+            reached = found["seconds to the stock loops' best"] if method == "auto" else []
+            when = ", ".join("never" if at is None else f"{at:.1f} s" for at in reached)
+            rows.append([name, method, tuned, *finals, when])
+    head = [
+        "problem",
+        "method",
+        "rate, indirect spp",
+        "surface error",
+        "picture error",
+        "at the best stock loop's end after",
+    ]
+    settings = record["settings"]
+    said = f"Of the start's, after {settings['seconds']:g} s of the processor, {settings['seeds']} seeds: median (least to greatest)."
+    return said + "\n\n" + markdown.table(head, rows)

@@ -1,0 +1,1 @@
+"""Images of two states of a mesh."""

@@ -1,0 +1,1 @@
+"""Pixel mini-batches on a mesh."""
