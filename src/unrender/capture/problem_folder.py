@@ -32,7 +32,7 @@ from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.judging.held_out import HELD_OUT
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
-from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.rendering.mitsuba import turntable_light
 from unrender.stages import stages_file
 
@@ -114,7 +114,7 @@ def _write_problems(
     """The files of the training views and of those that are held out; `tables`: of the parameters."""
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
-        moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
+        moved = [table for table in tables if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
         if sensors and moved:
             listed = [
                 {"reference": f"{REFERENCES}/{stems[i]}.exr", "sensor": i, "mask": f"{MASKS}/{stems[i]}.png"}

@@ -28,8 +28,11 @@ from unrender.judging.pictures import mask_of, names_of
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
+from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
+from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 from unrender.runs.folder import schema
@@ -100,17 +103,22 @@ def judge(
     problem, found = reopen.problem_of(run), folders.read(run)
     given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _found(Path(run), problem, found)
+    vignetting = values.get(VIGNETTING)
     judged, values, notices = _problem(problem, given, values)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
     if exposed and measured:
         notices.append("exposures of photographs were unknown: each rendering is measured after its best factors")
+    if POSES in values and measured:
+        notices.append("poses of photographs were corrected; those that are held out have the ones that they were given")
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:
             images, relit, albedo = _render(judged, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
             images, relit = relit, []
+        if vignetting is not None and measured:
+            images = [image * falloff(vignetting, *image.shape[:2]) for image in images]
         if exposed and measured:
             images = [_exposed(image, view) for image, view in zip(images, judged.views, strict=True)]
         measures = _measure(judged, images) if measured else []
@@ -155,11 +163,11 @@ def _problem(
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """What was found with the held-out views, and its values."""
     other = Problem.from_file(held_out)
-    known = set(other.renderer.parameters()) - {EXPOSURE}
+    known = set(other.renderer.parameters()).difference(OF_PHOTOGRAPHS)
     kept = [key for key in parameters if key in known]
     if not kept:
         raise InputError(f"{held_out}: its scene has none of the run's parameters, such as {problem.parameters[0].key}")
-    left_out = [key for key in parameters if key not in known and key != EXPOSURE]
+    left_out = [key for key in parameters if key not in known and key not in OF_PHOTOGRAPHS]
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in kept]

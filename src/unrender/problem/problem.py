@@ -44,7 +44,8 @@ from unrender.problem.validation import (
     renderer_notices,
 )
 from unrender.problem.view import View
-from unrender.rendering.exposure import EXPOSURE, ExposedRenderer, without_exposure
+from unrender.rendering.camera_poses import POSES
+from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
 __all__ = ["Bounds", "Problem"]
@@ -122,11 +123,11 @@ class Problem:
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
         keys = [parameter.key for parameter in self.parameters if isinstance(parameter.key, str)]
         self.renderer: Renderer = open_renderer(scene, max_depth, keys)
-        if any(parameter.key == EXPOSURE for parameter in self.parameters):
-            sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
-            rows = self.renderer.rows if isinstance(self.renderer, ExposedRenderer) else {}
-            if not rows.keys() >= set(sensors):  # else these are some of its views, and it keeps the rows of all
-                self.renderer = ExposedRenderer(without_exposure(self.renderer), sensors)
+        sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
+        try:
+            self.renderer = with_photographs(self.renderer, keys, sensors)
+        except InputError as error:
+            raise FieldError(("parameters", keys.index(POSES), "key"), str(error)) from error
 
         known = self.renderer.parameters()
         checked: dict[str, CheckedParameter] = {}
