@@ -1,4 +1,4 @@
-"""Vignetting and corrections of cameras, on a renderer of known integrals: what they do to pictures, exact derivatives, what is projected out."""
+"""Vignetting and corrections of cameras, on a renderer of known integrals: pictures, exact derivatives, projections."""
 
 from __future__ import annotations
 
@@ -123,7 +123,9 @@ def test_what_moves_all_cameras_alike_is_projected_out() -> None:
     corrections = Corrections(Cameras().cameras())
     arms = PLACES - PLACES.mean(0)
     turn, shift = np.array([0.3, -0.5, 0.2]), np.array([0.1, 0.4, -0.2])
-    rigid = np.concatenate([np.broadcast_to(turn, (5, 3)), np.radians(np.cross(turn, arms) + shift + 0.2 * arms) / corrections.unit], 1)
+    rigid = np.concatenate(
+        [np.broadcast_to(turn, (5, 3)), np.radians(np.cross(turn, arms) + shift + 0.2 * arms) / corrections.unit], 1
+    )
     np.testing.assert_allclose(corrections.projected(rigid), 0, atol=1e-9)
     rows = np.random.default_rng(0).normal(size=(5, 6))
     once = corrections.projected(rows)
@@ -143,6 +145,9 @@ def test_a_problem_takes_them_and_a_scene_is_told_the_poses() -> None:
     result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.01), steps=2)
     assert all(np.isfinite(result.parameters[key]).all() and result.parameters[key].any() for key in keys)
     told = scene_values(problem.renderer, {POSES: np.ones((5, 6)), VIGNETTING: np.zeros(3), "map": np.zeros(1)})
-    assert set(told) == {"map", *(key for camera in Cameras().cameras().values() for key in (camera.rotation, camera.translation))}
+    assert set(told) == {
+        "map",
+        *(key for camera in Cameras().cameras().values() for key in (camera.rotation, camera.translation)),
+    }
     with pytest.raises(InputError, match="at least 3 sensors"):
         ur.Problem(Cameras(), [ur.Parameter(POSES)], views[:2], max_depth=1)

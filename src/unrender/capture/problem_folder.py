@@ -32,8 +32,8 @@ from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.judging.held_out import HELD_OUT
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
-from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.stages import stages_file
 
 __all__ = ["OWN", "to_world", "write"]

@@ -97,8 +97,10 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving; poses move from
-    the second stage on, when there is a texture to see them by."""
+    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving.
+
+    Poses move from the second stage on, when there is a texture to see them by.
+    """
     of, found = keys(unknowns, turntable), []
     moved: list[str] = []
 

@@ -49,7 +49,10 @@ _Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape
 _Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
 _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
 _Unknowns = Annotated[
-    str, typer.Option(metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses.")
+    str,
+    typer.Option(
+        metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses."
+    ),
 ]
 _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")

@@ -23,7 +23,7 @@ _Given = TypeVar("_Given", View, Parameter)
 
 
 class _Parts(NamedTuple):
-    """The arguments of `Problem`, and the sensors of all views that have exposures or corrected poses; None where these are no parameters."""
+    """The arguments of `Problem`, and the sensors that have exposures or corrected poses; None where these are no parameters."""
 
     scene: Any
     parameters: Any

@@ -24,11 +24,11 @@ from unrender.exporting.setters import store
 from unrender.io import files
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
-from unrender.rendering.photographs import scene_renderer, scene_values
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
+from unrender.rendering.photographs import scene_renderer, scene_values
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders

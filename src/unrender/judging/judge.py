@@ -110,7 +110,9 @@ def judge(
     if exposed and measured:
         notices.append("exposures of photographs were unknown: each rendering is measured after its best factors")
     if POSES in values and measured:
-        notices.append("poses of photographs were corrected; those that are held out have the ones that they were given")
+        notices.append(
+            "poses of photographs were corrected; those that are held out have the ones that they were given"
+        )
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:

@@ -51,7 +51,7 @@ class Views:
         total = len(problem.views)
         count = min(self.count, total)
         chosen = np.sort(np.random.default_rng(key.uint32()).choice(total, count, replace=False))
-        sizes = [math.prod(np.asarray(problem.views[view].reference).shape[:2]) for view in chosen]
+        sizes = [math.prod(problem.sizes[view]) for view in chosen]
         like = problem.renderer.array(np.full((sum(sizes), 1), total / count, np.float32))
         views = arrays.like_integers(np.repeat(chosen, sizes), like)
         pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)

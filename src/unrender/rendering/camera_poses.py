@@ -142,7 +142,9 @@ class PosedCameras:
     def __init__(self, inner: Renderer, sensors: list[int]):
         known = inner.cameras() if isinstance(inner, WithCameras) else {}
         if missing := next((sensor for sensor in sensors if sensor not in known), None):
-            raise InputError(f"{POSES}: sensor {missing} cannot be moved; expected a perspective sensor with an id of its own")
+            raise InputError(
+                f"{POSES}: sensor {missing} cannot be moved; expected a perspective sensor with an id of its own"
+            )
         self.inner = inner
         self.rows = {sensor: row for row, sensor in enumerate(dict.fromkeys(sensors))}
         self.corrections = Corrections({sensor: known[sensor] for sensor in self.rows})

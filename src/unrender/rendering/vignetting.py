@@ -188,7 +188,10 @@ class VignettedSession:
         before = weights_previous * _factors(previous, paths.powers, weights_previous)
         states = _scene(current), _scene(previous)
         found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
-        own, own_previous = _gradient(paths.powers, now * paths.images), _gradient(paths.powers, before * paths.previous)
+        own, own_previous = (
+            _gradient(paths.powers, now * paths.images),
+            _gradient(paths.powers, before * paths.previous),
+        )
         return _ordered(current, found[0], own), _ordered(previous, found[1], own_previous)
 
     def tangent_moment(self, parameters: Tree, paths: VignettedPaths, tangents: Tree) -> Array:
