@@ -36,7 +36,7 @@ from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.stages import stages_file
 
-__all__ = ["OWN", "to_world", "write"]
+__all__ = ["OWN", "sensor_element", "to_world", "write"]
 
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
@@ -164,7 +164,7 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
     clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
-        sensor = _sensor(view, stem, *clip)
+        sensor = sensor_element(view, stem, *clip)
         for name in ("shutter_open", "shutter_close") if turntable else ():
             add_value(sensor, "float", name, float(index))
         root.append(sensor)
@@ -202,7 +202,8 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
         add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
 
 
-def _sensor(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+    """The camera of a view, as the scene has it."""
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
     add_value(sensor, "string", "fov_axis", "x")

@@ -65,6 +65,10 @@ _Turntable = Annotated[
         help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
     ),
 ]
+_Field = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=2, max=256, help="A radiance field of N voxels a side, without masks or mesh."),
+]
 
 
 def import_(
@@ -85,6 +89,7 @@ def import_(
     unknowns: _Unknowns = "colour,roughness,metallic,light",
     band: _Band = 0,
     turntable: _Turntable = None,
+    field: _Field = None,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
@@ -101,7 +106,7 @@ def import_(
     names = parse(unknowns)
     # fmt: off
     options = importing.ImportOptions(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field
     )
     # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
