@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Corrections
+from benchmarks.internals import Corrections, method
 from benchmarks.nuisances import capture
 
 COLOUR, LIGHT = "asset.bsdf.base_color.data", "light.data"
 BAND = 4
 CASES = {"none": (), **{name: (name,) for name in capture.NUISANCES}, "all": capture.NUISANCES}
 MERGE = ("faults.*",)
-QUICK = {"steps": 3, "size": 24, "spp": 1, "fault": ("none", "all")}
+QUICK = {"steps": 3, "size": 24, "spp": 1, "pixels": 512, "fault": ("none", "all")}
 
 
 def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], size: int, spp: int) -> Any:
@@ -83,7 +83,12 @@ def _angles(problem: ur.Problem, rows: np.ndarray, made: capture.Made) -> list[f
 
 
 def run(
-    fault: tuple[str, ...] = tuple(CASES), steps: int = 80, size: int = 48, spp: int = 8, seeds: int = 1
+    fault: tuple[str, ...] = tuple(CASES),
+    steps: int = 100,
+    size: int = 48,
+    spp: int = 8,
+    pixels: int = 8192,
+    seeds: int = 1,
 ) -> Iterator[dict[str, Any]]:
     """A part for each nuisance, without and with its models.
 
@@ -91,6 +96,7 @@ def run(
         fault: of the cases; the others' figures stay
         size: pixels along a side of a photograph
         spp: samples in each of the 16 parts of a photograph's pixel
+        pixels: of a step, from all photographs
     """
     with tempfile.TemporaryDirectory() as scratch:
         problem, _ = imported(Path(scratch), (), (), size, 1)
@@ -106,7 +112,8 @@ def run(
                 problem, made = imported(Path(scratch), CASES[name], models, size, spp)
                 rows = []
                 for seed in range(seeds):
-                    result = ur.optimize(problem, "auto", steps=steps, seed=seed)
+                    choice = method("auto").configure({"pixels": pixels}).choose(problem)
+                    result = ur.optimize(problem, choice.estimator, choice.optimizer, steps=steps, seed=seed)
                     rows.append(errors(problem, result.parameters, made, seen))
             part[way] = {key: [row[key] for row in rows] for key in rows[0]}
             print(name, way, part[way], flush=True)

@@ -82,7 +82,7 @@ def _plugin(variant: str) -> type:
             self.sigma_t = _volume(properties, "sigma_t")
             self.emission = _volume(properties, "emission")
             self.more = []
-            while properties.has_property(f"{COEFFICIENT}{len(self.more) + 1}"):
+            while f"{COEFFICIENT}{len(self.more) + 1}" in properties:
                 self.more.append(_volume(properties, f"{COEFFICIENT}{len(self.more) + 1}"))
             if len(self.more) + 1 not in FUNCTIONS:
                 raise InputError(
