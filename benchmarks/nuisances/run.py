@@ -84,10 +84,10 @@ def _angles(problem: ur.Problem, rows: np.ndarray, made: capture.Made) -> list[f
 
 def run(
     fault: tuple[str, ...] = tuple(CASES),
-    steps: int = 100,
-    size: int = 48,
+    steps: int = 60,
+    size: int = 32,
     spp: int = 8,
-    pixels: int = 8192,
+    pixels: int = 4096,
     seeds: int = 1,
 ) -> Iterator[dict[str, Any]]:
     """A part for each nuisance, without and with its models.
