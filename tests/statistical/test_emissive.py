@@ -142,7 +142,9 @@ def test_a_glow_of_spherical_harmonics_is_what_its_closed_form_says() -> None:
     medium |= {f"emission_{k}": grid(np.broadcast_to(coefficients[k], (*shape, 3)), "trilinear") for k in range(1, 4)}
     renderer = MitsubaRenderer(before_the_sky(medium), 1)
     keys = [f"body.interior_medium.emission{more}.data" for more in ("", "_1", "_2", "_3")]
-    assert all((info.lowest, info.highest) == (None, None) for key, info in renderer.parameters().items() if key in keys)
+    assert all(
+        (info.lowest, info.highest) == (None, None) for key, info in renderer.parameters().items() if key in keys
+    )
     sums = np.array([1, -(3**0.5), 0, 0]) @ coefficients
     radiance, covered = 0.05 * np.log1p(np.exp(sums / 0.05)), 1 - np.exp(-2 * extinction)
     images = np.array(renderer.prepare([], None).image({}, SampleRequest(0, 32 * 64, 1, 32)).images).astype(np.float64)
