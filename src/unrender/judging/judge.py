@@ -107,22 +107,15 @@ def judge(
     judged, values, notices = _problem(problem, given, values)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
-    if exposed and measured:
-        notices.append("exposures of photographs were unknown: each rendering is measured after its best factors")
-    if POSES in values and measured:
-        notices.append(
-            "poses of photographs were corrected; those that are held out have the ones that they were given"
-        )
+    notices += _unknown_of_photographs(problem) if measured else []
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:
             images, relit, albedo = _render(judged, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
             images, relit = relit, []
-        if vignetting is not None and measured:
-            images = [image * falloff(vignetting, *image.shape[:2]) for image in images]
-        if exposed and measured:
-            images = [_exposed(image, view) for image, view in zip(images, judged.views, strict=True)]
+        if measured:
+            images = _photographed(judged, images, vignetting, exposed)
         measures = _measure(judged, images) if measured else []
         pictures.write(folder, judged, images, relit, measures)
         record = _record(judged, measures, albedo, given, environment, spp, notices)
@@ -240,6 +233,27 @@ def _albedo(
         ]
         pixels.append(np.concatenate(images))
     return compare_albedo(*pixels)
+
+
+def _unknown_of_photographs(problem: Problem) -> list[str]:
+    """A line for each unknown that photographs held out have values of their own of."""
+    moved = {parameter.key for parameter in problem.parameters}
+    lines = {
+        EXPOSURE: "exposures of photographs were unknown: each rendering is measured after its best factors",
+        POSES: "poses of photographs were corrected; those that are held out have the ones that they were given",
+    }
+    return [line for key, line in lines.items() if key in moved]
+
+
+def _photographed(
+    problem: Problem, images: list[np.ndarray], vignetting: np.ndarray | None, exposed: bool
+) -> list[np.ndarray]:
+    """Renderings as the photographs' lens and exposures would have them."""
+    if vignetting is not None:
+        images = [image * falloff(vignetting, *image.shape[:2]) for image in images]
+    if exposed:
+        images = [_exposed(image, view) for image, view in zip(images, problem.views, strict=True)]
+    return images
 
 
 def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
