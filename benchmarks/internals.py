@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from unrender.capture.mesh import Mesh as CapturedMesh
+from unrender.capture.mesh import ply
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -26,8 +28,11 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
+from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
+from unrender.rendering.vignetting import falloff
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
@@ -38,7 +43,11 @@ dr: Any = importlib.import_module("drjit")
 mi: Any = importlib.import_module("mitsuba")
 
 __all__ = [
+    "MITSUBA_TO_OPENGL",
     "RATE",
+    "Camera",
+    "CapturedMesh",
+    "Corrections",
     "Estimator",
     "ImageEstimate",
     "ImageEstimator",
@@ -54,6 +63,7 @@ __all__ = [
     "coupled_gradients",
     "dr",
     "element_scales",
+    "falloff",
     "from_tensor",
     "gradient_of",
     "hardly_seen",
@@ -66,6 +76,7 @@ __all__ = [
     "mitsuba_renderer",
     "pixel_probability",
     "pixel_shares",
+    "ply",
     "prepare",
     "project",
     "scene_description",

@@ -1,122 +1,120 @@
-"""What photographs do: drifting exposure, saturated 8-bit pixels and masks two pixels off, with and without a model of each.
+"""What photographs do: a made capture with lens distortion, exposure drift, vignetting, wrong poses, masks off and 8-bit JPEG files.
 
-A textured ball under a sky, both unknown, seen by eight cameras in pictures made for it. Per fault, at equal steps: the root mean
-square error of the base colour after the best factor per channel (only the product of colour and light is seen), of the light's
-logarithm likewise, and of the exposures in stops. The clean capture is run with every model, too: what a model costs where there
-is no fault.
+A painted body under a sky, seen by eight cameras, is photographed (`capture.py`), imported with its mesh, and its base colour and light are
+recovered by `auto`, at equal steps: with no nuisance, with each, and with all at once; without and with what models it: the lens's
+coefficients in transforms.json, `exposure`, `vignetting` and `poses` among the unknowns, a band of low weight in the masks. JPEG files need
+nothing. Errors are root mean squares: of the base colour after the best factor per channel (only the product of colour and light is
+seen), of the light's logarithm likewise, of exposures in stops, of the vignetting at the corners in stops; of poses the mean angle, in
+degrees, by which the direction towards the body's middle is wrong.
 """
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 import unrender as ur
+from benchmarks.internals import Corrections, method
+from benchmarks.nuisances import capture
 
-VIEWS, SIZE, TEXELS = 8, 20, 16
-COLOUR, LIGHT, EXPOSURE = "ball.bsdf.reflectance.data", "light.data", "exposure"
-FAULTS = {
-    "none": (),
-    "exposure": ("exposure",),
-    "white": ("white",),
-    "masks": ("masks",),
-    "all": ("exposure", "white", "masks"),
-}
-DRIFT, WHITE, SHIFT, BAND = 0.3, 0.95, 2, 3
-QUICK = {"steps": 10, "seeds": 1}
+COLOUR, LIGHT = "asset.bsdf.base_color.data", "light.data"
+BAND = 4
+CASES = {"none": (), **{name: (name,) for name in capture.NUISANCES}, "all": capture.NUISANCES}
+MERGE = ("faults.*",)
+QUICK = {"steps": 3, "size": 24, "spp": 1, "pixels": 512, "fault": ("none", "all")}
 
 
-def scene() -> dict[str, Any]:
-    """The ball with its texture and its sky at their true values, and the cameras."""
-    rng = np.random.default_rng(0)
-    smooth = ndimage.gaussian_filter(rng.uniform(0, 1, (TEXELS, TEXELS, 3)), (1.5, 1.5, 0), mode="wrap")
-    texels = np.interp(smooth, (smooth.min(), smooth.max()), (0.2, 0.8)).astype(np.float32)
-    sky = (0.5 + ndimage.gaussian_filter(rng.exponential(1.0, (8, 16, 3)), (1, 1, 0), mode="wrap")).astype(np.float32)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "format": "variant"}
-    found: dict[str, Any] = {
-        "type": "scene",
-        "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": texture}},
-        "light": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-    }
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
-    for index in range(VIEWS):
-        angle, height = 2 * np.pi * index / VIEWS, 2.5 * np.sin(1 + 2.3 * index)
-        place = mi.ScalarTransform4f().look_at([4 * np.cos(angle), 4 * np.sin(angle), height], [0, 0, 0], [0, 0, 1])
-        found[f"camera{index}"] = {"type": "perspective", "fov": 32, "to_world": place, "film": dict(film)}
-    return found
+def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], size: int, spp: int) -> Any:
+    """The problem of a capture with these nuisances and these models, and what was put in."""
+    made = capture.make(folder / "photographs", nuisances, size, spp, "distortion" in models)
+    unknowns = ("colour", "light", *(name for name in ("exposure", "vignetting", "poses") if name in models))
+    options = ur.ImportOptions(
+        mesh=folder / "photographs" / "body.ply",
+        masks=folder / "photographs" / "masks",
+        resolution=size,
+        hold_out=0,
+        texture=capture.TEXELS,
+        unknowns=unknowns,
+        band=BAND if "masks" in models else 0,
+        turntable=False,
+    )
+    ur.import_capture(folder / "photographs", folder / "problem", options)
+    return ur.Problem.from_file(folder / "problem" / "problem.toml"), made
 
 
-def photographs(
-    base: ur.Problem, faults: tuple[str, ...], models: tuple[str, ...]
-) -> tuple[list[ur.View], np.ndarray, float]:
-    """Views with these faults, and masks as these models take them; the true exposures, and white."""
-    rng = np.random.default_rng(1)
-    drift = rng.normal(0, DRIFT, (VIEWS, 3)) * ("exposure" in faults)
-    drift -= drift.mean(0)
-    y, x = np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2
-    inside = np.hypot(x, y) < 0.9 * SIZE / 2
-    # The camera's white: a tenth of the pixels is saturated.
-    level = np.percentile([np.asarray(view.reference)[inside] for view in base.views], 90)
-    views = []
-    for index, view in enumerate(base.views):
-        picture = np.asarray(view.reference) * 2.0 ** drift[index]
-        mask = inside
-        if "white" in faults:
-            picture = np.clip(picture / level, 0, 1)
-            encoded = np.where(picture <= 0.0031308, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055)
-            shown = np.round(255 * encoded) / 255
-            picture = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4) * level
-        if "masks" in faults:
-            # The photograph shows a dark wall where the scene has its sky, and the mask is off by two pixels.
-            picture = np.where((np.hypot(x, y) < SIZE / 2 * 0.95)[..., None], picture, 0.05)
-            mask = np.roll(inside, (SHIFT, -SHIFT), (0, 1))
-        weights = mask.astype(np.float32)
-        if "masks" in models:
-            weights = np.where(np.asarray(ndimage.distance_transform_edt(mask)) > BAND, weights, 0.1 * weights)
-        views.append(ur.View(picture.astype(np.float32), index, mask=weights))
-    return views, drift, float(level)
-
-
-def errors(found: dict[str, np.ndarray], truth: dict[str, np.ndarray], drift: np.ndarray) -> dict[str, float]:
-    """Of colour, light and exposures."""
-    colour, true = (x[COLOUR].reshape(-1, 3) for x in (found, truth))
-    scale = (colour * true).sum(0) / np.square(colour).sum(0)
-    light = np.log(np.maximum(found[LIGHT], 1e-6)) - np.log(truth[LIGHT])
-    light = (light - light.mean((0, 1)))[1:-1, 1:-1]
-    result = {
-        "colour": float(np.sqrt(np.mean((scale * colour - true) ** 2))),
-        "light": float(np.sqrt(np.mean(light**2))),
-    }
-    if EXPOSURE in found:
-        result["exposure"] = float(np.sqrt(np.mean((found[EXPOSURE] - found[EXPOSURE].mean(0) - drift) ** 2)))
+def errors(problem: ur.Problem, found: dict[str, np.ndarray], made: capture.Made, seen: np.ndarray) -> dict[str, float]:
+    """Of what was recovered; of poses also where they are taken as given."""
+    colour, sky = capture.truth()
+    # Rows of texels of a bitmap run downwards, as those of the truth do.
+    own, true = found[COLOUR][seen], colour[seen]
+    scale = (own * true).sum(0) / np.square(own).sum(0)
+    light = np.log(np.maximum(found[LIGHT][:, :32], 1e-6)) - np.log(sky)
+    light = (light - light.mean((0, 1)))[1:-1]
+    result = {"colour": _rms(scale * own - true), "light": _rms(light)}
+    if "exposure" in found:
+        result["exposure"] = _rms(found["exposure"] - found["exposure"].mean(0) - made.drift)
+    if "vignetting" in found:
+        result["vignetting"] = float(abs(found["vignetting"].sum() - made.vignetting))
+    rows = found.get("poses", np.zeros_like(made.rows))
+    result["poses"] = float(np.mean(_angles(problem, rows, made)))
     return result
 
 
-def run(fault: tuple[str, ...] = tuple(FAULTS), steps: int = 150, seeds: int = 2) -> dict[str, Any]:
-    """Every fault, without and with its models."""
-    made = ur.Problem(scene, [ur.Parameter(COLOUR), ur.Parameter(LIGHT)], [
-        ur.View(np.ones((SIZE, SIZE, 3)), index) for index in range(VIEWS)
-    ], max_depth=2)  # fmt: skip
-    truth = made.initial_values()
-    exact = [ur.render(made, view=index, spp=1024) for index in range(VIEWS)]
-    base = ur.Problem(made.renderer, made.parameters, [ur.View(x, i) for i, x in enumerate(exact)], max_depth=2)
-    starts = [ur.Parameter(COLOUR, 0.4), ur.Parameter(LIGHT, 1.0)]
-    found: dict[str, Any] = {}
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))
+
+
+def _angles(problem: ur.Problem, rows: np.ndarray, made: capture.Made) -> list[float]:
+    """Of each camera, between the directions towards the body's middle, in its own axes."""
+    from scipy.spatial.transform import Rotation
+
+    cameras = {v: capture.Camera(f"{v}r", f"{v}t", pose[:3, 3]) for v, pose in enumerate(made.cameras)}
+    moved, found = Corrections(cameras).poses(np.asarray(rows, float)), []
+    for v, (wrong, true) in enumerate(zip(made.cameras, capture.poses(), strict=True)):
+        turned = Rotation.from_rotvec(moved[f"{v}r"]).as_matrix() @ wrong[:3, :3]
+        place = wrong[:3, 3] + moved[f"{v}t"]
+        a, b = turned.T @ -place, true[:3, :3].T @ -true[:3, 3]
+        found.append(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1))))
+    return found
+
+
+def run(
+    fault: tuple[str, ...] = tuple(CASES),
+    steps: int = 60,
+    size: int = 32,
+    spp: int = 8,
+    pixels: int = 4096,
+    seeds: int = 1,
+) -> Iterator[dict[str, Any]]:
+    """A part for each nuisance, without and with its models.
+
+    Args:
+        fault: of the cases; the others' figures stay
+        size: pixels along a side of a photograph
+        spp: samples in each of the 16 parts of a photograph's pixel
+        pixels: of a step, from all photographs
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        problem, _ = imported(Path(scratch), (), (), size, 1)
+        gradient = ur.estimate(problem, ur.PathGradient(spp=16)).gradient[COLOUR]
+        seen = np.abs(gradient).sum(-1) > 0
     for name in fault:
-        every = FAULTS["all"] if name == "none" else FAULTS[name]
-        for models in ((), every):
-            views, drift, level = photographs(base, FAULTS[name], models)
-            loss = ur.losses.Censored(ur.losses.L1(), WHITE * level) if "white" in models else ur.losses.L1()
-            parameters = [*starts, *([ur.Parameter(EXPOSURE)] if "exposure" in models else [])]
-            problem = ur.Problem(made.renderer, parameters, views, loss, max_depth=2)
-            rows = [
-                errors(ur.optimize(problem, "auto", steps=steps, seed=seed).parameters, truth, drift)
-                for seed in range(seeds)
-            ]
-            entry = {key: [row[key] for row in rows] for key in rows[0]}
-            found.setdefault(name, {})["with" if models else "without"] = entry
-            print(name, models, entry, flush=True)
-    return {"faults": found, "steps": steps}
+        everything = CASES["all"] if name == "none" else CASES[name]
+        part: dict[str, Any] = {}
+        for way, models in (("without", ()), ("with", everything)):
+            if name == "jpeg" and models:
+                continue
+            with tempfile.TemporaryDirectory() as scratch:
+                problem, made = imported(Path(scratch), CASES[name], models, size, spp)
+                rows = []
+                for seed in range(seeds):
+                    choice = method("auto").configure({"pixels": pixels}).choose(problem)
+                    result = ur.optimize(problem, choice.estimator, choice.optimizer, steps=steps, seed=seed)
+                    rows.append(errors(problem, result.parameters, made, seen))
+            part[way] = {key: [row[key] for row in rows] for key in rows[0]}
+            print(name, way, part[way], flush=True)
+        yield {"faults": {name: part}, "steps": steps, "size": size}

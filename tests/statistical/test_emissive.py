@@ -14,6 +14,7 @@ from fog import DARK, KIND, LEVELS, fog, grid, scene
 from test_volume_gradients import limit, own, scores
 
 from tiers import quick
+from unrender.rendering.mitsuba.emissive import harmonics
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -130,3 +131,26 @@ def test_both_states_of_a_glow_agree_with_separate_renders() -> None:
         a, b = (np.array(x).astype(np.float64).mean(axis=(1, 2)) for x in (images, alone.images))
         error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 24)
         assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4 * error).all()
+
+
+@pytest.mark.slow
+def test_a_glow_of_spherical_harmonics_is_what_its_closed_form_says() -> None:
+    """Constant coefficients: the picture seen face on from -y; and what is emitted in a direction, with its derivatives."""
+    rng = np.random.default_rng(3)
+    coefficients, extinction, shape = rng.uniform(-0.1, 0.3, (4, 3)), 0.6, (2, 2, 2)
+    medium = glow(np.full((*shape, 1), extinction), np.broadcast_to(coefficients[0], (*shape, 3)))
+    medium |= {f"emission_{k}": grid(np.broadcast_to(coefficients[k], (*shape, 3)), "trilinear") for k in range(1, 4)}
+    renderer = MitsubaRenderer(before_the_sky(medium), 1)
+    keys = [f"body.interior_medium.emission{more}.data" for more in ("", "_1", "_2", "_3")]
+    assert all(
+        (info.lowest, info.highest) == (None, None) for key, info in renderer.parameters().items() if key in keys
+    )
+    sums = np.array([1, -(3**0.5), 0, 0]) @ coefficients
+    radiance, covered = 0.05 * np.log1p(np.exp(sums / 0.05)), 1 - np.exp(-2 * extinction)
+    images = np.array(renderer.prepare([], None).image({}, SampleRequest(0, 32 * 64, 1, 32)).images).astype(np.float64)
+    images = images.mean(axis=(1, 2))
+    expected, error = radiance * covered + SKY * (1 - covered), images.std(axis=0, ddof=1) / np.sqrt(len(images))
+    assert (np.abs(images.mean(axis=0) - expected) < 4 * error).all()
+    assert (np.abs(images.mean(axis=0) - 1.05 * expected) > 4 * error).any()
+    Y = np.array(harmonics(mi.ScalarPoint3f(0, -1, 0), 9))
+    np.testing.assert_allclose(Y, [1, -(3**0.5), 0, 0, 0, 0, -(5**0.5) / 2, 0, -(15**0.5) / 2], atol=1e-6)

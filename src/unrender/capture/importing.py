@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from PIL import Image
 from unrender.backend import variant
 from unrender.capture import (
     atlas,
+    field_folder,
     flips,
     formats,
     hull,
@@ -50,7 +51,7 @@ TURNTABLE = (
 )
 LIT_DEFAULT = ("colour", "normal")
 _OF_CHECK = {CHECK, SHEET}
-_OF_IMPORT = {*problem_folder.OWN, SHEET}
+_OF_IMPORT = {*problem_folder.OWN, *field_folder.OWN, SHEET}
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class ImportOptions:
         unknowns: of the asset, of `unknowns.NAMES`.
         band: pixels along the border of masks that count little.
         turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
+        field: voxels along a side of a radiance field, which needs neither masks nor a mesh; None for an asset.
     """
 
     mesh: Path | None = None
@@ -88,6 +90,7 @@ class ImportOptions:
     unknowns: tuple[str, ...] = DEFAULT
     band: int = 0
     turntable: bool | None = None
+    field: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("mesh", "masks"):
@@ -96,6 +99,10 @@ class ImportOptions:
         object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
         for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
             checks.integer("import", name, getattr(self, name), at_least=least)
+        if self.field is not None:
+            checks.integer("import", "field", self.field, at_least=2)
+            if self.field > MOST_VOXELS or self.mesh is not None:
+                raise InputError(f"--field: expected 2 to {MOST_VOXELS} voxels a side, and no --mesh")
         if self.voxels > MOST_VOXELS:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
 
@@ -164,6 +171,8 @@ def import_capture(
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
     if formats.is_lit(folder, options.kind):
         return _import_lit(folder, out, options)
+    if options.field is not None:
+        return _import_field(folder, out, options)
     found = _read(folder, options, unwrapped=True)
     if found.refusal:
         raise InputError(f"{folder}: {found.refusal}")
@@ -213,6 +222,38 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
 
 
+def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
+    """What has no surface."""
+    assert options.field is not None
+    voxels, chosen = options.field, field_folder.NAMES[:2] if options.unknowns == DEFAULT else options.unknowns
+    if others := [one for one in chosen if one not in field_folder.NAMES]:
+        raise InputError(f"--unknowns {others[0]}: of a radiance field, expected some of light, exposure")
+    variant.ensure()
+    capture = _capture(folder, options)
+    with phases.phase("photographs") as advance:
+        views, notices = prepare(
+            replace(capture, photographs=tuple(replace(one, mask=None) for one in capture.photographs)),
+            options.resolution,
+            options.scale,
+            options.hold_out,
+            lambda done, count: advance(done / count),
+        )
+    name = folder.resolve().name
+    _write_folder(out, lambda place: field_folder.write(place, name, views, voxels, chosen))
+    held_out = sum(view.held_out for view in views.bare())
+    size = max((view.lens.width, view.lens.height) for view in views.bare())
+    return Imported(out, capture.kind, len(views) - held_out, held_out, size, 0, (), (*capture.notices, *notices))
+
+
+def _capture(folder: Path, options: ImportOptions) -> Capture:
+    """What the folder holds, in the conventions that were asked for."""
+    capture = formats.read(folder, options.kind, options.masks)
+    if options.axes is not None or options.world_to_camera is not None:
+        inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
+        capture = reinterpreted(capture, options.axes or capture.axes, inverse)
+    return capture
+
+
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
     """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
 
@@ -260,10 +301,7 @@ def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str])
 def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     """What the folder holds, its shape and how they fit; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
-    capture = formats.read(folder, options.kind, options.masks)
-    if options.axes is not None or options.world_to_camera is not None:
-        inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
-        capture = reinterpreted(capture, options.axes or capture.axes, inverse)
+    capture = _capture(folder, options)
     given = None if options.mesh is None else meshes.read(options.mesh)
     if given is None:
         meshes.check_installed()

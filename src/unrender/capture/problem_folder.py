@@ -32,11 +32,11 @@ from unrender.core.text import printable
 from unrender.exporting.ready_made import file_name
 from unrender.judging.held_out import HELD_OUT
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
-from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.stages import stages_file
 
-__all__ = ["OWN", "to_world", "write"]
+__all__ = ["OWN", "sensor_element", "to_world", "write"]
 
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
@@ -114,7 +114,7 @@ def _write_problems(
     """The files of the training views and of those that are held out; `tables`: of the parameters."""
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
-        moved = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
+        moved = [table for table in tables if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
         if sensors and moved:
             listed = [
                 {"reference": f"{REFERENCES}/{stems[i]}.exr", "sensor": i, "mask": f"{MASKS}/{stems[i]}.png"}
@@ -164,7 +164,7 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
     clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
-        sensor = _sensor(view, stem, *clip)
+        sensor = sensor_element(view, stem, *clip)
         for name in ("shutter_open", "shutter_close") if turntable else ():
             add_value(sensor, "float", name, float(index))
         root.append(sensor)
@@ -202,7 +202,8 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
         add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
 
 
-def _sensor(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+    """The camera of a view, as the scene has it."""
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
     add_value(sensor, "string", "fov_axis", "x")

@@ -11,12 +11,14 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
+from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.vignetting import VIGNETTING
 from unrender.stages.stages_file import Stage, Stages
 
 __all__ = ["DEFAULT", "NAMES", "keys", "parameters", "parse", "stages", "textures"]
 
-NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure")
+NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
@@ -27,6 +29,10 @@ _FLAT = (0.5, 0.5, 1.0)
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 """Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
 _COARSER = 4
+_OF_PICTURES = ("exposure", "vignetting")
+"""Unknowns that move in all stages."""
+_POSE_RATE = 0.05
+"""First step of poses, in degrees and units like them."""
 
 
 def parse(text: str) -> tuple[str, ...]:
@@ -52,6 +58,8 @@ def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
         "shape": "asset.vertex_positions",
         "light": "light.map.data" if turntable else "light.data",
         "exposure": EXPOSURE,
+        "vignetting": VIGNETTING,
+        "poses": POSES,
     }
 
 
@@ -70,6 +78,8 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
             "preconditioner": {"type": "LargeSteps", "strength": _STRENGTH},
         },
         "exposure": {},
+        "vignetting": {},
+        "poses": {"learning_rate": _POSE_RATE},
     }
     return [{"key": of[name], **more[name]} for name in NAMES if name in unknowns]
 
@@ -87,7 +97,10 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving."""
+    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving.
+
+    Poses move from the second stage on, when there is a texture to see them by.
+    """
     of, found = keys(unknowns, turntable), []
     moved: list[str] = []
 
@@ -95,11 +108,12 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
         given = [one for one in more if one in unknowns]
         if given:
             moved.extend(one for one in given if one not in moved)
-            exposed = [one for one in NAMES if one in unknowns and one in (*moved, "exposure")]
-            found.append(Stage(name, tuple(of[one] for one in exposed), share, coarser))
+            moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
+            found.append(Stage(name, tuple(of[one] for one in moving), share, coarser))
 
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
-    add("materials", _MATERIALS, 3.0)
+    add("materials", (*_MATERIALS, "poses"), 3.0)
     add("normals", ("normal",), 1.0)
     add("shape", ("shape",), 1.0)
-    return Stages(problem, tuple(found or [Stage("exposure", (of["exposure"],))]))
+    rest = [name for name in _OF_PICTURES if name in unknowns]
+    return Stages(problem, tuple(found or [Stage("photographs", tuple(of[name] for name in rest))]))

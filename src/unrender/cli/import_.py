@@ -49,7 +49,10 @@ _Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape
 _Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
 _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
 _Unknowns = Annotated[
-    str, typer.Option(metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure.")
+    str,
+    typer.Option(
+        metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses."
+    ),
 ]
 _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
@@ -61,6 +64,10 @@ _Turntable = Annotated[
         "--turntable/--no-turntable",
         help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
     ),
+]
+_Field = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=2, max=256, help="A radiance field of N voxels a side, without masks or mesh."),
 ]
 
 
@@ -82,6 +89,7 @@ def import_(
     unknowns: _Unknowns = "colour,roughness,metallic,light",
     band: _Band = 0,
     turntable: _Turntable = None,
+    field: _Field = None,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
 ) -> None:
@@ -98,7 +106,7 @@ def import_(
     names = parse(unknowns)
     # fmt: off
     options = importing.ImportOptions(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field
     )
     # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)

@@ -51,6 +51,7 @@ __all__ = [
     "sign",
     "sqrt",
     "sum_in_double",
+    "sum_over_last",
     "sum_over_rows",
     "total",
     "where",
@@ -273,6 +274,13 @@ def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
     loop: Any = dr.while_loop
     _, sums = loop(empty, lambda k, sums: k < count, add)
     return type(x)(sums, (dr.width(starts), width))
+
+
+def sum_over_last(x: Array) -> Array:
+    """The sum over the last axis, which stays with length 1: (..., C) -> (..., 1), left lazy on Dr.Jit."""
+    if not is_drjit(x):
+        return x.sum(axis=-1, keepdims=True)
+    return reshape(dr.sum(x, axis=-1), (*x.shape[:-1], 1))
 
 
 def sum_over_rows(x: Array) -> Array:

@@ -15,7 +15,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.validation import open_renderer
 from unrender.problem.view import View
-from unrender.rendering.exposure import ExposedRenderer, without_exposure
+from unrender.rendering.photographs import scene_renderer, sensors_with_rows, with_photographs
 
 __all__ = ["packed", "unpacked"]
 
@@ -23,7 +23,7 @@ _Given = TypeVar("_Given", View, Parameter)
 
 
 class _Parts(NamedTuple):
-    """The arguments of `Problem`, and the sensors of all views that have an exposure; None where that is no parameter."""
+    """The arguments of `Problem`, and the sensors that have exposures or corrected poses; None where these are no parameters."""
 
     scene: Any
     parameters: Any
@@ -47,7 +47,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     """
     given = [_located(problem.given_views[view], "reference", "mask") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
-    sensors = tuple(problem.renderer.rows) if isinstance(problem.renderer, ExposedRenderer) else None
+    sensors = sensors_with_rows(problem.renderer)
     parts = _Parts(_scene(problem), parameters, given, problem.loss, problem.max_depth, problem.name, sensors)
     buffer = io.BytesIO()
     try:
@@ -69,14 +69,14 @@ def unpacked(blob: bytes, ray: Any) -> Problem:
     scene = parts.scene
     if parts.sensors is not None:
         keys = [parameter.key for parameter in parts.parameters]
-        scene = ExposedRenderer(open_renderer(scene, parts.max_depth, keys), parts.sensors)
+        scene = with_photographs(open_renderer(scene, parts.max_depth, keys), keys, parts.sensors)
     return Problem(scene, parts.parameters, parts.views, parts.loss, parts.max_depth, name=parts.name)
 
 
 def _scene(problem: Problem) -> Any:
     if "scene" in problem.origin:
         return problem.origin["scene"]
-    renderer = without_exposure(problem.renderer)
+    renderer = scene_renderer(problem.renderer)
     pair = getattr(renderer, "pair", None)
     description = getattr(pair, "description", None)
     if description is None:

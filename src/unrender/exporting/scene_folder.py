@@ -24,11 +24,11 @@ from unrender.exporting.setters import store
 from unrender.io import files
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
-from unrender.rendering.exposure import EXPOSURE, without_exposure
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
+from unrender.rendering.photographs import scene_renderer, scene_values
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
@@ -107,7 +107,7 @@ def export(
     out, asked = Path(out), check_formats(formats)
     files.check_replaceable(out, _OWN, maps.RECORD, overwrite, f"export to {out}", "an earlier export")
     problem, parameters = _opened(what)
-    renderer = without_exposure(problem.renderer)
+    renderer = scene_renderer(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
     as_tree(problem, parameters)
@@ -153,7 +153,7 @@ def _write(
             raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
         why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
         return [*notices, why], {}
-    of_scene = {key: value for key, value in values.items() if key != EXPOSURE}
+    of_scene = scene_values(problem.renderer, values)
     renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
     if MITSUBA in asked:
         told = [f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene]

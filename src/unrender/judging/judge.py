@@ -28,8 +28,11 @@ from unrender.judging.pictures import mask_of, names_of
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
+from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
+from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 from unrender.runs.folder import schema
@@ -100,19 +103,19 @@ def judge(
     problem, found = reopen.problem_of(run), folders.read(run)
     given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _found(Path(run), problem, found)
+    vignetting = values.get(VIGNETTING)
     judged, values, notices = _problem(problem, given, values)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
-    if exposed and measured:
-        notices.append("exposures of photographs were unknown: each rendering is measured after its best factors")
+    notices += _unknown_of_photographs(problem) if measured else []
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:
             images, relit, albedo = _render(judged, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
             images, relit = relit, []
-        if exposed and measured:
-            images = [_exposed(image, view) for image, view in zip(images, judged.views, strict=True)]
+        if measured:
+            images = _photographed(judged, images, vignetting, exposed)
         measures = _measure(judged, images) if measured else []
         pictures.write(folder, judged, images, relit, measures)
         record = _record(judged, measures, albedo, given, environment, spp, notices)
@@ -155,11 +158,11 @@ def _problem(
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """What was found with the held-out views, and its values."""
     other = Problem.from_file(held_out)
-    known = set(other.renderer.parameters()) - {EXPOSURE}
+    known = set(other.renderer.parameters()).difference(OF_PHOTOGRAPHS)
     kept = [key for key in parameters if key in known]
     if not kept:
         raise InputError(f"{held_out}: its scene has none of the run's parameters, such as {problem.parameters[0].key}")
-    left_out = [key for key in parameters if key not in known and key != EXPOSURE]
+    left_out = [key for key in parameters if key not in known and key not in OF_PHOTOGRAPHS]
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in kept]
@@ -230,6 +233,27 @@ def _albedo(
         ]
         pixels.append(np.concatenate(images))
     return compare_albedo(*pixels)
+
+
+def _unknown_of_photographs(problem: Problem) -> list[str]:
+    """A line for each unknown that photographs held out have values of their own of."""
+    moved = {parameter.key for parameter in problem.parameters}
+    lines = {
+        EXPOSURE: "exposures of photographs were unknown: each rendering is measured after its best factors",
+        POSES: "poses of photographs were corrected; those that are held out have the ones that they were given",
+    }
+    return [line for key, line in lines.items() if key in moved]
+
+
+def _photographed(
+    problem: Problem, images: list[np.ndarray], vignetting: np.ndarray | None, exposed: bool
+) -> list[np.ndarray]:
+    """Renderings as the photographs' lens and exposures would have them."""
+    if vignetting is not None:
+        images = [image * falloff(vignetting, *image.shape[:2]) for image in images]
+    if exposed:
+        images = [_exposed(image, view) for image, view in zip(images, problem.views, strict=True)]
+    return images
 
 
 def _exposed(image: np.ndarray, view: Any) -> np.ndarray:

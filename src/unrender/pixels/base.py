@@ -132,7 +132,7 @@ def check_batch(owner: str, problem: Problem, count: int) -> None:
             f"pixels: {type(problem.loss).__name__} is of whole images, so it takes no pixel mini-batches; "
             "use unrender.pixels.All()"
         )
-    pixels = sum(np.asarray(view.reference).size // 3 for view in problem.views)
+    pixels = problem.pixels
     if count > max(_MOST_DRAWS * pixels, _FEWEST_REFUSED):
         raise InputError(
             f"{owner}: {count} pixels a step, but all views together have {pixels}; give fewer, or take unrender.pixels.All() "

@@ -132,7 +132,7 @@ class Views:
     def redraw(self, problem: Problem, state: ViewsState | None, key: Key) -> MiniBatch:
         """See `RepeatableSampler.redraw`."""
         chosen, weights = self._chosen(problem, state, key)
-        sizes = [math.prod(np.asarray(problem.views[view].reference).shape[:2]) for view in chosen]
+        sizes = [math.prod(problem.sizes[view]) for view in chosen]
         like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))
         views = arrays.like_integers(np.repeat(chosen, sizes), like)
         pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)

@@ -53,7 +53,7 @@ def html(problem: Problem) -> str:
 
 def describe_views(problem: Problem) -> str:
     """How many views there are, and of which sizes: 2 views of 128x128."""
-    sizes = sorted({np.asarray(view.reference).shape[1::-1] for view in problem.views})
+    sizes = sorted({(width, height) for height, width in problem.sizes})
     size = ", ".join(f"{width}x{height}" for width, height in sizes)
     return f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"
 

@@ -17,6 +17,7 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.evaluation.surfaces import Surface, surface_error
+from unrender.io.stored_pictures import PictureStore
 from unrender.losses import L2, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
@@ -31,7 +32,7 @@ from unrender.problem.mesh_checks import (
     mesh_notices,
 )
 from unrender.problem.parameter import Parameter
-from unrender.problem.references import References
+from unrender.problem.references import ON_DEVICE, References
 from unrender.problem.validation import (
     Bounds,
     CheckedParameter,
@@ -43,13 +44,14 @@ from unrender.problem.validation import (
     check_preconditioner,
     check_sequence,
     check_truth,
-    check_view,
     mesh_topology,
     open_renderer,
     renderer_notices,
 )
 from unrender.problem.view import View
-from unrender.rendering.exposure import EXPOSURE, ExposedRenderer, without_exposure
+from unrender.problem.view_checks import check_view, stored
+from unrender.rendering.camera_poses import POSES
+from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
 __all__ = ["Bounds", "Problem"]
@@ -78,7 +80,8 @@ class Problem:
 
     Attributes:
         parameters: tuple of `Parameter`, as given.
-        views: tuple of `View`, their reference a float32 array (H, W, 3), their mask (H, W) or None.
+        views: tuple of `View`, their reference a float32 array (H, W, 3), their mask (H, W) or None. Where all references
+            together take more than 512 MiB, they wait in a temporary file, and `np.asarray` reads one.
         renderer: what renders the scene.
         given_views: tuple of `View`, as given.
         origin: where it came from, to make it again: {"scene": path of the XML}, with "file", the path of the problem file, where there is
@@ -128,11 +131,11 @@ class Problem:
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
         keys = [parameter.key for parameter in self.parameters if isinstance(parameter.key, str)]
         self.renderer: Renderer = open_renderer(scene, max_depth, keys)
-        if any(parameter.key == EXPOSURE for parameter in self.parameters):
-            sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
-            rows = self.renderer.rows if isinstance(self.renderer, ExposedRenderer) else {}
-            if not rows.keys() >= set(sensors):  # else these are some of its views, and it keeps the rows of all
-                self.renderer = ExposedRenderer(without_exposure(self.renderer), sensors)
+        sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
+        try:
+            self.renderer = with_photographs(self.renderer, keys, sensors)
+        except InputError as error:
+            raise FieldError(("parameters", keys.index(POSES), "key"), str(error)) from error
 
         known = self.renderer.parameters()
         checked: dict[str, CheckedParameter] = {}
@@ -154,9 +157,8 @@ class Problem:
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
-        read = [check_view(n, view, self.renderer.resolutions()) for n, view in enumerate(self.given_views)]
-        self.views = tuple(view for view, _ in read)
-        self.notices += [notice for _, notices in read for notice in notices]
+        self.views, notices = self._read_views()
+        self.notices += notices
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth = self._checked_truth(truth or {})
         self.surfaces = dict(surfaces or {})
@@ -168,6 +170,17 @@ class Problem:
         self._references: dict[int, Array] = {}
         self._masks: dict[int, Array | None] = {}
         self._as_given: Problem | None = None
+
+    def _read_views(self) -> tuple[tuple[View, ...], list[str]]:
+        """The views with their pictures, and notices: in memory, or in a file where they are many."""
+        sizes, found, notices = self.renderer.resolutions(), [], []
+        known = [math.prod(sizes[v.sensor]) for v in self.given_views if v.sensor in range(len(sizes))]
+        store = PictureStore() if 12 * sum(known) > ON_DEVICE else None
+        for number, given in enumerate(self.given_views):
+            view, notes = check_view(number, given, sizes)
+            found.append(view if store is None else stored(view, store))
+            notices += notes
+        return tuple(found), notices
 
     def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """True values as arrays; adds to the notices."""
@@ -276,7 +289,13 @@ class Problem:
     @property
     def pixels(self) -> int:
         """Of all views together."""
-        return sum(math.prod(np.asarray(view.reference).shape[:2]) for view in self.views)
+        return sum(height * width for height, width in self.sizes)
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of each view."""
+        known = self.renderer.resolutions()
+        return [known[view.sensor] for view in self.views]
 
     def initial(self) -> Tree:
         """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""
@@ -304,16 +323,22 @@ class Problem:
 
     def reference(self, view: int) -> Array:
         """The view's reference as the renderer's array (H, W, 3)."""
-        if view not in self._references:
-            self._references[view] = self.renderer.array(np.asarray(self.views[view].reference))
-        return self._references[view]
+        if view in self._references:
+            return self._references[view]
+        found = self.renderer.array(np.asarray(self.views[view].reference))
+        if not self.references.in_host_memory:
+            self._references[view] = found
+        return found
 
     def mask(self, view: int) -> Array | None:
         """The view's mask as the renderer's array (H, W, 1), or None where every pixel counts."""
-        if view not in self._masks:
-            mask = self.views[view].mask
-            self._masks[view] = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
-        return self._masks[view]
+        if view in self._masks:
+            return self._masks[view]
+        mask = self.views[view].mask
+        found = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
+        if not self.references.in_host_memory:
+            self._masks[view] = found
+        return found
 
     def loss_value(self, view: int, image: Array) -> Array:
         """The view's part of the loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.io.stored_pictures import StoredPicture
 from unrender.problem.view import View
 
 __all__ = ["ON_DEVICE", "References"]
@@ -22,7 +22,8 @@ ON_DEVICE = 1 << 29
 class References:
     """Values and weights of single pixels of the references.
 
-    Small sets are copied to the renderer's device once. Large ones stay in host memory, and only the requested pixels are copied.
+    Small sets are copied to the renderer's device once. Of large ones only the requested pixels are, from host memory, or from
+    the file where pictures wait (`StoredPicture`).
 
     Args:
         views: with references (H, W, 3), masks (H, W) or None.
@@ -33,12 +34,9 @@ class References:
     def __init__(self, views: Sequence[View], array: Callable[[np.ndarray], Array], on_device: int = ON_DEVICE):
         self._views = views
         self._array = array
-        self._references = [np.asarray(view.reference).reshape(-1, 3) for view in views]
-        self._masks = [None if view.mask is None else np.asarray(view.mask).reshape(-1, 1) for view in views]
-        self._factors = [
-            view.weight / math.prod(reference.shape) for view, reference in zip(views, self._references, strict=True)
-        ]
-        self.in_host_memory = sum(reference.nbytes for reference in self._references) > on_device
+        self._sizes = [_size(view.reference) for view in views]
+        self._factors = [view.weight / size for view, size in zip(views, self._sizes, strict=True)]
+        self.in_host_memory = 4 * sum(self._sizes) > on_device
 
     @cached_property
     def sensors(self) -> Array:
@@ -69,27 +67,40 @@ class References:
         factors = np.empty((len(pixels), 1), np.float32)
         for view in np.unique(views):
             here = views == view
-            values[here] = self._references[view][pixels[here]]
-            mask = self._masks[view]
-            factors[here] = self._factors[view] * (1.0 if mask is None else mask[pixels[here]])
+            seen = self._views[view]
+            values[here] = _rows(seen.reference, pixels[here], 3)
+            factors[here] = self._factors[view] * (1.0 if seen.mask is None else _rows(seen.mask, pixels[here], 1))
         return self._array(values), self._array(factors)
 
     @cached_property
     def _all_references(self) -> Array:
-        return self._array(np.concatenate(self._references))
+        return self._array(np.concatenate([np.asarray(view.reference).reshape(-1, 3) for view in self._views]))
 
     @cached_property
     def _all_masks(self) -> Array | None:
-        if all(mask is None for mask in self._masks):
+        if all(view.mask is None for view in self._views):
             return None
-        pairs = zip(self._masks, self._references, strict=True)
-        return self._array(np.concatenate([np.ones((len(p), 1)) if m is None else m for m, p in pairs]))
+        pairs = zip(self._views, self._sizes, strict=True)
+        columns = [np.ones(size // 3) if view.mask is None else np.asarray(view.mask).ravel() for view, size in pairs]
+        return self._array(np.concatenate(columns)[:, None])
 
     @cached_property
     def _starts(self) -> Any:
-        sizes = [len(reference) for reference in self._references]
+        sizes = [size // 3 for size in self._sizes]
         return arrays.like_integers(np.cumsum([0, *sizes[:-1]]), self._array(np.zeros(1)))
 
     @cached_property
     def _view_factors(self) -> Array:
         return self._array(np.array(self._factors)[:, None])
+
+
+def _size(picture: Any) -> int:
+    """Of its values; a stored one is not read for it."""
+    return picture.size if isinstance(picture, StoredPicture) else np.asarray(picture).size
+
+
+def _rows(picture: Any, pixels: np.ndarray, channels: int) -> np.ndarray:
+    """The values of these pixels, (N, C)."""
+    if isinstance(picture, StoredPicture):
+        return picture.rows(pixels)
+    return np.asarray(picture).reshape(-1, channels)[pixels]

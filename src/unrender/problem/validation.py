@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,7 +15,7 @@ from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
-from unrender.io import bounded_files, images, parameter_values, scene_files
+from unrender.io import bounded_files, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
@@ -28,7 +28,6 @@ from unrender.problem.key_hints import instead_of, near_key
 from unrender.problem.mesh_checks import check_regularizer
 from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.parameter import Parameter
-from unrender.problem.view import View
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
 __all__ = [
@@ -42,7 +41,7 @@ __all__ = [
     "check_preconditioner",
     "check_sequence",
     "check_truth",
-    "check_view",
+    "is_number",
     "mesh_topology",
     "open_renderer",
     "renderer_notices",
@@ -156,7 +155,7 @@ def check_parameter(
         bounds = _bounds(parameter.bounds, info)
     rate = parameter.learning_rate
     with checking("learning_rate"):
-        if rate is not None and (not _is_number(rate) or rate <= 0):
+        if rate is not None and (not is_number(rate) or rate <= 0):
             raise InputError(f"expected a number above 0, got {rate!r}")
     preconditioner, parameterisation, transform, regularizer = None, None, None, None
     with checking("preconditioner"):
@@ -275,47 +274,6 @@ def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]
     return inside.astype(np.float32), notice
 
 
-def check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
-    """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
-
-    Args:
-        index: of the view in the problem, for messages.
-        view: as given.
-        resolutions: (height, width) of each sensor's film.
-    """
-    owner = f"view {index}"
-
-    def wrong(field: str, what: str | Exception) -> FieldError:
-        return FieldError(("views", index, field), str(what), f"{owner}: {field}")
-
-    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(resolutions):
-        have = f"0 to {len(resolutions) - 1}" if len(resolutions) > 1 else "0, the only sensor"
-        raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
-    if not _is_number(view.weight) or view.weight <= 0:
-        raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
-    height, width = resolutions[view.sensor]
-    try:
-        image = images.read(view.reference)
-        _check_size(image.values, height, width, view.sensor)
-    except InputError as error:
-        raise wrong("reference", error) from error
-    notices = [f"{owner}: reference {image.notice}"] if image.notice else []
-    reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
-    mask = None
-    if view.mask is not None:
-        try:
-            mask = images.read(view.mask, linearise=False).values
-            _check_size(mask, height, width, view.sensor)
-            mask = mask.mean(axis=2)
-            if mask.min() < 0 or mask.max() > 1:
-                raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
-            if not mask.any():
-                raise InputError("it is 0 everywhere: no pixel would count")
-        except InputError as error:
-            raise wrong("mask", error) from error
-    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
-
-
 def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> tuple[np.ndarray, str]:
     """The true value of a parameter, float32, and what was changed to make it fit, "" for nothing. Raises `FieldError`."""
     if key not in shapes:
@@ -387,13 +345,5 @@ def _bounds(given: Any, info: ParameterInfo) -> Bounds:
     return low, high
 
 
-def _is_number(x: Any) -> bool:
+def is_number(x: Any) -> bool:
     return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)
-
-
-def _check_size(values: np.ndarray, height: int, width: int, sensor: int) -> None:
-    if values.shape[:2] != (height, width):
-        raise InputError(
-            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
-            f"but the film of sensor {sensor} is {width}x{height}"
-        )

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from unrender.io.stored_pictures import StoredPicture
+
 __all__ = ["View"]
 
 
@@ -21,7 +23,7 @@ class View:
         mask: file or array (H, W), in [0, 1]; factor of each pixel's loss. None for all ones.
     """
 
-    reference: str | Path | np.ndarray
+    reference: str | Path | np.ndarray | StoredPicture
     sensor: int = 0
     weight: float = 1.0
-    mask: str | Path | np.ndarray | None = None
+    mask: str | Path | np.ndarray | StoredPicture | None = None

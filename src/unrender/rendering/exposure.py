@@ -25,7 +25,7 @@ from unrender.rendering.renderer import (
     differentiated,
 )
 
-__all__ = ["EXPOSURE", "ExposedPaths", "ExposedRenderer", "ExposedSession", "gains", "without_exposure"]
+__all__ = ["EXPOSURE", "ExposedPaths", "ExposedRenderer", "ExposedSession", "gains"]
 
 EXPOSURE = "exposure"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
@@ -35,11 +35,6 @@ _LN2 = math.log(2.0)
 def gains(exposure: np.ndarray) -> np.ndarray:
     """The factors of the views' pictures, (V, 3), of exposures in stops (V, 3): 2 ** (e - mean over views of e)."""
     return np.exp2(exposure - np.mean(exposure, axis=0, keepdims=True))
-
-
-def without_exposure(renderer: Renderer) -> Renderer:
-    """What renders the scene alone."""
-    return renderer.inner if isinstance(renderer, ExposedRenderer) else renderer
 
 
 class ExposedRenderer:

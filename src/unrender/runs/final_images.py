@@ -25,6 +25,8 @@ _SHARE, _LEAST_SECONDS = 0.05, 1.0
 _SENSITIVITY_SHARE = 0.5
 """Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
 _TRIAL_PATHS = 1 << 18
+_MOST_BYTES, _PICTURES = 1 << 29, 3
+"""Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
 
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
@@ -55,7 +57,7 @@ def render_pictures(problem: Problem, result: Result, spp: int | None = None) ->
 
 def render_final_images(problem: Problem, result: Result, spp: int | None = None) -> FinalImages:
     """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any; and how
-    much the views tell of each element of the parameters.
+    much the views tell of each element of the parameters. Of many large views, whose references are not held in memory, pictures of some.
 
     Each picture is rendered in two independent halves, which tell its error, by the view's mask, apart from its noise
     (`evaluation.debiased`).
@@ -71,8 +73,9 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
     errors: dict[str, tuple[float, float]] = {}
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result)
-        for index, view in enumerate(problem.views):
-            reference = np.asarray(view.reference, np.float32)
+        chosen = _chosen(problem)
+        for place, index in enumerate(chosen):
+            reference = np.asarray(problem.views[index].reference, np.float32)
             pictures[f"view{index}/reference"] = reference
             for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
                 name = image_name(index, which)
@@ -80,15 +83,26 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
                 pictures[name], error = _picture(of, values, index, samples, _SEEDS[which])
                 if error is not None:
                     errors[name] = error
-                advance((2 * index + done + 1) / (2 * len(problem.views)))
+                advance((2 * place + done + 1) / (2 * len(chosen)))
             if index in weights:
                 pictures[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
             if index in probabilities:
                 density = np.asarray(probabilities[index], np.float32)
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
         seconds = _SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS)
-        found = sensitivity(problem, result.parameters, seconds=seconds)
+        everything = len(chosen) == len(problem.views)
+        found = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
     return FinalImages(pictures, errors, samples, found)
+
+
+def _chosen(problem: Problem) -> list[int]:
+    """The views that have pictures: all, or evenly some of many large ones."""
+    largest = max(height * width for height, width in problem.sizes)
+    most = max(1, _MOST_BYTES // (_PICTURES * 12 * largest))
+    count = len(problem.views)
+    if not problem.references.in_host_memory or count <= most:
+        return list(range(count))
+    return sorted({round(place) for place in np.linspace(0, count - 1, most)})
 
 
 def image_name(view: int, which: str) -> str:
@@ -111,7 +125,7 @@ def _picture(
 
 def _affordable(problem: Problem, result: Result) -> int:
     """Samples per pixel that final pictures may have: what they take is measured on a few samples of the first view."""
-    sizes = [np.asarray(view.reference).size // 3 for view in problem.views]
+    sizes = [height * width for height, width in problem.sizes]
     most = min(min(max(_PICTURE_PATHS // size, _FEWEST), _MOST) for size in sizes)
     trial = _power_of_two(min(max(_TRIAL_PATHS // sizes[0], 1), most // 2))
     seconds = 0.0

@@ -293,7 +293,7 @@ def _images(run: Run) -> dict[str, np.ndarray]:
     """{"view0": (H, W, 3)} as the loss saw them, of the views that the last estimate has."""
     info = run.estimate.info if run.estimate is not None else {}
     found = {i: arrays.numpy(image) for i, image in info.get("images", {}).items() if i < _VIEWS}
-    wanted = {i: np.asarray(view.reference).shape for i, view in enumerate(run.problem.views)}
+    wanted = {i: (*size, 3) for i, size in enumerate(run.problem.sizes)}
     return {f"view{i}": reduced(image, _PICTURE) for i, image in found.items() if image.shape == wanted.get(i)}
 
 
@@ -303,7 +303,7 @@ def _views(run: Run) -> dict[str, np.ndarray]:
     for kind in ("control_weight", "pixel_probability"):
         for i, values in info.get(kind, {}).items():
             if i < _VIEWS and (array := arrays.numpy(values)).ndim in (2, 3):
-                size = np.asarray(run.problem.views[i].reference).shape[:2]
+                size = run.problem.sizes[i]
                 small = reduced(np.empty((*size, 0), np.float32), _PICTURE).shape[:2]
                 found[f"view{i}/{kind}"] = resize_nearest(reduced(array, _PICTURE), *small)
     return found

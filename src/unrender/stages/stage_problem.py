@@ -17,7 +17,7 @@ from unrender.problem.coarse_to_fine import NEVER, CoarseToFine
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
-from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.rendering.renderer import ParameterInfo
 from unrender.stages.stages_file import Stage, Stages
 
@@ -48,7 +48,7 @@ class Whole:
         """Of the stages' problem file.
 
         Raises:
-            InputError: it is malformed, a stage names what is no parameter of it, or leaves out an exposure.
+            InputError: it is malformed, a stage names what is no parameter of it, or leaves out what no scene can hold.
         """
         problem = Problem.from_file(stages.problem)
         known = problem.renderer.parameters()
@@ -113,14 +113,15 @@ class Whole:
 
 
 def _check(stages: Stages, keys: list[str]) -> None:
-    exposed = ""
+    moved: dict[str, str] = {}
     for stage in stages.stages:
         for key in stage.unknowns:
             if key not in keys:
                 hint = did_you_mean(key, keys) or f" ({', '.join(keys)})"
                 raise InputError(f"stage {stage.name}: {key} is no parameter of {stages.problem}{hint}")
-        if exposed and EXPOSURE not in stage.unknowns:
-            raise InputError(
-                f'stage {stage.name}: "{EXPOSURE}" is an unknown of stage {exposed}, and no scene can hold it: name it here, too'
-            )
-        exposed = exposed or (stage.name if EXPOSURE in stage.unknowns else "")
+        for key, first in moved.items():
+            if key not in stage.unknowns:
+                raise InputError(
+                    f'stage {stage.name}: "{key}" is an unknown of stage {first}, and no scene can hold it: name it here, too'
+                )
+        moved |= {key: stage.name for key in OF_PHOTOGRAPHS if key in stage.unknowns and key not in moved}

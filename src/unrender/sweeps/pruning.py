@@ -161,7 +161,7 @@ def _finite(error: float) -> float:
 
 
 def _picture_error(problem: Problem, values: Mapping[str, np.ndarray]) -> float:
-    pixels = sum(np.asarray(view.reference).size // 3 for view in problem.views)
+    pixels = problem.pixels
     spp = min(max(_PATHS // max(pixels, 1), 1), _MOST_SPP)
     found = []
     for index, view in enumerate(problem.views):

@@ -3,7 +3,17 @@
     {"type": "emissive", "sigma_t": volume, "emission": volume}
 
 Along a ray the radiance is ∫ T(t) σₜ(t) e(t) dt, with the extinction σₜ of `sigma_t` in inverse scene units, and the radiance e of
-`emission`, the same in all directions. Only the kernels of this package know of it: Mitsuba's own integrators take its light for
+`emission`: the same in all directions. With 3 or 8 volumes more, `emission_1` to `emission_3` or `emission_8`, all of them are
+coefficients of spherical harmonics of degree 1 or 2, and in the direction d
+
+    e(d) = s log(1 + exp(Σ_k c_k Y_k(d) / s)),    s = 0.05,
+
+which is positive, and the sum itself where this is well above s. c_0 is `emission`, c_k is `emission_k`, and Y_k are the real spherical
+harmonics over that of degree 0:
+
+    1,  √3 y, √3 z, √3 x,  √15 xy, √15 yz, √5 (3z² - 1)/2, √15 xz, √15 (x² - y²)/2.
+
+Only the kernels of this package know of it: Mitsuba's own integrators take its light for
 scattering.
 """
 
@@ -17,7 +27,13 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 
-__all__ = ["emits", "register"]
+__all__ = ["COEFFICIENT", "FUNCTIONS", "emits", "harmonics", "register"]
+
+COEFFICIENT = "emission_"
+"""What the names of the volumes beyond `emission` begin with."""
+FUNCTIONS = (1, 4, 9)
+"""Spherical harmonics up to degree 0, 1 and 2."""
+_SOFTNESS = 0.05
 
 
 def register() -> None:
@@ -38,6 +54,20 @@ def _volume(properties: Any, name: str) -> Any:
     return volume
 
 
+def harmonics(d: Any, count: int) -> list[Any]:
+    """The first 4 or 9 real spherical harmonics in the direction d, over that of degree 0."""
+    found = [1.0, 3**0.5 * d.y, 3**0.5 * d.z, 3**0.5 * d.x]
+    if count == 9:
+        found += [15**0.5 * d.x * d.y, 15**0.5 * d.y * d.z, 5**0.5 / 2 * (3 * d.z * d.z - 1)]
+        found += [15**0.5 * d.x * d.z, 15**0.5 / 2 * (d.x * d.x - d.y * d.y)]
+    return found
+
+
+def _positive(x: Any) -> Any:
+    """s log(1 + exp(x / s)), without overflow."""
+    return dr.maximum(x, 0) + _SOFTNESS * dr.log(1 + dr.exp(-dr.abs(x) / _SOFTNESS))
+
+
 @cache
 def _plugin(variant: str) -> type:
     del variant  # the base class is that of the variant that is set
@@ -51,12 +81,21 @@ def _plugin(variant: str) -> type:
             self.m_has_spectral_extinction = False
             self.sigma_t = _volume(properties, "sigma_t")
             self.emission = _volume(properties, "emission")
+            self.more = []
+            while f"{COEFFICIENT}{len(self.more) + 1}" in properties:
+                self.more.append(_volume(properties, f"{COEFFICIENT}{len(self.more) + 1}"))
+            if len(self.more) + 1 not in FUNCTIONS:
+                raise InputError(
+                    f"medium emissive: expected emission_1 to emission_3 or to emission_8, got {len(self.more)}"
+                )
             self.parameters_changed([])
 
         def traverse(self, callback: Any) -> None:
             super().traverse(callback)
             callback.put("sigma_t", self.sigma_t, mi.ParamFlags.Differentiable)
             callback.put("emission", self.emission, mi.ParamFlags.Differentiable)
+            for number, volume in enumerate(self.more, 1):
+                callback.put(f"{COEFFICIENT}{number}", volume, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any) -> None:
             del keys
@@ -70,7 +109,15 @@ def _plugin(variant: str) -> type:
 
         def get_scattering_coefficients(self, mei: Any, active: Any = True) -> Any:
             σₜ = self.sigma_t.eval(mei, active)
-            return σₜ * self.emission.eval(mei, active), self.majorant - σₜ, σₜ
+            return σₜ * self._radiance(mei, active), self.majorant - σₜ, σₜ
+
+        def _radiance(self, mei: Any, active: Any) -> Any:
+            found = self.emission.eval(mei, active)
+            if not self.more:
+                return found
+            for volume, Y in zip(self.more, harmonics(mei.wi, len(self.more) + 1)[1:], strict=True):
+                found = dr.fma(volume.eval(mei, active), Y, found)
+            return _positive(found)
 
         def intersect_aabb(self, ray: Any) -> Any:
             return self.sigma_t.bbox().ray_intersect(ray)

@@ -7,6 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
 __all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range"]
@@ -124,6 +125,8 @@ def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | No
             else (None, None)
         )
     if isinstance(node, mi.Medium):
+        if role == "emission" and f"{key.rpartition('.emission')[0]}.{COEFFICIENT}1.data" in parameters:
+            return None, None
         ranges = {"sigma_t": (0.0, None), "albedo": (0.0, 1.0), "emission": (0.0, None), "g": (-0.99, 0.99)}
         return ranges.get(role, (None, None))
     if not isinstance(node, mi.BSDF):

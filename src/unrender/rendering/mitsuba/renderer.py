@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
+from unrender.rendering.camera_poses import Camera
 from unrender.rendering.mitsuba import ignored, poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
@@ -86,6 +87,16 @@ class MitsubaRenderer:
     def resolutions(self) -> list[tuple[int, int]]:
         """(height, width) of each sensor's film, after cropping."""
         return self.pair.resolutions
+
+    def cameras(self) -> Mapping[int, Camera]:
+        """See `WithCameras.cameras`."""
+        found = {}
+        for index, sensor in enumerate(self.pair.current.sensors()):
+            keys = f"{sensor.id()}.rotation", f"{sensor.id()}.translation"
+            if keys[0] in self._poses:
+                place = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4, -1)[:3, 3, 0]
+                found[index] = Camera(*keys, place)
+        return found
 
     def array(self, values: np.ndarray) -> mi.TensorXf:
         """`mi.TensorXf` with these values, in memory of its own."""

@@ -1,0 +1,77 @@
+"""Checks of one view, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.io import images
+from unrender.io.stored_pictures import PictureStore, StoredPicture
+from unrender.problem.errors import FieldError
+from unrender.problem.validation import is_number
+from unrender.problem.view import View
+
+__all__ = ["check_view", "stored"]
+
+
+def check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
+    """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
+
+    Args:
+        index: of the view in the problem, for messages.
+        view: as given.
+        resolutions: (height, width) of each sensor's film.
+    """
+    owner = f"view {index}"
+
+    def wrong(field: str, what: str | Exception) -> FieldError:
+        return FieldError(("views", index, field), str(what), f"{owner}: {field}")
+
+    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(resolutions):
+        have = f"0 to {len(resolutions) - 1}" if len(resolutions) > 1 else "0, the only sensor"
+        raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
+    if not is_number(view.weight) or view.weight <= 0:
+        raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
+    height, width = resolutions[view.sensor]
+    notices: list[str] = []
+    try:
+        if isinstance(view.reference, StoredPicture):
+            _check_size(view.reference, height, width, view.sensor)
+            reference = view.reference
+        else:
+            image = images.read(view.reference)
+            _check_size(image.values, height, width, view.sensor)
+            notices += [f"{owner}: reference {image.notice}"] if image.notice else []
+            reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
+    except InputError as error:
+        raise wrong("reference", error) from error
+    mask = view.mask
+    if view.mask is not None and not isinstance(view.mask, StoredPicture):
+        try:
+            mask = images.read(view.mask, linearise=False).values
+            _check_size(mask, height, width, view.sensor)
+            mask = mask.mean(axis=2)
+            if mask.min() < 0 or mask.max() > 1:
+                raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
+            if not mask.any():
+                raise InputError("it is 0 everywhere: no pixel would count")
+        except InputError as error:
+            raise wrong("mask", error) from error
+    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
+
+
+def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sensor: int) -> None:
+    if values.shape[:2] != (height, width):
+        raise InputError(
+            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
+            f"but the film of sensor {sensor} is {width}x{height}"
+        )
+
+
+def stored(view: View, store: PictureStore) -> View:
+    """A view that was checked, with its pictures in a file."""
+    kept = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
+    return replace(view, **kept)

@@ -1,0 +1,70 @@
+"""What photographs have beside a scene: exposure, vignetting and corrections of their cameras' poses, as parameters around a renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from unrender.rendering.camera_poses import POSES, PosedCameras
+from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
+from unrender.rendering.renderer import Renderer
+from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
+
+__all__ = ["OF_PHOTOGRAPHS", "scene_renderer", "scene_values", "sensors_with_rows", "with_photographs"]
+
+OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE)
+"""Keys of parameters that no scene has, from the inside out."""
+_Wrapping = (ExposedRenderer, VignettedRenderer, PosedCameras)
+
+
+def scene_renderer(renderer: Renderer) -> Renderer:
+    """What renders the scene alone."""
+    while isinstance(renderer, _Wrapping):
+        renderer = renderer.inner
+    return renderer
+
+
+def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
+    """The sensors that have exposures or corrections, in the order of their rows; None where none has."""
+    while isinstance(renderer, _Wrapping):
+        if not isinstance(renderer, VignettedRenderer):
+            return tuple(renderer.rows)
+        renderer = renderer.inner
+    return None
+
+
+def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequence[int]) -> Renderer:
+    """The renderer with those parameters of photographs that are among the keys.
+
+    Args:
+        renderer: of a scene; or one that has these parameters, whose rows are kept where `sensors` are among them: they are of some of its
+            views then.
+        keys: of all parameters.
+        sensors: of the views.
+
+    Raises:
+        InputError: poses are among the keys, and the sensors cannot be moved.
+    """
+    wanted = [key for key in OF_PHOTOGRAPHS if key in keys]
+    if not wanted:
+        return renderer
+    rows = sensors_with_rows(renderer)
+    if set(wanted) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
+        return renderer
+    found = scene_renderer(renderer)
+    if POSES in wanted:
+        found = PosedCameras(found, list(sensors))
+    if VIGNETTING in wanted:
+        found = VignettedRenderer(found)
+    return ExposedRenderer(found, sensors) if EXPOSURE in wanted else found
+
+
+def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The values that a scene can hold: without exposures and vignetting, and with the poses of its cameras."""
+    found = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
+    while isinstance(renderer, _Wrapping):
+        if isinstance(renderer, PosedCameras) and POSES in values:
+            found |= renderer.corrections.poses(np.asarray(values[POSES]))
+        renderer = renderer.inner
+    return found
