@@ -45,8 +45,9 @@ _DEPTH = 0.5
 _RATES = {"extinction": 0.4, "light": 0.02, "emission": 0.02, **dict.fromkeys(_HARMONICS[1:], 0.005)}
 """First steps: of extinction in units of the cube's half side, of the others over the photographs' mean."""
 _COARSEST = 16
-_METHOD, _SETTINGS = "adaptive", {"scheme": "uniform", "pixels": 4096, "spp": 2, "beta_2": 0.99}
-"""Of the stages: mini-batches of pixels of all photographs."""
+_METHOD = "adaptive"
+_SETTINGS = {"scheme": "uniform", "pixels": 4096, "spp": 2, "beta_2": 0.99, "schedule": "exponential(50, 0.05)"}
+"""Of the stages: mini-batches of pixels of all photographs, and rates that fall, since their noise does not."""
 _LIGHT_SIZE = 16, 32
 _WHOLE = 0.999
 
