@@ -494,9 +494,8 @@ def test_a_control_variate_found_at_whole_views_now_and_then() -> None:
         found, state = estimator.estimate(asked, asked.initial(), state, Key(0, step))
         whole.append(bool(found.info["images"]))
     assert whole == [True, False, False, False, False] * 2 + [True]
-    rendered = np.concatenate(
-        [memory.image.reshape(-1, 3) for memory in state.image.views]
-    )  # after a step of whole views
+    # After a step of whole views.
+    rendered = np.concatenate([memory.image.reshape(-1, 3) for memory in state.image.views])
     np.testing.assert_array_equal(state.image.snapshot.image, rendered)
 
 
@@ -508,7 +507,8 @@ def test_a_snapshot_remembers_what_mini_batches_render_of_its_state(planted: boo
     assert isinstance(renderer, AnalyticRenderer)
     moved = {key: value + 0.2 for key, value in start.items()}
     image = ur.images.RecursiveControlVariate()
-    rows, last = np.random.default_rng(0).integers(0, asked.pixels, 40), {}
+    rows = np.random.default_rng(0).integers(0, asked.pixels, 40)
+    variance = np.zeros(0)
     drawn = PixelSample(np.zeros(40, np.uint32), rows.astype(np.uint32), np.ones((40, 1)))
     found: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for seed in range(400):
@@ -519,8 +519,9 @@ def test_a_snapshot_remembers_what_mini_batches_render_of_its_state(planted: boo
         _, told = image.estimate(asked, moved, state, PixelBatch(asked, drawn), 2, 2, Key(seed, 1))
         after = image.learn(asked, state, drawn, told)
         for learnt, each in ((False, state), (True, after)):
+            assert each.snapshot is not None
             found[learnt].append(np.asarray(each.snapshot.image))
-        last = after.snapshot
+            variance = np.asarray(each.snapshot.relative_variance)
     learnt, exact = np.array(found[True]), renderer.exact(start).reshape(-1, 3)
     error = np.sqrt(learnt.var(0, ddof=1) / len(learnt))
     worst = np.abs((learnt.mean(0) - exact) / error).max()
@@ -528,7 +529,7 @@ def test_a_snapshot_remembers_what_mini_batches_render_of_its_state(planted: boo
     if planted:
         return
     times = np.bincount(rows, minlength=asked.pixels)
-    np.testing.assert_allclose(last.relative_variance, np.repeat(1 / (1 + times[:, None]), 3, axis=1))
+    np.testing.assert_allclose(variance, np.repeat(1 / (1 + times[:, None]), 3, axis=1))
     ratio = (learnt.var(0) / np.array(found[False]).var(0)).mean(1)
     assert abs(np.mean(ratio * (1 + times)) - 1) < 0.1
 

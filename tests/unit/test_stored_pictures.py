@@ -18,7 +18,7 @@ def pictures() -> dict[str, tuple[np.ndarray, int]]:
     return {
         "half": (rng.uniform(0, 3, (5, 7, 3)).astype(np.float16).astype(np.float32), 2),
         "float": (rng.uniform(0, 3, (5, 7, 3)).astype(np.float32), 4),
-        "mask": (np.float32(rng.integers(0, 256, (5, 7)) / 255), 1),
+        "mask": ((rng.integers(0, 256, (5, 7)) / 255).astype(np.float32), 1),
         "soft": (rng.uniform(0, 1, (90, 7)).astype(np.float32), 4),
         "bright": (np.full((2, 2, 3), 1e6, np.float32), 4),
     }
@@ -73,6 +73,6 @@ def test_a_problem_whose_pictures_wait_in_a_file_is_the_same(monkeypatch: pytest
             results.append(found.parameters["map"])
         assert bool(problem._references) == (most != 10)
         again = ur.Problem(renderer, [ur.Parameter("map", 0.5)], problem.views, max_depth=1)
-        np.testing.assert_array_equal(np.asarray(again.views[1].mask), np.float32(views[1].mask))
+        np.testing.assert_array_equal(np.asarray(again.views[1].mask), np.asarray(views[1].mask, np.float32))
     np.testing.assert_allclose(results[0], results[2], rtol=1e-6)
     np.testing.assert_allclose(results[1], results[3], rtol=1e-6)

@@ -36,9 +36,10 @@ def gradients(problem: ur.Problem, estimator: Any, path: list[dict[str, Any]], r
     """(runs, n) gradients at the end of the line by as many seeds, and the paths of one."""
     rows, samples = [], 0
     for run in range(runs):
-        state, estimate = estimator.init(problem, path[0]), None
-        for step, at in enumerate(path):
-            estimate, state = estimator.estimate(problem, at, state, Key(run, step))
+        state = estimator.init(problem, path[0])
+        for step, at in enumerate(path[:-1]):
+            _, state = estimator.estimate(problem, at, state, Key(run, step))
+        estimate, _ = estimator.estimate(problem, path[-1], state, Key(run, len(path) - 1))
         pulled = problem.coordinates.pull_back(estimate.gradient, problem.coordinates.slopes(path[-1]))
         rows.append(np.concatenate([np.array(g).ravel() for g in pulled.values()]))
         samples = estimate.info["samples"]
