@@ -69,10 +69,11 @@ def test_settings_that_cannot_be_meant_are_refused_in_one_line(
     assert not (problem.parent / "out").exists()
 
 
-def test_a_pose_under_path_gradients_names_the_method(problem: Path, mitsuba_variant: str) -> None:
+def test_a_sensor_under_a_shared_path_names_the_methods(problem: Path, mitsuba_variant: str) -> None:
     del mitsuba_variant
-    made = problem.parent / "pose.toml"
-    text = problem.read_text().replace("wall.bsdf.reflectance.value", "wall.rotation.y").replace("truth", "# truth")
+    made, scene = problem.parent / "pose.toml", problem.parent / "wall.xml"
+    scene.write_text(scene.read_text().replace("<sensor ", '<sensor id="sensor" '))
+    text = problem.read_text().replace("wall.bsdf.reflectance.value", "sensor.rotation.y").replace("truth", "# truth")
     made.write_text(text)
     with pytest.raises(ur.InputError, match="--method smoothed"):
         ur.optimize(ur.Problem.from_file(made), "rcv", steps=1)

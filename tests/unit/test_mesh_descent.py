@@ -325,7 +325,8 @@ def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
 def test_whole_views_are_drawn_evenly() -> None:
     shapes = [(2, 3), (4, 4), (1, 5), (3, 3), (2, 2)]
     problem = SimpleNamespace(
-        views=[SimpleNamespace(reference=np.zeros((*shape, 3))) for shape in shapes],
+        views=shapes,
+        sizes=shapes,
         renderer=SimpleNamespace(array=lambda values: values),
     )
     seen = np.zeros(5)

@@ -132,7 +132,8 @@ class Views:
     def redraw(self, problem: Problem, state: ViewsState | None, key: Key) -> MiniBatch:
         """See `RepeatableSampler.redraw`."""
         chosen, weights = self._chosen(problem, state, key)
-        sizes = [math.prod(problem.sizes[view]) for view in chosen]
+        known = problem.sizes
+        sizes = [math.prod(known[view]) for view in chosen]
         like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))
         views = arrays.like_integers(np.repeat(chosen, sizes), like)
         pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)

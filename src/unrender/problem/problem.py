@@ -174,7 +174,11 @@ class Problem:
     def _read_views(self) -> tuple[tuple[View, ...], list[str]]:
         """The views with their pictures, and notices: in memory, or in a file where they are many."""
         sizes, found, notices = self.renderer.resolutions(), [], []
-        known = [math.prod(sizes[v.sensor]) for v in self.given_views if v.sensor in range(len(sizes))]
+        known = [
+            math.prod(sizes[v.sensor])
+            for v in self.given_views
+            if isinstance(v.sensor, int) and 0 <= v.sensor < len(sizes)
+        ]
         store = PictureStore() if 12 * sum(known) > ON_DEVICE else None
         for number, given in enumerate(self.given_views):
             view, notes = check_view(number, given, sizes)
