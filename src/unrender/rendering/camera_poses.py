@@ -14,6 +14,7 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
     CountingSession,
     ParameterInfo,
@@ -121,7 +122,7 @@ class Corrections:
         return self.projected(rows)
 
 
-class PosedCameras:
+class PosedCameras(WithParameter):
     """A renderer whose cameras have one parameter together, `poses` (V, 6): see `Corrections`.
 
     Images and batches are as unbiased as the inner renderer's, and gradients, too. `tangent_moment` leaves the poses out. Two states share
@@ -139,40 +140,25 @@ class PosedCameras:
         InputError: fewer than 3 sensors, one that cannot be moved, or a renderer that does not know where they stand.
     """
 
+    key = POSES
+
     def __init__(self, inner: Renderer, sensors: list[int]):
         known = inner.cameras() if isinstance(inner, WithCameras) else {}
         if missing := next((sensor for sensor in sensors if sensor not in known), None):
             raise InputError(
                 f"{POSES}: sensor {missing} cannot be moved; expected a perspective sensor with an id of its own"
             )
-        self.inner = inner
+        super().__init__(inner)
         self.rows = {sensor: row for row, sensor in enumerate(dict.fromkeys(sensors))}
         self.corrections = Corrections({sensor: known[sensor] for sensor in self.rows})
-        self.notices = tuple(getattr(inner, "notices", ()))
 
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
-        known = self.inner.parameters()
+    def info(self) -> ParameterInfo:
+        """See `WithParameter.info`: (V, 6)."""
         first = next(iter(self.corrections.cameras.values()))
-        of = known[first.translation]
-        info = ParameterInfo(
+        of = self.inner.parameters()[first.translation]
+        return ParameterInfo(
             self.corrections.shape, of.differentiable, False, "it moves sensors", perturbable=True, viewpoint=True
         )
-        return {**known, POSES: info}
-
-    def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`. Corrections are 0."""
-        found = self.inner.values([key for key in keys if key != POSES])
-        nothing = self.array(np.zeros(self.corrections.shape, np.float32))
-        return {key: nothing if key == POSES else found[key] for key in keys}
-
-    def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
-        return self.inner.resolutions()
-
-    def array(self, values: np.ndarray) -> Array:
-        """See `Renderer.array`."""
-        return self.inner.array(values)
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True

@@ -8,6 +8,7 @@ import numpy as np
 
 from unrender.rendering.camera_poses import POSES, PosedCameras
 from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
+from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
 
@@ -15,19 +16,18 @@ __all__ = ["OF_PHOTOGRAPHS", "scene_renderer", "scene_values", "sensors_with_row
 
 OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE)
 """Keys of parameters that no scene has, from the inside out."""
-_Wrapping = (ExposedRenderer, VignettedRenderer, PosedCameras)
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
     """What renders the scene alone."""
-    while isinstance(renderer, _Wrapping):
+    while isinstance(renderer, WithParameter):
         renderer = renderer.inner
     return renderer
 
 
 def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
     """The sensors that have exposures or corrections, in the order of their rows; None where none has."""
-    while isinstance(renderer, _Wrapping):
+    while isinstance(renderer, WithParameter):
         if not isinstance(renderer, VignettedRenderer):
             return tuple(renderer.rows)
         renderer = renderer.inner
@@ -63,7 +63,7 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The values that a scene can hold: without exposures and vignetting, and with the poses of its cameras."""
     found = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
-    while isinstance(renderer, _Wrapping):
+    while isinstance(renderer, WithParameter):
         if isinstance(renderer, PosedCameras) and POSES in values:
             found |= renderer.corrections.poses(np.asarray(values[POSES]))
         renderer = renderer.inner

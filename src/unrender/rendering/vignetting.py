@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
-from unrender.core.trees import Tree
-from unrender.rendering.renderer import (
-    CountingSession,
-    ParameterInfo,
-    Renderer,
-    Rendering,
-    RenderSession,
-    SampleRequest,
-    Space,
-    differentiated,
-)
+from unrender.rendering.picture_factors import PictureFactors
+from unrender.rendering.renderer import ParameterInfo, Renderer, SampleRequest
 
-__all__ = ["VIGNETTING", "VignettedPaths", "VignettedRenderer", "VignettedSession", "falloff", "powers"]
+__all__ = ["VIGNETTING", "VignettedRenderer", "falloff", "powers"]
 
 VIGNETTING = "vignetting"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
@@ -44,7 +31,7 @@ def falloff(vignetting: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.exp2(powers(height, width) @ vignetting).reshape(height, width, 1)
 
 
-class VignettedRenderer:
+class VignettedRenderer(PictureFactors):
     """A renderer whose pictures are darker towards their corners, all in the same way: the lens of a capture.
 
     The parameter `vignetting` (3,) holds a₁, a₂ and a₃, in stops: a pixel at the distance r from the middle of its film, 1 at the corners,
@@ -54,9 +41,7 @@ class VignettedRenderer:
 
     The middle is as it is, so no brightness of all photographs can hide in it.
 
-    Images, pairs and batches are unbiased, adjoints the exact derivative of the images that are returned. `tangent_moment` leaves out the
-    products of this parameter's tangent with others, whose mean over independent signs is 0, and takes the mean of a pixel's samples for
-    each: exact for one sample.
+    See `PictureFactors` for biases.
 
     Args:
         inner: what renders the scene.
@@ -65,40 +50,19 @@ class VignettedRenderer:
         notices: of the inner renderer.
     """
 
+    key = VIGNETTING
+
     def __init__(self, inner: Renderer):
-        self.inner = inner
-        self.notices = tuple(getattr(inner, "notices", ()))
+        super().__init__(inner)
         self._powers: dict[tuple[int, int], Array] = {}
         self._all: tuple[Array, Array] | None = None
 
-    def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
-        return {**self.inner.parameters(), VIGNETTING: ParameterInfo((_TERMS,))}
+    def info(self) -> ParameterInfo:
+        """See `WithParameter.info`: stops, (3,)."""
+        return ParameterInfo((_TERMS,))
 
-    def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`. Vignetting is 0."""
-        found = self.inner.values([key for key in keys if key != VIGNETTING])
-        nothing = self.array(np.zeros(_TERMS, np.float32))
-        return {key: nothing if key == VIGNETTING else found[key] for key in keys}
-
-    def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
-        return self.inner.resolutions()
-
-    def array(self, values: np.ndarray) -> Array:
-        """See `Renderer.array`."""
-        return self.inner.array(values)
-
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
-        """See `Renderer.prepare`."""
-        own = [key for key in keys if key != VIGNETTING]
-        session = self.inner.prepare(own, space, differentiated(own, derivatives))
-        return session if len(own) == len(keys) else VignettedSession(self, session)
-
-    def powers_of(self, request: SampleRequest) -> Array:
-        """r², r⁴ and r⁶ of the chosen pixels, (N, 3), or of all of the film, (H W, 3)."""
+    def places(self, request: SampleRequest) -> Array:
+        """See `PictureFactors.places`: r², r⁴ and r⁶ of the chosen pixels, (N, 3), or of all of the film, (H W, 3)."""
         if request.pixels is None:
             return self._film(self.resolutions()[request.sensor])
         if request.sensors is None:
@@ -121,94 +85,25 @@ class VignettedRenderer:
             self._all = table, arrays.like_integers(starts, self.array(np.zeros(1)))
         return self._all
 
+    def factors(self, values: Array, places: Array, like: Array) -> Array:
+        """See `PictureFactors.factors`: (H, W, 1) or (N, 1)."""
+        return _laid(arrays.exp(_stops(values, places) * _LN2), like)
 
-@dataclass(frozen=True)
-class VignettedPaths:
-    """What `adjoint` needs to walk the paths of a rendering again.
+    def factors_of_batch(self, values: np.ndarray, sensor: int) -> np.ndarray:
+        """See `PictureFactors.factors_of_batch`: (n, H, W, 1)."""
+        size = self.resolutions()[sensor]
+        return np.stack([falloff(one, *size) for one in values])
 
-    Attributes:
-        inner: of the inner renderer.
-        powers: of its pixels, (N, 3).
-        images, previous: before the vignetting, as in `Rendering`.
-    """
+    def along(self, tangent: Array, places: Array, images: Array) -> Array:
+        """See `PictureFactors.along`."""
+        return _laid(_stops(tangent, places), images) * (_LN2 * images)
 
-    inner: object
-    powers: Array
-    images: Array
-    previous: Array | None = None
-
-
-class VignettedSession:
-    """Images and derivatives with respect to the vignetting and to the parameters of a session. See `RenderSession`."""
-
-    def __init__(self, renderer: VignettedRenderer, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
-
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(_scene(parameters), request)
-        powers_ = self._renderer.powers_of(request)
-        images = found.images * _factors(parameters, powers_, found.images)
-        return Rendering(images, None, VignettedPaths(found.paths, powers_, found.images))
-
-    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
-        size = self._renderer.resolutions()[request.sensor]
-        factors = np.stack([falloff(one, *size) for one in np.asarray(parameters[VIGNETTING])])
-        if scene := _scene(parameters):
-            images = self._inner.image_batch(scene, request)
-        else:
-            images = self._inner.image({}, replace(request, groups=1)).images
-        return images * self._renderer.array(factors)
-
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(_scene(current), _scene(previous), request, space)
-        if found.previous is None:
-            raise InputError("vignetting: the renderer returned one image of the two")
-        powers_ = self._renderer.powers_of(request)
-        images = (
-            found.images * _factors(current, powers_, found.images),
-            found.previous * _factors(previous, powers_, found.previous),
-        )
-        return Rendering(*images, VignettedPaths(found.paths, powers_, found.images, found.previous))
-
-    def adjoint(self, parameters: Tree, paths: VignettedPaths, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        weighted = weights * _factors(parameters, paths.powers, weights)
-        scene = _scene(parameters)
-        found = self._inner.adjoint(scene, paths.inner, weighted) if scene else {}
-        return _ordered(parameters, found, _gradient(paths.powers, weighted * paths.images))
-
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: VignettedPaths, weights: Array, weights_previous: Array
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        now = weights * _factors(current, paths.powers, weights)
-        before = weights_previous * _factors(previous, paths.powers, weights_previous)
-        states = _scene(current), _scene(previous)
-        found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
-        own, own_previous = (
-            _gradient(paths.powers, now * paths.images),
-            _gradient(paths.powers, before * paths.previous),
-        )
-        return _ordered(current, found[0], own), _ordered(previous, found[1], own_previous)
-
-    def tangent_moment(self, parameters: Tree, paths: VignettedPaths, tangents: Tree) -> Array:
-        """See `RenderSession.tangent_moment`, and `VignettedRenderer` for what is left out."""
-        images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
-        along = _laid(_stops(tangents[VIGNETTING], paths.powers), images) * (_LN2 * images)
-        moment = along * along
-        if scene := _scene(parameters):
-            moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents))
-        factors = _factors(parameters, paths.powers, images)
-        return moment * (factors * factors)
-
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        if isinstance(self._inner, CountingSession):
-            return self._inner.vertices(_scene(parameters), request)
-        return self._inner.image(_scene(parameters), replace(request, groups=1)).images[0] * 0.0 + 1.0
+    def gradient(self, values: Array, places: Array, weighted: Array) -> Array:
+        """See `PictureFactors.gradient`: ln 2 times the sum over pixels and channels of weight, image and power."""
+        del values
+        parts = arrays.mean_over_first(weighted)
+        of_pixels = arrays.sum_over_last(arrays.reshape(parts, (arrays.shape(places)[0], 3)))
+        return arrays.reshape(arrays.sum_over_rows(places * of_pixels), (_TERMS,)) * _LN2
 
 
 def _stops(vignetting: Array, powers_: Array) -> Array:
@@ -221,22 +116,3 @@ def _laid(values: Array, like: Array) -> Array:
     shape = arrays.shape(like)
     sides = shape[-3:-1] if len(shape) > 2 and shape[-2] * shape[-3] == arrays.shape(values)[0] else shape[-2:-1]
     return arrays.reshape(values, (*sides, 1))
-
-
-def _factors(parameters: Tree, powers_: Array, like: Array) -> Array:
-    return _laid(arrays.exp(_stops(parameters[VIGNETTING], powers_) * _LN2), like)
-
-
-def _gradient(powers_: Array, weighted: Array) -> Array:
-    """From weight times image (groups, ..., 3): ln 2 times the sum over pixels and channels of weight, image and power."""
-    parts = arrays.mean_over_first(weighted)
-    of_pixels = arrays.sum_over_last(arrays.reshape(parts, (arrays.shape(powers_)[0], 3)))
-    return arrays.reshape(arrays.sum_over_rows(powers_ * of_pixels), (_TERMS,)) * _LN2
-
-
-def _scene(parameters: Tree) -> Tree:
-    return {key: value for key, value in parameters.items() if key != VIGNETTING}
-
-
-def _ordered(parameters: Tree, found: Tree, own: Array) -> Tree:
-    return {key: own if key == VIGNETTING else found[key] for key in parameters}

@@ -1,0 +1,202 @@
+"""Renderers with one parameter more than the scene's: any such, and those whose parameter multiplies the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import (
+    CountingSession,
+    ParameterInfo,
+    Renderer,
+    Rendering,
+    RenderSession,
+    SampleRequest,
+    Space,
+    differentiated,
+)
+
+__all__ = ["FactorPaths", "FactorSession", "PictureFactors", "WithParameter"]
+
+
+class WithParameter:
+    """A renderer with one parameter more than the one inside it, 0 at first.
+
+    Args:
+        inner: what renders the scene.
+
+    Attributes:
+        key: of the parameter. No scene has it: Mitsuba's keys have a dot.
+        notices: of the inner renderer.
+    """
+
+    key: ClassVar[str]
+
+    def __init__(self, inner: Renderer):
+        self.inner = inner
+        self.notices = tuple(getattr(inner, "notices", ()))
+
+    def info(self) -> ParameterInfo:
+        """Of the parameter."""
+        raise NotImplementedError
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """See `Renderer.parameters`."""
+        return {**self.inner.parameters(), self.key: self.info()}
+
+    def values(self, keys: list[str]) -> Tree:
+        """See `Renderer.values`."""
+        found = self.inner.values([key for key in keys if key != self.key])
+        nothing = self.array(np.zeros(self.info().shape, np.float32))
+        return {key: nothing if key == self.key else found[key] for key in keys}
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """See `Renderer.resolutions`."""
+        return self.inner.resolutions()
+
+    def array(self, values: np.ndarray) -> Array:
+        """See `Renderer.array`."""
+        return self.inner.array(values)
+
+
+class PictureFactors(WithParameter):
+    """A renderer whose pictures are multiplied, pixel by pixel, by a function of its parameter.
+
+    Images, pairs and batches are unbiased, adjoints the exact derivative of the images that are returned. `tangent_moment` leaves out the
+    products of this parameter's tangent with others, whose mean over independent signs is 0, and takes the mean of a pixel's samples for
+    each: exact for one sample.
+    """
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        """See `Renderer.prepare`."""
+        own = [key for key in keys if key != self.key]
+        session = self.inner.prepare(own, space, differentiated(own, derivatives))
+        return session if len(own) == len(keys) else FactorSession(self, session)
+
+    def places(self, request: SampleRequest) -> Array:
+        """What the factors of the pixels of a rendering depend on, beside the parameter."""
+        raise NotImplementedError
+
+    def factors(self, values: Array, places: Array, like: Array) -> Array:
+        """Of the parameter's values, as they multiply images such as `like`."""
+        raise NotImplementedError
+
+    def factors_of_batch(self, values: np.ndarray, sensor: int) -> np.ndarray:
+        """Of n values of the parameter, first axis, for whole pictures (n, H, W, 3) or what is broadcast to them."""
+        raise NotImplementedError
+
+    def along(self, tangent: Array, places: Array, images: Array) -> Array:
+        """The derivative along a tangent of the logarithms of the factors, times images."""
+        raise NotImplementedError
+
+    def gradient(self, values: Array, places: Array, weighted: Array) -> Array:
+        """By the parameter, from weight times image times factor (groups, ..., 3)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class FactorPaths:
+    """What `adjoint` needs to walk the paths of a rendering again.
+
+    Attributes:
+        inner: of the inner renderer.
+        places: of the pixels, see `PictureFactors.places`.
+        images, previous: before the factors, as in `Rendering`.
+    """
+
+    inner: object
+    places: Array
+    images: Array
+    previous: Array | None = None
+
+
+class FactorSession:
+    """Images and derivatives with respect to what multiplies them and to the parameters of a session. See `RenderSession`."""
+
+    def __init__(self, renderer: PictureFactors, inner: RenderSession):
+        self._renderer, self._inner = renderer, inner
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `RenderSession.image`."""
+        found = self._inner.image(self._scene(parameters), request)
+        places = self._renderer.places(request)
+        images = found.images * self._factors(parameters, places, found.images)
+        return Rendering(images, None, FactorPaths(found.paths, places, found.images))
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `RenderSession.image_batch`."""
+        renderer = self._renderer
+        factors = renderer.factors_of_batch(np.asarray(parameters[renderer.key]), request.sensor)
+        if scene := self._scene(parameters):
+            images = self._inner.image_batch(scene, request)
+        else:
+            images = self._inner.image({}, replace(request, groups=1)).images
+        return images * renderer.array(factors)
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `RenderSession.image_pair`."""
+        found = self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
+        if found.previous is None:
+            raise InputError(f"{self._renderer.key}: the renderer returned one image of the two")
+        places = self._renderer.places(request)
+        images = found.images * self._factors(current, places, found.images)
+        before = found.previous * self._factors(previous, places, found.previous)
+        return Rendering(images, before, FactorPaths(found.paths, places, found.images, found.previous))
+
+    def adjoint(self, parameters: Tree, paths: FactorPaths, weights: Array) -> Tree:
+        """See `RenderSession.adjoint`."""
+        weighted = weights * self._factors(parameters, paths.places, weights)
+        scene = self._scene(parameters)
+        found = self._inner.adjoint(scene, paths.inner, weighted) if scene else {}
+        return self._ordered(parameters, found, paths.places, weighted * paths.images)
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: FactorPaths, weights: Array, weights_previous: Array
+    ) -> tuple[Tree, Tree]:
+        """See `RenderSession.adjoint_pair`."""
+        now = weights * self._factors(current, paths.places, weights)
+        before = weights_previous * self._factors(previous, paths.places, weights_previous)
+        states = self._scene(current), self._scene(previous)
+        found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
+        return (
+            self._ordered(current, found[0], paths.places, now * paths.images),
+            self._ordered(previous, found[1], paths.places, before * paths.previous),
+        )
+
+    def tangent_moment(self, parameters: Tree, paths: FactorPaths, tangents: Tree) -> Array:
+        """See `RenderSession.tangent_moment`, and `PictureFactors` for what is left out."""
+        renderer = self._renderer
+        images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
+        along = renderer.along(tangents[renderer.key], paths.places, images)
+        moment = along * along
+        if scene := self._scene(parameters):
+            moment = moment + self._inner.tangent_moment(scene, paths.inner, self._scene(tangents))
+        factors = self._factors(parameters, paths.places, images)
+        return moment * (factors * factors)
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `CountingSession.vertices`: ones where the inner session does not count."""
+        if isinstance(self._inner, CountingSession):
+            return self._inner.vertices(self._scene(parameters), request)
+        return self._inner.image(self._scene(parameters), replace(request, groups=1)).images[0] * 0.0 + 1.0
+
+    def _factors(self, parameters: Tree, places: Array, like: Array) -> Array:
+        return self._renderer.factors(parameters[self._renderer.key], places, like)
+
+    def _scene(self, parameters: Tree) -> Tree:
+        return {key: value for key, value in parameters.items() if key != self._renderer.key}
+
+    def _ordered(self, parameters: Tree, found: Tree, places: Array, weighted: Array) -> Tree:
+        key = self._renderer.key
+        own = self._renderer.gradient(parameters[key], places, weighted)
+        return {name: own if name == key else found[name] for name in parameters}
