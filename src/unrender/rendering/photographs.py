@@ -28,7 +28,7 @@ def scene_renderer(renderer: Renderer) -> Renderer:
 def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
     """The sensors that have exposures or corrections, in the order of their rows; None where none has."""
     while isinstance(renderer, WithParameter):
-        if not isinstance(renderer, VignettedRenderer):
+        if isinstance(renderer, (ExposedRenderer, PosedCameras)):
             return tuple(renderer.rows)
         renderer = renderer.inner
     return None
