@@ -114,7 +114,7 @@ def estimator(problem: ur.Problem, combination: tuple[bool, ...], sigma: float) 
         return path
     annealed = ur.schedules.Exponential(25, 0.1)
     smoothed = ur.SmoothedDerivatives(sigma, SAMPLES, spp=SPP, schedule=annealed, debiased=True)
-    return ur.HybridGradient(path, smoothed, poses)
+    return ur.HybridGradient(path, smoothed, poses, averaged=gradients)
 
 
 def entrants(problem: ur.Problem, name: str, only: tuple[str, ...] | None) -> list[Entrant]:

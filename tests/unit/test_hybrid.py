@@ -159,11 +159,23 @@ def test_all_four_recover_both_and_resume_to_the_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(ended.parameters[key], value)
 
 
-def test_what_is_perturbed_has_running_means_where_the_path_has_a_memory() -> None:
+def test_the_variance_of_what_is_perturbed_is_a_mean_square() -> None:
+    """So that MetaAdam's steps are no longer than its learning rate."""
+    asked = problem(noise=0.0)
+    estimator = ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(samples=64))
+    found = ur.estimate(asked, estimator)
+    assert found.variance is not None
+    assert (found.variance["pose"] > found.gradient["pose"] ** 2).all()
+    state = (optimizer := ur.optimizers.MetaAdam(0.1)).init(asked.initial())
+    steps, _ = optimizer.update(found, state, asked.initial())
+    assert (np.abs(steps["pose"]) < 0.1).all()
+
+
+def test_what_is_perturbed_has_running_means_where_asked_for() -> None:
     """So that MetaAdam's steps are Adam's, and no longer than its learning rate."""
     asked, at = problem(noise=0.0), problem().initial()
     hybrid, alone = (
-        ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed()),
+        ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(), averaged=True),
         ur.HybridGradient(perturbed=smoothed()),
     )
     state, own = hybrid.init(asked, at), alone.init(asked, at)

@@ -48,8 +48,8 @@ class HybridState:
     Attributes:
         path: of the path gradients.
         perturbed: of the smoothed derivatives.
-        mean, square: running means of the gradient by the second parameters, and of its square, not debiased; {} where `path` provides no
-            variance.
+        mean, square: running means of the gradient by the second parameters, and of its square, not debiased; {} where it is not
+            `averaged`.
         step: estimates made so far, since these began.
     """
 
@@ -97,15 +97,18 @@ class HybridGradient:
 
     The two kinds of steps have no common scale: give the second learning rates of their own.
 
-    Provides a gradient, and its variance where `path` does: for the second parameters then the running mean of the gradients of about ten
-    steps, and as variance that of their squares, debiased, so that `MetaAdam` takes Adam's steps there. Differences of the smoothed loss
-    between two steps, which a memory of path gradients follows, are not rendered: such a mean lags behind by some steps. The
-    loss is that of `path`.
+    Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
+    gradient, which is what a meta-estimate has of as many samples. By the variance alone, which is small where perturbations agree,
+    `MetaAdam` would take steps longer than its learning rate. The loss is that of `path`.
 
     Args:
         path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
         perturbed: of order "gradient"; its `sigma` is for the second parameters alone.
         keys: the second parameters; None for all poses, and all that have no path gradient.
+        averaged: for `MetaAdam`, which has no momentum: the gradient by the second parameters is the running mean of about ten steps, and
+            its variance that of the squares, both debiased, so its steps there are Adam's. Differences of the smoothed
+            loss between two steps are not rendered, so the mean lags behind. Optimizers that average by themselves, or grow their
+            rates while gradients agree, should have it False. Needs a variance of `path`.
     """
 
     path: Estimator = field(default_factory=PathGradient)
@@ -113,6 +116,7 @@ class HybridGradient:
         default_factory=lambda: SmoothedDerivatives(0.2, samples=16, spp=2, debiased=True)
     )
     keys: tuple[str, ...] | None = None
+    averaged: bool = False
 
     def __post_init__(self):
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
@@ -129,6 +133,10 @@ class HybridGradient:
                 'HybridGradient: perturbed must be SmoothedDerivatives with order="gradient", since path gradients have no '
                 f"curvature, got {self.perturbed!r:.80}"
             )
+        if self.averaged and Variance.name not in self.path.provides:
+            raise InputError(
+                f"HybridGradient: averaged needs a path that provides a variance, such as MetaEstimator(), got {type(self.path).__name__}"
+            )
         if self.keys is not None:
             if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
                 raise InputError(f"HybridGradient: keys must be a list of parameters' keys, got {self.keys!r:.80}")
@@ -144,7 +152,7 @@ class HybridGradient:
         own = self._perturbed(problem.renderer, parameters)
         path, perturbed = self._problems(problem, parameters, own)
         part = {key: parameters[key] for key in own}
-        nothing = trees.zeros_like(part) if Variance.name in self.provides else {}
+        nothing = trees.zeros_like(part) if self.averaged else {}
         return HybridState(self.path.init(path, parameters), self.perturbed.init(perturbed, part), nothing, nothing)
 
     def estimate(
@@ -160,8 +168,10 @@ class HybridGradient:
         if found.preconditioned:
             moved = by_coordinates(moved, _of(problem, own), part)
         moments = state
-        if state.mean:
+        if self.averaged:
             moved, moments = _averaged(moved, state)
+        elif Variance.name in self.provides:
+            moved = replace(moved, capabilities=(Variance(_mean_square(moved)),))
         gradient = {name: moved.gradient[name] if name in own else g for name, g in found.gradient.items()}
         info = {
             **found.info,
@@ -225,6 +235,12 @@ def _averaged(perturbed: Estimate, state: HybridState) -> tuple[Estimate, Hybrid
     variance = {key: x * arrays.scalar(1.0 / (1.0 - _SQUARE**step), x) for key, x in square.items()}
     found = replace(perturbed, gradient=gradient, capabilities=(Variance(variance),))
     return found, replace(state, mean=mean, square=square, step=step)
+
+
+def _mean_square(perturbed: Estimate) -> Tree:
+    """Variance plus squared gradient."""
+    variance = perturbed.require("HybridGradient", Variance).values
+    return trees.map(lambda v, g: v + g * g, variance, perturbed.gradient)
 
 
 def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Capability, ...]:

@@ -90,7 +90,7 @@ class HybridMethod(AdamOptions):
         path, optimizer = self._path(image, space), self.optimizer()
         if rates and isinstance(optimizer, (Adam, MetaAdam)):
             optimizer = replace(optimizer, learning_rate={"*": self.learning_rate, **rates})
-        return HybridGradient(path, smoothing, self._keys), optimizer
+        return HybridGradient(path, smoothing, self._keys, averaged=self.gradient == "coupled"), optimizer
 
     def _path(self, image: ImageEstimator, space: Literal["path", "primary"]) -> Estimator:
         sampler: PixelSampler = pixels.Adaptive(self.pixels) if self.pixels else pixels.All()
