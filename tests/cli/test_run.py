@@ -78,10 +78,12 @@ def test_run_where_path_gradients_are_zero(unrender, problem: Path, mitsuba_vari
     with np.load(Path("mug", "parameters.npz")) as found:
         assert abs(float(found["mug.rotation.y"])) < 0.15
     assert unrender("report", "mug").status == 0
-    refused = unrender("run", "mug", "--method", "rcv", "--steps", 1, "--variant", mitsuba_variant)
-    assert refused.status == 2
-    assert "parameter mug.rotation.y: it moves a shape as a whole" in refused.error
-    assert "smoothed" in refused.error.lower()
+    still = unrender(
+        "run", "mug", "--method", "rcv", "--steps", 10, "--out", "paths", "--variant", mitsuba_variant, *QUICK
+    )
+    assert still.status == 0, still.error
+    with np.load(Path("paths", "parameters.npz")) as found:
+        assert abs(float(found["mug.rotation.y"])) > 0.5
     if not settings:
         chosen = unrender("run", "mug", "--steps", 1, "--out", "auto", "--variant", mitsuba_variant, *QUICK)
         assert chosen.status == 0, chosen.error
