@@ -11,7 +11,7 @@ from analytic import exact_gradient, problem
 
 import unrender as ur
 from unrender.core.random import Key
-from unrender.pixels.base import DrawStatistics, MiniBatch
+from unrender.pixels.base import DrawStatistics
 from unrender.pixels.views import Views, ViewsState, inclusion_probabilities
 
 WEIGHTS = np.array([8.0, 2.0, 1.0, 1.0, 1e-6])
@@ -31,12 +31,11 @@ def flat(gradient: dict[str, Any]) -> np.ndarray:
 class EqualWeights(Views):
     """A planted fault: weighted as if all views were equally likely."""
 
-    def redraw(self, problem: ur.Problem, state: ViewsState | None, key: Key) -> MiniBatch:
-        batch = super().redraw(problem, state, key)
+    def draw(self, problem: ur.Problem, parameters: Any, state: ViewsState | None, key: Key) -> Any:
+        batch, state = super().draw(problem, parameters, state, key)
         assert batch.sample is not None
-        return dataclasses.replace(
-            batch, sample=dataclasses.replace(batch.sample, weights=batch.sample.weights * 0 + 5 / self.count)
-        )
+        equal = dataclasses.replace(batch.sample, weights=batch.sample.weights * 0 + 5 / self.count)
+        return dataclasses.replace(batch, sample=equal), state
 
 
 def test_views_are_drawn_by_what_their_gradients_tell_without_bias() -> None:

@@ -250,8 +250,7 @@ class AutoMethod(Options):
             return pixels.Views(taken), f"{taken} of {views} views a step: moving borders cost each view alike"
         if count <= _MOST_PIXELS or not problem.loss.pixelwise:
             return pixels.All(), ""
-        drawn = _DRAWN
-        return pixels.Uniform(drawn), f"{drawn} of all {count} pixels a step"
+        return pixels.Uniform(_DRAWN), f"{_DRAWN} of all {count} pixels a step"
 
     def _samples(self, problem: Problem, sampler: PixelSampler) -> int:
         """Per pixel: the power of two that comes nearest to the paths of a step from below."""

@@ -119,10 +119,10 @@ class Views:
         self, problem: Problem, parameters: Tree, state: ViewsState | None, key: Key
     ) -> tuple[MiniBatch, ViewsState | None]:
         """See `PixelSampler.draw`."""
-        batch = self.redraw(problem, state, key)
+        chosen, weights = self._chosen(problem, state, key)
+        batch = _whole(problem, chosen, weights)
         if state is None or self.count >= len(problem.views):
             return batch, state
-        chosen, _ = self._chosen(problem, state, key)
         counts = state.counts[chosen] * _MEMORY**state.since
         if counts.min() < _FORGOTTEN or state.step % _REFRESH == 0:
             scales = pixel_statistics.scales(parameters, state.second_moment)
@@ -131,13 +131,7 @@ class Views:
 
     def redraw(self, problem: Problem, state: ViewsState | None, key: Key) -> MiniBatch:
         """See `RepeatableSampler.redraw`."""
-        chosen, weights = self._chosen(problem, state, key)
-        known = problem.sizes
-        sizes = [math.prod(known[view]) for view in chosen]
-        like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))
-        views = arrays.like_integers(np.repeat(chosen, sizes), like)
-        pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)
-        return MiniBatch(PixelSample(views, pixels, like))
+        return _whole(problem, *self._chosen(problem, state, key))
 
     def _chosen(self, problem: Problem, state: ViewsState | None, key: Key) -> tuple[np.ndarray, np.ndarray]:
         """Views, ascending, and their weights."""
@@ -182,6 +176,16 @@ class Views:
 
     def _probabilities(self, state: ViewsState) -> np.ndarray:
         return inclusion_probabilities((1 - state.uniform) * state.density() + state.uniform, self.count)
+
+
+def _whole(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> MiniBatch:
+    """All pixels of the chosen views, with the views' weights."""
+    known = problem.sizes
+    sizes = [math.prod(known[view]) for view in chosen]
+    like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))
+    views = arrays.like_integers(np.repeat(chosen, sizes), like)
+    pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)
+    return MiniBatch(PixelSample(views, pixels, like))
 
 
 def inclusion_probabilities(shares: np.ndarray, count: int) -> np.ndarray:

@@ -16,13 +16,13 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
-    CountingSession,
     ParameterInfo,
     Renderer,
     Rendering,
     RenderSession,
     SampleRequest,
     Space,
+    counted_vertices,
     differentiated,
 )
 
@@ -226,9 +226,7 @@ class PosedCamerasSession:
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `CountingSession.vertices`: ones where the inner session does not count."""
-        if isinstance(self._inner, CountingSession):
-            return self._inner.vertices(self._scene(parameters), request)
-        return self._inner.image(self._scene(parameters), request).images[0] * 0.0 + 1.0
+        return counted_vertices(self._inner, self._scene(parameters), request)
 
     def _scene(self, parameters: Tree) -> Tree:
         """With the cameras' own parameters: the same arrays for the same poses, which the scene then need not set again."""

@@ -13,13 +13,13 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
-    CountingSession,
     ParameterInfo,
     Renderer,
     Rendering,
     RenderSession,
     SampleRequest,
     Space,
+    counted_vertices,
     differentiated,
 )
 
@@ -106,9 +106,7 @@ class _PartialSession:
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `CountingSession.vertices`: ones where the inner session does not count."""
-        if isinstance(self._inner, CountingSession):
-            return self._inner.vertices(parameters, request)
-        return self._inner.image(parameters, request).images[0] * 0.0 + 1.0
+        return counted_vertices(self._inner, parameters, request)
 
     def _completed(self, gradient: Tree, parameters: Tree) -> Tree:
         return {key: arrays.zeros_like(x) if key in self._constant else gradient[key] for key, x in parameters.items()}

@@ -14,13 +14,13 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
-    CountingSession,
     ParameterInfo,
     Renderer,
     Rendering,
     RenderSession,
     SampleRequest,
     Space,
+    counted_vertices,
     differentiated,
 )
 
@@ -186,9 +186,7 @@ class FactorSession:
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `CountingSession.vertices`: ones where the inner session does not count."""
-        if isinstance(self._inner, CountingSession):
-            return self._inner.vertices(self._scene(parameters), request)
-        return self._inner.image(self._scene(parameters), replace(request, groups=1)).images[0] * 0.0 + 1.0
+        return counted_vertices(self._inner, self._scene(parameters), request)
 
     def _factors(self, parameters: Tree, places: Array, like: Array) -> Array:
         return self._renderer.factors(parameters[self._renderer.key], places, like)

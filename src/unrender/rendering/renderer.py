@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -29,6 +29,7 @@ __all__ = [
     "Space",
     "StockLoop",
     "StockRenderer",
+    "counted_vertices",
     "differentiated",
 ]
 
@@ -184,6 +185,13 @@ class CountingSession(Protocol):
         """The mean number of vertices of a pixel's paths, the camera's not counted, from samples of the request: of the shape of one of its
         images, all channels alike. A path that meets nothing has none."""
         ...
+
+
+def counted_vertices(session: RenderSession, parameters: Tree, request: SampleRequest) -> Array:
+    """See `CountingSession.vertices`: ones where the session does not count."""
+    if isinstance(session, CountingSession):
+        return session.vertices(parameters, request)
+    return session.image(parameters, replace(request, groups=1)).images[0] * 0.0 + 1.0
 
 
 class Renderer(Protocol):
