@@ -50,40 +50,14 @@ def test_images_have_a_memory(loss: Any) -> None:
     estimator, _ = chosen(problem(loss))
     tolerance = 0.0 if loss.linear else module._TOLERANCE
     fresh = {"spp": module._MOST, "tolerance": tolerance, "fresh_from": module._FRESH_FROM}
-    assert estimator == PathGradient(images.RecursiveControlVariate("path"), **fresh)
+    memory = {"max_weight": module._LINEAR_MEMORY if loss.linear else module._MEMORY}
+    assert estimator == PathGradient(images.RecursiveControlVariate("path", **memory), **fresh)
     estimator, _ = chosen(problem(loss, shares_paths=False))
-    assert estimator.image == images.RecursiveControlVariate("primary")
+    assert estimator.image == images.RecursiveControlVariate("primary", **memory)
     assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6, tolerance=tolerance)
     assert chosen(problem(loss), tolerance=0)[0].tolerance == 0
     reasons = method("auto").choose(problem(loss), {}).reasons
     assert any("damped where noise exceeds the residual" in line for line in reasons) == (not loss.linear)
-
-
-def test_fireflies_are_not_remembered_where_the_loss_is_unbiased_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = problem(losses.L2())
-    assert module._firefly_share(made) == 0.0  # too few pixels to tell
-    rng = np.random.default_rng(0)
-
-    def pilot(fireflies: bool) -> float:
-        noise = rng.normal(size=(2, 64, 64, 3))
-        if fireflies:
-            noise[:, :2, :10] *= 300.0
-
-        class Session:
-            def image(self, *given: Any) -> Any:
-                return type("Rendering", (), {"images": noise})
-
-        with monkeypatch.context() as patch:
-            patch.setattr(made.renderer, "prepare", lambda *given, **options: Session())
-            return module._firefly_share(made)
-
-    assert 0.02 < pilot(False) < 0.06  # a hundredth of the pixels, those at the end of a chi-square of three channels
-    assert pilot(True) > 0.95
-    monkeypatch.setattr(module, "_firefly_share", lambda problem: 0.9)
-    assert chosen(made)[0] == PathGradient(spp=module._MOST)
-    assert "90% of the noise" in method("auto").choose(made).reasons[0]
-    assert chosen(made, image="rcv")[0].image == images.RecursiveControlVariate("path")
-    assert chosen(problem(losses.L1()))[0].image == images.RecursiveControlVariate("path")
 
 
 def test_textures_are_smoothed_unless_they_have_a_preconditioner() -> None:

@@ -104,6 +104,9 @@ class RecursiveControlVariate:
         whole_views: with pixel mini-batches, every so many of them are followed by a step that renders whole views, >= 1.
         learn_from_draws: remember what mini-batches render, too, not whole views alone.
         update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
+        max_weight: upper bound of the weights, in (0, 1]; 1 in the paper. Below, an error of the image is forgotten after some
+            1 / (1 - max_weight) steps. With 1, it lasts as long as the run has lasted, an optimizer takes it for signal, and
+            follows: where rare bright paths make most of the noise, the parameters get worse again.
 
     With pixel mini-batches the control variate is a snapshot, since pixels outside the batch are not updated: a step that renders whole
     views updates image and statistics, and until the next one each mini-batch uses ⟨F_n⟩ + w (⟨F_s⟩_CV − ⟨F_s⟩_n) against that
@@ -128,6 +131,7 @@ class RecursiveControlVariate:
     update_before_use: bool = False
     whole_views: int = 20
     learn_from_draws: bool = True
+    max_weight: float = 1.0
 
     def __post_init__(self):
         checks.integer("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
@@ -136,6 +140,8 @@ class RecursiveControlVariate:
         for name in ("alpha", "beta"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"RecursiveControlVariate: {name} must be in [0, 1), got {getattr(self, name)!r}")
+        if not checks.number("RecursiveControlVariate", "max_weight", self.max_weight, above=0.0) <= 1:
+            raise InputError(f"RecursiveControlVariate: max_weight must be in (0, 1], got {self.max_weight!r}")
 
     def init(self, problem: Problem, parameters: Tree) -> RecursiveControlVariateState:
         """See `ImageEstimator.init`."""
@@ -187,7 +193,7 @@ class RecursiveControlVariate:
         past = snapshot.relative_variance
         after = past / (1.0 + past * number)
         image = snapshot.image + after * (total - number * snapshot.image)
-        weight = arrays.minimum(snapshot.weight * (1.0 + past) / (1.0 + after), 1.0)
+        weight = arrays.minimum(snapshot.weight * (1.0 + past) / (1.0 + after), self.max_weight)
         return replace(state, snapshot=Snapshot(image, weight, after))
 
     def _learnt(self, state: RecursiveControlVariateState, view: int) -> ViewMemory:
@@ -279,7 +285,8 @@ class RecursiveControlVariate:
             weight, var_current / number, var_previous / number, cov / number, past * var_previous
         )
         known = var_current > 0
-        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), past / (1.0 + past * number))
+        averaged = weight * weight * past + (1.0 - weight) * (1.0 - weight) / number
+        relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), averaged)
         info = {"control_weight": weight, "variance": variance}
         previous = advance(image, asked.previous, rendering.previous, of_each)
         if (within := variance_of_mean(rendering.images, counts)) is not None:
@@ -299,11 +306,12 @@ class RecursiveControlVariate:
     def _weight(self, memory: ViewMemory, number: Array | float = 1.0) -> Array:
         """Where one step has so many samples of those that the statistics are of."""
         var_previous, past = welford.covariance(memory.previous), memory.relative_variance * number
-        return arrays.where(
+        best = arrays.where(
             var_previous > 0,
             statistics.control_weight(welford.covariance(memory.joint), var_previous, past * var_previous),
             1.0 / (1.0 + past),
         )
+        return arrays.minimum(best, self.max_weight)
 
     def _start(self, image: Array, counts: SampleCounts | None) -> ViewMemory:
         """Eq. 7: the first image is its own control variate."""

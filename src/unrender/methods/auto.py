@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from unrender import pixels
-from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
@@ -33,7 +32,6 @@ from unrender.preconditioners import LargeSteps, Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
-from unrender.rendering.renderer import SampleRequest
 from unrender.schedules import Exponential
 
 __all__ = ["AutoMethod"]
@@ -60,10 +58,8 @@ _TEXELS = ".data"
 """End of the key of a texture's texels."""
 _TOLERANCE = 2.0
 """κ of `PathGradient`."""
-_FIREFLIES = 0.8
-"""Share of the noise in a hundredth of the pixels from which a linear loss is better off without a memory of images."""
-_PILOT_SPP, _PILOT_VIEWS = 16, 4
-"""Of the images that the share is measured on."""
+_LINEAR_MEMORY, _MEMORY = 0.95, 0.97
+"""`max_weight` of control variates, for losses whose derivatives are linear and for others, which noise of the image biases."""
 _MOST_NUMBERS, _MOST_MARGINS = 4, 10
 """Elements of a number or colour that moves as its logarithm; and the distance from its bound that it has at least, in margins."""
 _TEXTURE = 3
@@ -96,15 +92,15 @@ class AutoMethod(Options):
     """what suits the problem: images with a memory or without, smoothing for textures and grids, schedule-free Adam
 
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
-    other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
-    memory, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the vertices of
+    other than L2. Its errors are forgotten after some 20 steps, of L1 and such 33, lest steps follow them. Where the scene cannot be
+    loaded twice, each step has its own rendering. Textures, grids and values at the vertices of
     meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in proportion
     to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path gradients of
     the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
-        None, description="what the loss sees: a fresh rendering, or rcv's; none chooses by their noise"
+        None, description="what the loss sees: a fresh rendering, or rcv's; none for the latter where it can be had"
     )
     spp: PositiveInt | None = Field(
         None,
@@ -135,7 +131,7 @@ class AutoMethod(Options):
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`: what is chosen where nothing is known of the problem."""
-        image = Plain() if self.image == "plain" else RecursiveControlVariate()
+        image = Plain() if self.image == "plain" else RecursiveControlVariate(max_weight=_LINEAR_MEMORY)
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
         return PathGradient(image, sampler, self.spp or _FEWEST), ScheduleFree(self.learning_rate)
 
@@ -231,14 +227,12 @@ class AutoMethod(Options):
             return _Image("plain", Plain(), "a mesh moves (--set image=rcv uses earlier samples again)")
         if self.image is None and not whole:
             return _Image("plain", Plain(), "control variates need whole views")
-        if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:
-            reason = f"{share:.0%} of the noise is in 1% of the pixels, where a control variate would remember it"
-            return _Image("plain", Plain(), reason)
         space, obstacle = _shared_space(problem)
         if obstacle and self.image is None:
             return _Image("plain", Plain(), f"no control variates: {obstacle}")
         reason = "as asked for" if self.image else "earlier samples are used again"
-        return _Image("rcv", RecursiveControlVariate(space), reason)
+        most = _LINEAR_MEMORY if problem.loss.linear else _MEMORY
+        return _Image("rcv", RecursiveControlVariate(space, max_weight=most), reason)
 
     def _sampler(self, problem: Problem) -> tuple[PixelSampler, str]:
         """The pixels of a step, and why they are not all."""
@@ -304,25 +298,6 @@ def _refusal(problem: Problem) -> str:
     except InputError as error:
         return str(error)
     return ""
-
-
-def _firefly_share(problem: Problem) -> float:
-    """The share of the noise of the first images, squared, that is in the hundredth of the pixels that have most of it.
-
-    From the differences of two independent images of up to four views at the initial parameters: 0.1 to 0.3 in scenes lit evenly, 0.9
-    where rare paths by way of mirrors and glass are very bright.
-    """
-    parameters = problem.initial()
-    session = problem.renderer.prepare(list(parameters), None, derivatives=False)
-    noise = []
-    for view in range(min(len(problem.views), _PILOT_VIEWS)):
-        groups = arrays.numpy(
-            session.image(parameters, SampleRequest(problem.views[view].sensor, _PILOT_SPP, 0, 2)).images
-        )
-        noise.append(np.square(groups[0] - groups[1], dtype=np.float64).sum(axis=-1).ravel())
-    found = np.sort(np.concatenate(noise))[::-1]
-    whole = found.sum()
-    return float(found[: max(1, len(found) // 100)].sum() / whole) if len(found) >= 1000 and whole > 0 else 0.0
 
 
 def _logarithms(problem: Problem) -> dict[str, str]:

@@ -26,7 +26,14 @@ class RecursiveControlVariateMethod(PathOptions):
     )
     alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means behind the control weight")
     beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances behind the control weight")
+    max_weight: FiniteFloat = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="upper bound of the control weight: 0.95 forgets errors of the image after some 20 steps",
+    )
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
-        return self.estimator(RecursiveControlVariate(self.space, self.alpha, self.beta)), self.optimizer()
+        image = RecursiveControlVariate(self.space, self.alpha, self.beta, max_weight=self.max_weight)
+        return self.estimator(image), self.optimizer()

@@ -1,0 +1,54 @@
+"""`RecursiveControlVariate(max_weight=...)`: how long an image remembers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic import problem
+
+import unrender as ur
+from unrender.core.random import Key
+from unrender.rendering.numpy.linear import AnalyticRenderer
+
+STEPS, RUNS, NOISE, SPP = 30, 12, 0.5, 2
+WEIGHT = 0.8
+
+
+def remembered(max_weight: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of the last image of an unchanging scene, in units of the variance of one step's: squared errors of its pixels in many runs, and what
+    the state says of them."""
+    asked = problem(noise=NOISE)
+    at, renderer = asked.initial(), asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    exact = renderer.exact(at)
+    of_one_step = np.square(NOISE * (exact - 0.1)) / 3 / SPP  # 0.1 has no noise, uniform noise in [-1, 1] a third
+    estimator = ur.PathGradient(ur.images.RecursiveControlVariate(max_weight=max_weight), spp=SPP)
+    errors, told = [], []
+    for run in range(RUNS):
+        state = estimator.init(asked, at)
+        for step in range(STEPS):
+            _, state = estimator.estimate(asked, at, state, Key(run, step))
+        memory = state.image.views[0]
+        errors.append(np.square(memory.image - exact) / of_one_step)
+        told.append(memory.relative_variance)
+    return np.array(errors), np.array(told)
+
+
+def score(errors: np.ndarray) -> float:
+    """Of the mean against a running mean's, (1 - w) / (1 + w)."""
+    expected = (1 - WEIGHT) / (1 + WEIGHT)
+    return float((errors.mean() - expected) / (errors.std(ddof=1) / np.sqrt(errors.size)))
+
+
+def test_an_unchanging_scene_has_the_variance_of_a_running_mean() -> None:
+    errors, told = remembered(WEIGHT)
+    np.testing.assert_allclose(told, (1 - WEIGHT) / (1 + WEIGHT), rtol=1e-3)
+    assert abs(score(errors)) < 4
+    unbounded, _ = remembered(1.0)
+    assert score(unbounded) < -4, "a bound that is ignored went unseen"
+
+
+def test_weights_above_one_or_below_zero_are_refused() -> None:
+    for weight in (0, 1.5, -0.1, float("nan")):
+        with pytest.raises(ur.InputError, match="RecursiveControlVariate: max_weight must be"):
+            ur.images.RecursiveControlVariate(max_weight=weight)
