@@ -50,10 +50,10 @@ def test_images_have_a_memory(loss: Any) -> None:
     estimator, _ = chosen(problem(loss))
     tolerance = 0.0 if loss.linear else module._TOLERANCE
     fresh = {"spp": module._MOST, "tolerance": tolerance, "fresh_from": module._FRESH_FROM}
-    memory = {"max_weight": module._LINEAR_MEMORY if loss.linear else module._MEMORY}
-    assert estimator == PathGradient(images.RecursiveControlVariate("path", **memory), **fresh)
+    memory = module._LINEAR_MEMORY if loss.linear else module._MEMORY
+    assert estimator == PathGradient(images.RecursiveControlVariate("path", max_weight=memory), **fresh)
     estimator, _ = chosen(problem(loss, shares_paths=False))
-    assert estimator.image == images.RecursiveControlVariate("primary", **memory)
+    assert estimator.image == images.RecursiveControlVariate("primary", max_weight=memory)
     assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6, tolerance=tolerance)
     assert chosen(problem(loss), tolerance=0)[0].tolerance == 0
     reasons = method("auto").choose(problem(loss), {}).reasons
