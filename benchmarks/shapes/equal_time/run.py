@@ -1,8 +1,9 @@
 """Meshes from pictures at equal time: `auto` against the stock loop with `prb_projective`, tuned.
 
 The stock loop is that of Mitsuba's tutorial on shapes: `mi.render` with `prb_projective`, `dr.backward`, and `mi.ad.Adam` on the vertices,
-or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps` (λ 19). It is tuned on a seed of its own over rates, and
-over whether the boundary of shadows and indirect light is sampled or not; without a guide, whose octree takes seconds at every step.
+or, with one rate for all, on the differential coordinates of `mi.ad.LargeSteps`. It is tuned on a seed of its own, one setting after
+another: the rate, whether the boundary of shadows and indirect light is sampled, samples per pixel, λ, and the rate again; without a guide,
+whose octree takes seconds at every step.
 Textures, where there are any, move by the same Adam. Errors are distances between surfaces, and root mean square differences of pictures
 from their references, relative to the start. Time is the processor's, of all threads, so that other work on the machine does not count.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,30 +25,41 @@ from benchmarks.stock_loop import step_seed
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "problems": ["sphere-to-bunny"], "resolution": 8, "subdivisions": 1, "views": 2, "rates": [0.01],
-    "indirect": [0],
+    "indirect": [], "spp": [], "strengths": [],
 }  # fmt: skip
-_SPP, _PICTURE_SPP = 2, 64
+_PICTURE_SPP = 64
 _POINTS = 40
 _TEXTURE_RATE = 0.02
-LAMBDA = 19.0
 STOCK = ("Adam", "LargeSteps")
 
 
-class StockShapes:
-    """The stock loop on a problem whose unknowns are the vertices of one mesh, and maybe textures.
+@dataclass(frozen=True)
+class Setting:
+    """Of the stock loop.
 
-    Args:
-        problem: of the gallery.
+    Attributes:
         kind: of `STOCK`.
         rate: of the vertices.
         indirect: samples per pixel of the boundary of shadows and indirect light.
+        spp: samples per pixel of the picture, and of the boundary of what the camera sees.
+        strength: λ of large steps.
     """
 
-    def __init__(self, problem: ur.Problem, kind: str, rate: float, indirect: int):
-        self.problem, self.kind, self.rate = problem, kind, rate
+    kind: str
+    rate: float = 0.0
+    indirect: int = 0
+    spp: int = 2
+    strength: float = 19.0
+
+
+class StockShapes:
+    """The stock loop on a problem whose unknowns are the vertices of one mesh, and maybe textures."""
+
+    def __init__(self, problem: ur.Problem, setting: Setting):
+        self.problem, self.setting = problem, setting
         self.scene, self.parameters = stock_scene(problem)
         (self.mesh,) = problem.faces
-        counts = {"sppc": _SPP, "sppp": _SPP, "sppi": indirect, "guiding": "none"}
+        counts = {"sppc": setting.spp, "sppp": setting.spp, "sppi": setting.indirect, "guiding": "none"}
         self._integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
 
     def run(self, seconds: float, seed: int) -> list[tuple[float, dict[str, np.ndarray]]]:
@@ -60,10 +73,10 @@ class StockShapes:
             self.parameters[key] = from_tensor(value, self.parameters[key])
         self.parameters.update()
         large = None
-        if self.kind == "LargeSteps":
+        if self.setting.kind == "LargeSteps":
             faces = self.parameters[f"{self.mesh.rpartition('.')[0]}.faces"]
-            large = mi.ad.LargeSteps(self.parameters[self.mesh], faces, LAMBDA)
-        vertices = mi.ad.Adam(lr=self.rate, uniform=large is not None)
+            large = mi.ad.LargeSteps(self.parameters[self.mesh], faces, self.setting.strength)
+        vertices = mi.ad.Adam(lr=self.setting.rate, uniform=large is not None)
         vertices["u"] = (
             self.parameters[self.mesh] if large is None else large.to_differential(self.parameters[self.mesh])
         )
@@ -168,29 +181,48 @@ def time_to(curve: Sequence[Sequence[float]], level: float) -> float | None:
     return next((seconds for seconds, error in zip(*curve, strict=True) if error <= level), None)
 
 
+def tuned(
+    problem: ur.Problem, kind: str, seconds: float, rates: Sequence[float], others: Mapping[str, Sequence[float]]
+) -> Setting:
+    """The setting of least surface error that the search meets: rates, then the others one after another, then half and twice the rate."""
+    (key,) = problem.faces
+
+    def final(setting: Setting) -> float:
+        return problem.parameter_error(StockShapes(problem, setting).run(seconds, TUNING_SEED)[-1][1])[key]
+
+    best = Setting(kind)
+    rate, tried = search(tuple(rates), lambda rate: final(replace(best, rate=rate)))
+    best, least = replace(best, rate=rate), min(one["error"] for one in tried)
+    trials = [{name: value} for name, values in others.items() for value in values]
+    for change in (*trials, {"rate": 0.5}, {"rate": 2.0}):
+        if kind == "Adam" and "strength" in change:
+            continue
+        other = replace(best, rate=best.rate * change["rate"]) if "rate" in change else replace(best, **change)
+        if (error := final(other)) < least:
+            best, least = other, error
+    return best
+
+
 def race(
-    problem: ur.Problem, seconds: float, seeds: int, rates: Sequence[float], indirect: Sequence[int]
+    problem: ur.Problem,
+    seconds: float,
+    seeds: int,
+    rates: Sequence[float],
+    indirect: Sequence[int],
+    spp: Sequence[int],
+    strengths: Sequence[float],
 ) -> dict[str, Any]:
     """All methods on one problem, the stock loops tuned first."""
     found: dict[str, Any] = {"auto": {"runs": []}}
+    settings = {}
     for kind in STOCK:
-        best: tuple[float, float, int] | None = None
-        for spp in indirect:
-
-            def final(rate: float, kind: str = kind, spp: int = spp) -> float:
-                run = StockShapes(problem, kind, rate, spp).run(seconds, TUNING_SEED)
-                return problem.parameter_error(run[-1][1])[next(iter(problem.faces))]
-
-            rate, tried = search(tuple(rates), final)
-            least = min(one["error"] for one in tried)
-            if best is None or least < best[0]:
-                best = (least, rate, spp)
-        assert best is not None
-        found[kind] = {"rate": best[1], "indirect": best[2], "runs": []}
+        settings[kind] = tuned(problem, kind, seconds, rates, {"indirect": indirect, "spp": spp, "strength": strengths})
+        found[kind] = {**asdict(settings[kind]), "runs": []}
+        print(settings[kind], flush=True)
     for seed in range(seeds):
         found["auto"]["runs"].append(ours(problem, seconds, seed))
         for kind in STOCK:
-            loop = StockShapes(problem, kind, found[kind]["rate"], found[kind]["indirect"])
+            loop = StockShapes(problem, settings[kind])
             found[kind]["runs"].append(measured(problem, loop.run(seconds, seed)))
     best_final = min(float(np.median([run["surface"] for run in found[kind]["runs"]])) for kind in STOCK)
     found["seconds to the stock loops' best"] = [time_to(run["curve"], best_final) for run in found["auto"]["runs"]]
@@ -205,7 +237,9 @@ def run(
     subdivisions: int = 4,
     views: int = 6,
     rates: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1),
-    indirect: tuple[int, ...] = (0, 2),
+    indirect: tuple[int, ...] = (2,),
+    spp: tuple[int, ...] = (4, 8),
+    strengths: tuple[float, ...] = (5.0, 50.0),
 ) -> Iterator[dict[str, Any]]:
     """Every problem.
 
@@ -217,11 +251,13 @@ def run(
         subdivisions: of the sphere
         views: how many
         rates: of the stock loops, tried on a seed of its own
-        indirect: samples per pixel of the stock loops' boundary of shadows and indirect light, likewise
+        indirect: samples per pixel of the stock loops' boundary of shadows and indirect light, likewise, beside 0
+        spp: samples per pixel of the stock loops, beside 2
+        strengths: λ of the stock loop of large steps, beside 19
     """
     found = {}
     for name in problems:
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, views=views)
-        found[name] = race(problem, seconds, seeds, rates, indirect)
+        found[name] = race(problem, seconds, seeds, rates, indirect, spp, strengths)
         print(name, found[name]["seconds to the stock loops' best"], flush=True)
         yield {"problems": found}

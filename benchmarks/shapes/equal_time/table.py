@@ -17,14 +17,15 @@ def table(record: Record) -> str:
                 markdown.median_range((float(np.median(values)), min(values), max(values)))
                 for values in ([run[what] for run in of["runs"]] for what in ("surface", "pictures"))
             ]
-            tuned = f"{of['rate']:g}, {of['indirect']}" if "rate" in of else ""
+            names = ("rate", "spp", "indirect", "strength") if method == "LargeSteps" else ("rate", "spp", "indirect")
+            tuned = ", ".join(f"{of[name]:g}" for name in names) if "rate" in of else ""
             reached = found["seconds to the stock loops' best"] if method == "auto" else []
             when = ", ".join("never" if at is None else f"{at:.1f} s" for at in reached)
             rows.append([name, method, tuned, *finals, when])
     head = [
         "problem",
         "method",
-        "rate, indirect spp",
+        "rate, spp, indirect spp, λ",
         "surface error",
         "picture error",
         "at the best stock loop's end after",
