@@ -190,7 +190,7 @@ class AutoMethod(Options):
             parameterisations=moved,
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
-        tolerance = self.tolerance if biased and isinstance(sampler, pixels.All) else 0.0
+        tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         first = ", ".join(f"{rate:.3g} ({key})" for key, rate in {**rates, **problem.learning_rates}.items())
         reasons = (
