@@ -15,8 +15,10 @@ import pytest
 import unrender as ur
 from kernels import on_device, recorded
 from tiers import quick
+from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba.boundary_term import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.view_weights import views_of
@@ -191,6 +193,37 @@ def test_moments_of_pixels_have_the_boundary_term() -> None:
     np.testing.assert_allclose(
         np.array(term.tangent_moment(loaded, request)).reshape(-1, 3), image.reshape(-1, 3) ** 2, rtol=1e-3, atol=1e-6
     )
+
+
+@pytest.mark.slow
+def test_adaptive_mini_batches_find_the_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a black body all that moves is its outline and its shadow, which path replay knows nothing of."""
+    points, faces = meshes.icosphere(1)
+    black = meshes.triangles("thing", 0.4 * points, faces, {"type": "diffuse", "reflectance": 0.0})
+    reference = np.zeros((SIZE, SIZE, 3), np.float32)
+    problem = ur.Problem(lambda: scene(thing=black), [ur.Parameter(KEY)], [ur.View(reference)], max_depth=2)
+    start, learning, repetitions = problem.initial(), 1, 24
+
+    def variance(sampler: Any) -> float:
+        estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=2)
+        state, found = estimator.init(problem, start), []
+        for step in range(learning + repetitions):
+            estimate, after = estimator.estimate(problem, start, state, Key(0, step))
+            if step < learning:
+                state = after
+            else:
+                found.append(np.array(estimate.gradient[KEY], float))
+        return float(np.var(found, axis=0, ddof=1).sum())
+
+    sampler = ur.pixels.Adaptive(64, samples=1024, uniform=0.1, denoiser="pooling")
+    uniform, adaptive = variance(ur.pixels.Uniform(64)), variance(sampler)
+    assert adaptive < 0.7 * uniform
+    monkeypatch.setattr(
+        BoundaryTerm,
+        "tangent_moment",
+        lambda self, scene, request: mi.TensorXf(dr.zeros(mi.Float, 3 * dr.width(request.pixels))),
+    )
+    assert variance(sampler) > 0.7 * uniform
 
 
 @pytest.mark.slow
