@@ -97,10 +97,11 @@ class AutoMethod(Options):
 
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
-    memory, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the vertices of
-    meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in proportion
-    to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path gradients of
-    the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can be set.
+    memory, each step has its own rendering; and where a mesh moves, or the scene cannot be loaded twice. Textures, grids and values at the
+    vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in
+    proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path
+    gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can
+    be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -228,7 +229,7 @@ class AutoMethod(Options):
         if self.image == "plain":
             return _Image("plain", Plain(), "as asked for")
         if self.image is None and deforms:
-            return _Image("plain", Plain(), "a mesh moves (--set image=rcv uses earlier samples again)")
+            return _Image("plain", Plain(), "a mesh moves, and a memory costs more steps than it saves (image=rcv)")
         if self.image is None and not whole:
             return _Image("plain", Plain(), "control variates need whole views")
         if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:
