@@ -250,3 +250,12 @@ def test_textures_of_one_material_share_the_rate() -> None:
     _, optimizer = chosen(made)
     rates = [optimizer.learning_rate[key] for key in values]
     assert rates == pytest.approx([0.1 / 2**0.5, 0.1 / 2**0.5, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
+def test_mini_batches_of_views_are_damped_as_whole_views_are(loss: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of pixels here and there are not: their noise is not known."""
+    for sampler, damped in ((pixels.All(), True), (pixels.Views(1), True), (pixels.Uniform(4), False)):
+        monkeypatch.setattr(module.AutoMethod, "_sampler", lambda self, problem, sampler=sampler: (sampler, ""))
+        expected = module._TOLERANCE if damped and not loss.linear else 0.0
+        assert chosen(problem(loss))[0].tolerance == expected
