@@ -1,9 +1,9 @@
-"""What the loss sees where a mesh moves: `auto` as it is, without damping, and with recursive control variates, at equal processor time.
+"""What the loss sees where a mesh moves: plain images, control variates, and no damping, at equal processor time.
 
 Problems of the gallery, and spheres that are to become meshes of others under a photographed sky, with L1 and L2. Errors over the start's,
-of the surface, where it is known, and of pictures. `auto` renders anew at each step half of the views (all where there are few), and damps
-the derivative of L1 where noise exceeds the residual; `tolerance=0` does not. With `image=rcv`, a memory of all views is set up every
-twenty steps, and learns from the views between.
+of the surface, where it is known, and of pictures. `plain` (`image=plain`) renders anew at each step half of the views, all where there are
+few, and damps the derivative of L1 where noise exceeds the residual; without damping it is `tolerance=0`. With `rcv` (`image=rcv`), damped,
+too, a memory of all views is set up every twenty steps, and learns from the views between.
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ FOREIGN = {
 }
 """Meshes among the assets, and their materials."""
 _SKY = "tutorials/textures/envmap.exr"
-CHOICES = {"auto": {}, "tolerance=0": {"tolerance": 0}, "image=rcv": {"image": "rcv"}}
+CHOICES: dict[str, dict[str, Any]] = {
+    "plain": {"image": "plain"},
+    "plain, undamped": {"image": "plain", "tolerance": 0},
+    "rcv": {"image": "rcv"},
+}
 """Options of `auto`."""
 
 
@@ -116,7 +120,7 @@ def run(
                 problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, loss=loss, **more)
             of_loss = found.setdefault(name, {}).setdefault(of, {})
             for choice in choices:
-                if choice == "tolerance=0" and loss.linear:
+                if "tolerance" in CHOICES[choice] and loss.linear:
                     continue
                 runs = [descend(problem, CHOICES[choice], seconds, seed) for seed in range(seeds)]
                 of_loss[choice] = {key: [one[key] for one in runs] for key in runs[0]}

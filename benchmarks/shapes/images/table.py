@@ -34,7 +34,7 @@ def table(record: Record) -> str:
 
 
 def _means(record: Record) -> str:
-    """Geometric means over the problems of each choice's median over that of `auto`."""
+    """Geometric means over the problems of each choice's median over that of `plain`."""
     rows = []
     pairs = sorted(
         {(loss, choice) for losses in record["problems"].values() for loss in losses for choice in losses[loss]}
@@ -43,12 +43,12 @@ def _means(record: Record) -> str:
         row = [loss, choice]
         for what in ("surface", "pictures"):
             ratios = [
-                np.median(losses[loss][choice][what]) / np.median(losses[loss]["auto"][what])
+                np.median(losses[loss][choice][what]) / np.median(losses[loss]["plain"][what])
                 for losses in record["problems"].values()
-                if what in losses[loss]["auto"]
+                if what in losses[loss]["plain"]
             ]
             row.append(f"{np.exp(np.mean(np.log(ratios))):.3f}")
         rows.append(row)
-    return "Over that of `auto`, geometric mean over problems:\n\n" + markdown.table(
+    return "Over that of `plain`, geometric mean over problems:\n\n" + markdown.table(
         ["loss", "choice", "surface error", "picture error"], rows
     )

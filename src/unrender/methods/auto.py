@@ -96,8 +96,8 @@ class AutoMethod(Options):
     """what suits the problem: images with a memory or without, smoothing for textures and grids, schedule-free Adam
 
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
-    other than L2. But a memory keeps fireflies, too: where a pilot finds the noise in few pixels, and the loss is unbiased without a
-    memory, each step has its own rendering; and where a mesh moves, or the scene cannot be loaded twice. Textures, grids and values at the
+    other than L2. But a memory keeps fireflies, too: where the loss is unbiased without a memory, and a pilot finds the noise in few
+    pixels or a mesh moves, each step has its own rendering; and where the scene cannot be loaded twice. Textures, grids and values at the
     vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in
     proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path
     gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can
@@ -172,7 +172,7 @@ class AutoMethod(Options):
         given = given or {}
         sampler, drawn = self._sampler(problem)
         meshes = tuple(problem.faces)
-        image = self._image(problem, isinstance(sampler, pixels.All), bool(meshes))
+        image = self._image(problem, _shows_half(problem, sampler), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = _logarithms(problem) if self.parameterise else {}
         moved = {key: name for key, name in moved.items() if key not in given}
@@ -228,10 +228,10 @@ class AutoMethod(Options):
     def _image(self, problem: Problem, whole: bool, deforms: bool) -> _Image:
         if self.image == "plain":
             return _Image("plain", Plain(), "as asked for")
-        if self.image is None and deforms:
-            return _Image("plain", Plain(), "a mesh moves, and a memory costs more steps than it saves (image=rcv)")
+        if self.image is None and deforms and problem.loss.linear:
+            return _Image("plain", Plain(), "a mesh moves, and the loss is unbiased without a memory")
         if self.image is None and not whole:
-            return _Image("plain", Plain(), "control variates need whole views")
+            return _Image("plain", Plain(), "control variates need whole views, half of them a step")
         if self.image is None and problem.loss.linear and (share := _firefly_share(problem)) > _FIREFLIES:
             reason = f"{share:.0%} of the noise is in 1% of the pixels, where a control variate would remember it"
             return _Image("plain", Plain(), reason)
@@ -269,6 +269,12 @@ class AutoMethod(Options):
             and key not in problem.preconditioners
             and (grid.is_map(shape) or (known[key].mesh is not None and not known[key].welded))
         )
+
+
+def _shows_half(problem: Problem, sampler: PixelSampler) -> bool:
+    """Whether a step renders all views, or half of them: what was remembered of a view seldom seen is of another mesh."""
+    half = isinstance(sampler, pixels.Views) and 2 * sampler.count >= len(problem.views)
+    return half or isinstance(sampler, pixels.All)
 
 
 def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:
