@@ -15,10 +15,13 @@ import pytest
 import unrender as ur
 from kernels import on_device, recorded
 from tiers import quick
+from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba.boundary_term import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import SampleRequest
 
 SIZE = 16
@@ -129,7 +132,7 @@ def test_points_are_projected_as_the_sensor_does() -> None:
     described["camera"] |= {"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1}
     loaded = mi.load_dict(described)
     sensor = loaded.sensors()[0]
-    picture = Picture(loaded, sensor, mi.TensorXf(np.zeros((16, 20, 3), np.float32)), 1)
+    picture = Picture(loaded, sensor, 1)
     points = mi.Point3f(np.random.default_rng(0).uniform(-0.1, 0.1, (3, 8)).astype(np.float32))
     its = dr.zeros(mi.SurfaceInteraction3f, 8)
     its.p = points
@@ -152,6 +155,75 @@ def test_a_mini_batch_of_all_pixels_is_the_whole_view() -> None:
     np.testing.assert_allclose(batch, whole, rtol=1e-3, atol=1e-3 * np.abs(whole).max())
     none = gradient(scene, request=SampleRequest(0, 16, 3, pixels=mi.UInt32([0, 1])))
     assert np.abs(none).max() < 0.2 * np.abs(whole).max()
+
+
+@pytest.mark.slow
+def test_moments_of_pixels_have_the_boundary_term() -> None:
+    """The boundary's image of derivatives along a tangent, weighted, is its gradient along that: forward and backward mode on the same
+    samples. Its square is what a moment has more than path replay tells."""
+    renderer = MitsubaRenderer(scene, 2)
+    session, values = renderer.prepare([KEY], None), renderer.values([KEY])
+    random = np.random.default_rng(0)
+    weights, tangent = random.normal(size=(SIZE, SIZE, 3)), random.normal(size=np.array(values[KEY]).shape)
+    pixels = random.permutation(SIZE * SIZE)[:100]
+    request = SampleRequest(0, 16, 3, 2)
+    term, loaded = session._boundary, session._pair.loaded()
+    assert term is not None
+    session.image(values, request)
+    session._pair.clear_gradients()
+    term.accumulate(loaded, request, renderer.array(np.stack([weights, weights])))
+    gradient = np.array(loaded.gradients()[KEY])
+    tangents = {KEY: renderer.array(tangent)}
+    loaded.set_tangents(values, tangents, frozenset(values))
+    nothing = mi.TensorXf(np.zeros((1, SIZE, SIZE, 3), np.float32))
+    (view,) = views_of(request, nothing, session._pair.resolutions)
+    sensor, seed, samples = term._samples(loaded, request, view)
+    image = np.array(term._integrator.tangent_image(loaded.scene, sensor, seed, samples))
+    np.testing.assert_allclose((image * weights).sum(), (gradient * tangent).sum(), rtol=1e-3)
+    assert (image**2).sum() > 0
+    for asked in (request, SampleRequest(0, 16, 3, 2, pixels=mi.UInt32(pixels.astype(np.uint32)))):
+        paths = session.image(values, asked).paths
+        whole = np.array(session.tangent_moment(values, paths, tangents))
+        more = np.array(term.tangent_moment(loaded, asked)).reshape(whole.shape[1:])
+        session._boundary = None
+        replayed = np.array(session.tangent_moment(values, paths, tangents))
+        session._boundary = term
+        np.testing.assert_allclose(whole, replayed + more, rtol=1e-3, atol=1e-6)
+        assert more.sum() > 0
+    np.testing.assert_allclose(
+        np.array(term.tangent_moment(loaded, request)).reshape(-1, 3), image.reshape(-1, 3) ** 2, rtol=1e-3, atol=1e-6
+    )
+
+
+@pytest.mark.slow
+def test_adaptive_mini_batches_find_the_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a black body all that moves is its outline and its shadow, which path replay knows nothing of."""
+    points, faces = meshes.icosphere(1)
+    black = meshes.triangles("thing", 0.4 * points, faces, {"type": "diffuse", "reflectance": 0.0})
+    reference = np.zeros((SIZE, SIZE, 3), np.float32)
+    problem = ur.Problem(lambda: scene(thing=black), [ur.Parameter(KEY)], [ur.View(reference)], max_depth=2)
+    start, learning, repetitions = problem.initial(), 1, 24
+
+    def variance(sampler: Any) -> float:
+        estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=2)
+        state, found = estimator.init(problem, start), []
+        for step in range(learning + repetitions):
+            estimate, after = estimator.estimate(problem, start, state, Key(0, step))
+            if step < learning:
+                state = after
+            else:
+                found.append(np.array(estimate.gradient[KEY], float))
+        return float(np.var(found, axis=0, ddof=1).sum())
+
+    sampler = ur.pixels.Adaptive(64, samples=1024, uniform=0.1, denoiser="pooling")
+    uniform, adaptive = variance(ur.pixels.Uniform(64)), variance(sampler)
+    assert adaptive < 0.7 * uniform
+    monkeypatch.setattr(
+        BoundaryTerm,
+        "tangent_moment",
+        lambda self, scene, request: mi.TensorXf(dr.zeros(mi.Float, 3 * dr.width(request.pixels))),
+    )
+    assert variance(sampler) > 0.7 * uniform
 
 
 @pytest.mark.slow

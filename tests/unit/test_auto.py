@@ -224,3 +224,22 @@ def test_textures_of_one_material_share_the_rate() -> None:
     _, optimizer = chosen(made)
     rates = [optimizer.learning_rate[key] for key in values]
     assert rates == pytest.approx([0.1 / 2**0.5, 0.1 / 2**0.5, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
+def test_mini_batches_of_views_are_damped_as_whole_views_are(loss: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of pixels here and there are not: their noise is not known."""
+    for sampler, damped in ((pixels.All(), True), (pixels.Views(1), True), (pixels.Uniform(4), False)):
+        monkeypatch.setattr(module.AutoMethod, "_sampler", lambda self, problem, sampler=sampler: (sampler, ""))
+        expected = module._TOLERANCE if damped and not loss.linear else 0.0
+        assert chosen(problem(loss))[0].tolerance == expected
+
+
+def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
+    """And where a step shows half of the views."""
+    for loss, name in ((losses.L1(), "rcv"), (losses.Huber(), "rcv"), (losses.L2(), "plain")):
+        assert module.AutoMethod()._image(problem(loss), True, True).name == name
+    assert module.AutoMethod()._image(problem(losses.L1()), False, True).name == "plain"
+    many: Any = SimpleNamespace(views=[None] * 16)
+    found = [module._shows_half(many, s) for s in (pixels.All(), pixels.Views(8), pixels.Views(7), pixels.Uniform(4))]
+    assert found == [True, True, False, False]

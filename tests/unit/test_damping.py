@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from unrender.estimators.damping import damping, smoothed_variance
+from unrender.estimators.sample_groups import _derivative
 from unrender.images.base import variance_of_mean
 from unrender.losses import L1
+from unrender.problem.batches import PixelBatch, PixelSample
 
 
 def test_the_damped_sign_is_the_derivative_of_charbonniers_loss():
@@ -51,3 +56,20 @@ def test_the_variance_of_a_mean_is_that_of_numpy():
     assert found is not None
     np.testing.assert_allclose(found, images.var(axis=0, ddof=1) / 7, rtol=1e-9)
     assert variance_of_mean(images[:1]) is None
+
+
+def test_mini_batches_of_whole_views_are_damped_as_these_are() -> None:
+    """By the variance around each pixel in its own view; what fills a batch up, and pixels drawn here and there, are not."""
+    random, sizes = np.random.default_rng(0), [(3, 4), (5, 2)]
+    views, pixels = np.r_[np.zeros(12, int), np.ones(10, int), 0], np.r_[np.arange(12), np.arange(10), 0]
+    reference, image, variance = random.random((3, 23, 3))
+    targets = SimpleNamespace(at=lambda views, pixels: (reference, np.ones((len(views), 1))))
+    problem: Any = SimpleNamespace(sizes=sizes, loss=L1(), references=targets)
+    frame = PixelBatch(problem, PixelSample(views, pixels, np.ones((23, 1))))
+    assert frame.whole == ((slice(0, 12), (3, 4)), (slice(12, 22), (5, 2)))
+    around = [smoothed_variance(variance[rows].reshape(*size, 3)).reshape(-1, 3) for rows, size in frame.whole]
+    expected = damping(image - reference, np.concatenate([*around, np.zeros((1, 3))]), 2.0)
+    np.testing.assert_allclose(_derivative(problem, frame, variance, 2.0)(image), np.sign(image - reference) * expected)
+    order = random.permutation(23)
+    drawn = PixelBatch(problem, PixelSample(views[order], pixels[order], np.ones((23, 1))))
+    np.testing.assert_array_equal(_derivative(problem, drawn, variance, 2.0)(image), np.sign(image - reference))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.remeshing import Remeshing
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.mesh_watch import MeshWatch
+from unrender.stages.stage_problem import _check
 
 POINTS, FACES = meshes.icosphere(2)
 COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)
@@ -346,3 +348,18 @@ def test_whole_views_are_drawn_evenly() -> None:
     assert whole is not None
     assert len(np.unique(whole.views)) == 5
     assert (np.asarray(whole.weights) == 1).all()
+
+
+def test_only_the_last_stage_may_remesh() -> None:
+    """Before anything is rendered: the triangles that a stage ends with are not those of the next one's scene."""
+    key = "ball.vertex_positions"
+    first, last = (SimpleNamespace(name=name, unknowns=[key]) for name in ("coarse", "fine"))
+    stages: Any = SimpleNamespace(stages=[first, last], problem="problem.toml")
+    _check(stages, {key: ur.Parameter(key)})
+    given = {key: ur.Parameter(key, remeshing={"steps": [5], "method": "subdivide"})}
+    with pytest.raises(
+        ur.InputError, match=r"stage coarse: ball.vertex_positions is remeshed, .* in the last stage alone"
+    ):
+        _check(stages, given)
+    stages.stages = [last]
+    _check(stages, given)

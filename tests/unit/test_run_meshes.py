@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from unrender import report
 from unrender.gallery import meshes
 from unrender.io import mesh_writing
 from unrender.report import shapes
+from unrender.runs import reopen
 from unrender.runs.folder import reader
 
 KEY = "ball.vertex_positions"
@@ -108,3 +110,23 @@ def test_meshes_turn_or_are_a_picture(tmp_path: Path) -> None:
         canvas, picture = page.locator(".shape canvas"), page.locator(".shape img")
         assert canvas.is_visible() != picture.is_visible()
         assert page.complaints == []
+
+
+def test_a_problem_gets_the_triangles_that_a_run_ended_with(tmp_path: Path) -> None:
+    """Judging, turning and exporting render the result of a mesh that was remeshed; one that was not stays as it is."""
+    points, faces = meshes.icosphere(0)
+    finer = {f"{KEY}/first_faces": faces}
+    path = write_run(
+        tmp_path / "run",
+        truth={},
+        initial={KEY: points.reshape(-1).astype(np.float32)},
+        parameters={KEY: POINTS.reshape(-1).astype(np.float32)},
+    )
+    np.savez(path / "meshes.npz", **{f"{KEY}/faces": FACES, **finer})  # type: ignore
+    run = reader.read(path)
+    problem: Any = SimpleNamespace(faces={KEY: faces}, remeshed=lambda found: found)
+    found: Any = reopen.with_meshes(problem, run)
+    np.testing.assert_array_equal(found[KEY].faces, FACES)
+    np.testing.assert_array_equal(found[KEY].vertices, POINTS.astype(np.float32))
+    problem.faces = {KEY: FACES}
+    assert reopen.with_meshes(problem, run) is problem

@@ -1,8 +1,11 @@
-"""A mesh from pictures by whole views, by some of them, and by uniform and adaptive mini-batches of pixels (Adaptive, Fig. 9).
+"""Meshes from pictures by whole views, by some of them, and by uniform and adaptive mini-batches of pixels (Adaptive, Fig. 9).
 
-`sphere-to-bunny`, large steps and one rate for all vertices, plain images, equal processor time of all threads. Rates are tried on a seed
-of their own, for each way of choosing pixels. Adaptive probabilities are of the second moment of what path replay differentiates; the
-boundary's derivatives, of what the silhouettes cover, are not part of it. Surface errors over the start's.
+Large steps and one rate for all vertices, plain images, equal processor time of all threads. Rates are tried on a seed of their own, for
+each way of choosing pixels. `sphere-to-bunny` shows shading and silhouettes, and is judged by the surface; of `shadow-art` nothing is known
+but the edges of two shadows, and it is judged by the pictures. Errors over the start's.
+
+Variance: of the gradient at the start, by the coordinates of the large steps, summed, after some steps that adaptive probabilities learn
+from; with parameters as they are.
 """
 
 from __future__ import annotations
@@ -12,13 +15,16 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import PixelSampler
+from benchmarks.internals import Key, PixelSampler
 from benchmarks.races import TUNING_SEED, search
-from benchmarks.shapes.equal_time.run import Kept, blind, measured
+from benchmarks.shapes.equal_time.run import Kept, blind, measured, picture_error
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "resolution": 8, "subdivisions": 1, "views": 2, "pixels": 16, "rates": [0.01],
+    "problems": ["sphere-to-bunny"], "repetitions": 2,
 }  # fmt: skip
+_LEARNING = 12
+"""Steps before the variance is measured."""
 
 
 def samplers(pixels: int, views: int) -> dict[str, PixelSampler]:
@@ -31,49 +37,77 @@ def samplers(pixels: int, views: int) -> dict[str, PixelSampler]:
     }
 
 
+def variance(problem: ur.Problem, sampler: PixelSampler, spp: int, repetitions: int) -> float:
+    """Of the gradient at the start."""
+    estimator, start = ur.PathGradient(ur.images.Plain(), sampler, spp=spp), problem.initial()
+    state, found = estimator.init(problem, start), []
+    (key,) = problem.faces
+    for step in range(_LEARNING + repetitions):
+        estimate, after = estimator.estimate(problem, start, state, Key(TUNING_SEED, step))
+        if step < _LEARNING:
+            state = after
+        else:
+            by_u = problem.coordinates.by_u(estimate.gradient, start)
+            found.append(np.array(problem.coordinates.pull_back(by_u, {})[key], np.float64).ravel())
+    return float(np.var(found, axis=0, ddof=1).sum())
+
+
 def descend(
     problem: ur.Problem, sampler: PixelSampler, rate: float, spp: int, seconds: float, seed: int
 ) -> dict[str, Any]:
-    """The curve of one run."""
+    """The curve of one run, and what it reached."""
     kept = Kept(seconds)
     estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=spp)
     descent = ur.optimizers.Adam(rate, uniform=True)
     ur.optimize(blind(problem), estimator, descent, seconds=100 * seconds, seed=seed, callbacks=[kept])
-    return measured(problem, kept.found)
+    if problem.surfaces:
+        return measured(problem, kept.found)
+    start = picture_error(problem, problem.initial_values())
+    return {"pictures": picture_error(problem, kept.found[-1][1]) / start}
 
 
 def run(
     seconds: float = 10.0,
-    seeds: int = 2,
+    seeds: int = 3,
+    problems: tuple[str, ...] = ("sphere-to-bunny", "shadow-art"),
     resolution: int = 64,
     subdivisions: int = 3,
     views: int = 6,
     pixels: int = 2048,
     spp: int = 4,
     strength: float = 4.0,
-    rates: tuple[float, ...] = (0.01, 0.03),
+    rates: tuple[float, ...] = (0.03, 0.1),
+    repetitions: int = 40,
 ) -> dict[str, Any]:
     """Every way.
 
     Args:
         seconds: of a run, of the processor
         seeds: of the runs that count
-        views: how many
+        problems: of the gallery
+        views: how many, of problems that let it be chosen
         pixels: of a mini-batch
         strength: of the large steps
         rates: tried on a seed of its own
+        repetitions: gradients that a variance is of
     """
-    problem = ur.gallery.problem("sphere-to-bunny", resolution=resolution, subdivisions=subdivisions, views=views)
-    (key,) = problem.faces
-    problem = problem.preconditioned({key: ur.preconditioners.LargeSteps(strength)})
     found: dict[str, Any] = {}
-    for name, sampler in samplers(pixels, views).items():
+    for name in problems:
+        options = {} if name == "shadow-art" else {"views": views}
+        problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, **options)
+        (key,) = problem.faces
+        problem = problem.preconditioned({key: ur.preconditioners.LargeSteps(strength)})
+        what = "surface" if problem.surfaces else "pictures"
+        found[name] = {"judged by": what, "views": len(problem.views), "methods": {}}
+        for way, sampler in samplers(pixels, len(problem.views)).items():
 
-        def final(rate: float, sampler: PixelSampler = sampler) -> float:
-            return descend(problem, sampler, rate, spp, seconds, TUNING_SEED)["surface"]
+            def final(rate: float, sampler: PixelSampler = sampler, problem: ur.Problem = problem) -> float:
+                found = descend(problem, sampler, rate, spp, seconds, TUNING_SEED)
+                return found["surface" if problem.surfaces else "pictures"]
 
-        rate, _ = search(tuple(rates), final)
-        runs = [descend(problem, sampler, rate, spp, seconds, seed) for seed in range(seeds)]
-        found[name] = {"rate": rate, "runs": runs}
-        print(name, rate, [float(np.round(one["surface"], 3)) for one in runs], flush=True)
-    return {"methods": found}
+            rate, _ = search(tuple(rates), final)
+            runs = [descend(problem, sampler, rate, spp, seconds, seed) for seed in range(seeds)]
+            noise = variance(problem, sampler, spp, repetitions)
+            found[name]["methods"][way] = {"rate": rate, "variance": noise, "runs": runs}
+            print(name, way, rate, [float(np.round(one[what], 3)) for one in runs], noise, flush=True)
+    return {"problems": found}

@@ -7,17 +7,26 @@ from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """What was left of the errors."""
+    """What was left of the errors, and the gradient's variance."""
     rows = []
-    for name, of in record["methods"].items():
-        finals = [
-            markdown.median_range((float(np.median(values)), min(values), max(values)))
-            for values in ([run[what] for run in of["runs"]] for what in ("surface", "pictures"))
-        ]
-        rows.append([name, f"{of['rate']:g}", *finals])
+    for problem, of_problem in record["problems"].items():
+        methods = of_problem["methods"]
+        for name, of in methods.items():
+            finals = [
+                markdown.median_range((float(np.median(values)), min(values), max(values))) if values else "–"
+                for values in ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
+            ]
+            uniform = methods["uniform"]["variance"]
+            noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
+            rows.append([problem, name, f"{of['rate']:g}", *finals, noise])
     settings = record["settings"]
     said = (
         f"Of the start's, after {settings['seconds']:g} s of the processor, {settings['seeds']} seeds: median (least to greatest). "
-        f"{settings['views']} views of {settings['resolution']}², mini-batches of {settings['pixels']} pixels, {settings['spp']} spp."
+        f"Views of {settings['resolution']}², mini-batches of {settings['pixels']} pixels, {settings['spp']} spp. "
+        "Variance of the gradient at the start, over that of uniform mini-batches."
     )
-    return said + "\n\n" + markdown.table(["pixels", "rate", "surface error", "picture error"], rows)
+    return (
+        said
+        + "\n\n"
+        + markdown.table(["problem", "pixels", "rate", "surface error", "picture error", "variance"], rows)
+    )

@@ -71,10 +71,10 @@ class PathGradient:
         adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for leave-one-out groups, and for `spp` paths of
             its own where `spp` cannot be divided into groups: 1, and primes above 16.
         tolerance: κ >= 0. Where it is above 0, the loss's derivative not linear, as of L1, and the variance σ² of the image known (of
-            a whole view, of several samples), the derivative at the residual r is multiplied by |r| / √(r² + κ² σ²), with σ² averaged
-            over neighbouring pixels. Of L1 that makes Charbonnier's loss √(r² + δ²) with δ = κ σ: where the sign of r is the noise's,
-            r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls, it is the loss
-            itself again.
+            whole views, or mini-batches of these, of several samples), the derivative at the residual r is multiplied by |r| / √(r² + κ²
+            σ²), with σ² averaged over neighbouring pixels. Of L1 that makes Charbonnier's loss √(r² + δ²) with δ = κ σ: where the sign of
+            r is the noise's, r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls,
+            it is the loss itself again.
         fresh_from: the estimate, counted from 0, from which eight have `FreshGradient`, too, as again from twice, four times, … that
             count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples (where it
             does not, every gradient is fresh), and with a linear derivative or a tolerance.

@@ -3,7 +3,7 @@ two on one set of paths."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -302,10 +302,23 @@ def _view_statistics(counts: SampleCounts, weights: Array, moments: Array) -> Dr
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:
     """The loss derivative of a frame's images; damped where the variance of its image is known, and the loss biased by it."""
     loss = problem.loss
-    if not isinstance(frame, WholeView) or variance is None or not tolerance or loss.linear or not loss.pixelwise:
+    if variance is None or not tolerance or loss.linear or not loss.pixelwise:
         return frame.loss_derivative
-    around, reference = (frame.laid(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
+    match frame:
+        case WholeView():
+            around, reference = (frame.laid(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
+        case PixelBatch(whole=whole) if whole:
+            around, reference = _variance_by_views(variance, whole), frame.targets[0]
+        case _:
+            return frame.loss_derivative
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
+
+
+def _variance_by_views(variance: Array, whole: Sequence[tuple[slice, tuple[int, int]]]) -> Array:
+    """`smoothed_variance` of the pixels (N, 3) of whole views; 0 for what comes after these, which fills a batch up."""
+    parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in whole]
+    rest = variance[whole[-1][0].stop :]
+    return arrays.concatenate([*parts, rest * 0.0] if int(arrays.shape(rest)[0]) else parts)
 
 
 def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: Array, weights: Array) -> Array:

@@ -29,7 +29,6 @@ from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.photographs import scene_renderer, scene_values
-from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
@@ -128,13 +127,8 @@ def _opened(
     if Path(what).suffix.lower() == ".toml":
         problem = Problem.from_file(what)
         return problem, problem.initial_values()
-    problem, run = reopen.problem_of(what), folders.read(what)
-    remeshed = {
-        key: ReplacedMesh(run.parameters[key].reshape(-1, 3), mesh.faces, mesh.uv)
-        for key, mesh in run.meshes.items()
-        if key in problem.faces and not np.array_equal(mesh.faces, problem.faces[key])
-    }
-    return problem.remeshed(remeshed) if remeshed else problem, run.parameters
+    run = folders.read(what)
+    return reopen.with_meshes(reopen.problem_of(what), run), run.parameters
 
 
 def _write(

@@ -260,10 +260,15 @@ class RecursiveControlVariate:
     ) -> ImageEstimate:
         """Both images of a mini-batch, (groups, N, 3), with the snapshot as control variate; the previous one is that of `asked`."""
         row = problem.references.rows(frame.sample.views, frame.sample.pixels)
-        image, weight = (arrays.gather_rows(x, row) for x in (snapshot.image, snapshot.weight))
+        image, weight, past = (
+            arrays.gather_rows(x, row) for x in (snapshot.image, snapshot.weight, snapshot.relative_variance)
+        )
         current = advance(image, rendering.images, rendering.previous, weight)
         previous = advance(image, asked.previous, rendering.previous, weight)
-        return ImageEstimate(current, asked.paths, previous=previous)
+        variance = variance_of_mean(current)
+        if variance is not None:
+            variance = variance + weight * weight * past * variance_of_mean(rendering.previous)
+        return ImageEstimate(current, asked.paths, previous=previous, variance=variance)
 
     def _combine_view(
         self, memory: ViewMemory, rendering: Rendering, asked: Rendering, frame: WholeView

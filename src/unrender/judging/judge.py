@@ -104,7 +104,7 @@ def judge(
     given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _found(Path(run), problem, found)
     vignetting = values.get(VIGNETTING)
-    judged, values, notices = _problem(problem, given, values)
+    judged, values, notices = _problem(problem, given, values, found)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
     notices += _unknown_of_photographs(problem) if measured else []
@@ -154,7 +154,7 @@ def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.
 
 
 def _problem(
-    problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray]
+    problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """What was found with the held-out views, and its values."""
     other = Problem.from_file(held_out)
@@ -169,6 +169,7 @@ def _problem(
     judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
     if not isinstance(judged.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")
+    judged = reopen.with_meshes(judged, run)
     values = {key: parameters[key] for key in kept}
     for key, shape in judged.shapes().items():
         if shape != np.shape(values[key]):

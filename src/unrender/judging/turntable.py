@@ -102,7 +102,8 @@ def turntable(
     axis = None if up is None else _axis(up)
     videos.check(place, overwrite)
     light = None if environment is None else scenes.read_light(Path(environment))
-    problem, found = reopen.problem_of(run), folders.read(run)
+    found = folders.read(run)
+    problem = reopen.with_meshes(reopen.problem_of(run), found)
     with tempfile.TemporaryDirectory() as scratch:
         path = scenes.export_scene(problem, problem.full(found.parameters), Path(scratch) / "scene")
         scene = scenes.load_scene(path)

@@ -93,10 +93,11 @@ class AutoMethod(Options):
 
     The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
     other than L2. Its errors are forgotten after some 20 steps, of L1 and such 33, lest steps follow them. Where the scene cannot be
-    loaded twice, each step has its own rendering. Textures, grids and values at the vertices of
-    meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by steps in proportion
-    to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside path gradients of
-    the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every choice can be set.
+    loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
+    the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
+    steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside
+    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every
+    choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -167,7 +168,7 @@ class AutoMethod(Options):
         given = given or {}
         sampler, drawn = self._sampler(problem)
         meshes = tuple(problem.faces)
-        image = self._image(problem, isinstance(sampler, pixels.All), bool(meshes))
+        image = self._image(problem, _shows_half(problem, sampler), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = _logarithms(problem) if self.parameterise else {}
         moved = {key: name for key, name in moved.items() if key not in given}
@@ -186,7 +187,7 @@ class AutoMethod(Options):
             parameterisations=moved,
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
-        tolerance = self.tolerance if biased and isinstance(sampler, pixels.All) else 0.0
+        tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         first = ", ".join(f"{rate:.3g} ({key})" for key, rate in {**rates, **problem.learning_rates}.items())
         reasons = (
@@ -223,10 +224,10 @@ class AutoMethod(Options):
     def _image(self, problem: Problem, whole: bool, deforms: bool) -> _Image:
         if self.image == "plain":
             return _Image("plain", Plain(), "as asked for")
-        if self.image is None and deforms:
-            return _Image("plain", Plain(), "a mesh moves (--set image=rcv uses earlier samples again)")
+        if self.image is None and deforms and problem.loss.linear:
+            return _Image("plain", Plain(), "a mesh moves, and the loss is unbiased without a memory")
         if self.image is None and not whole:
-            return _Image("plain", Plain(), "control variates need whole views")
+            return _Image("plain", Plain(), "control variates need whole views, half of them a step")
         space, obstacle = _shared_space(problem)
         if obstacle and self.image is None:
             return _Image("plain", Plain(), f"no control variates: {obstacle}")
@@ -262,6 +263,12 @@ class AutoMethod(Options):
             and key not in problem.preconditioners
             and (grid.is_map(shape) or (known[key].mesh is not None and not known[key].welded))
         )
+
+
+def _shows_half(problem: Problem, sampler: PixelSampler) -> bool:
+    """Whether a step renders all views, or half of them: what was remembered of a view seldom seen is of another mesh."""
+    half = isinstance(sampler, pixels.Views) and 2 * sampler.count >= len(problem.views)
+    return half or isinstance(sampler, pixels.All)
 
 
 def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:

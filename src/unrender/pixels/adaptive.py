@@ -50,10 +50,10 @@ class Adaptive:
     paths; per cost c_j of a path, and mixed with uniform sampling u.
 
     Both factors are estimated from a few paths per tile of pixels, denoised; the second by one pass in forward mode with random ±1
-    tangents (`Renderer.tangent_moment`). The samples of the first steps, and of one between two updates, add to both
-    (`LearningSampler`), where the estimator can tell what they saw. Parameters with a preconditioner count as u, where x = S u, the
-    coordinates of the descent. The gradient is unbiased for any positive probabilities, so errors of these estimates change its
-    variance only.
+    tangents (`RenderSession.tangent_moment`), where shapes move with the derivative by the borders of silhouettes and shadows. The
+    samples of the first steps, and of one between two updates, add to both (`LearningSampler`), where the estimator can tell what they
+    saw. Parameters with a preconditioner count as u, where x = S u, the coordinates of the descent. The gradient is unbiased for any
+    positive probabilities, so errors of these estimates change its variance only.
 
     Few paths know nothing of rare bright ones, and a map that has missed them can make the variance many times that of uniform
     sampling. Since p_j >= λ u_j, the second moment of the gradient is at most 1 / λ times uniform sampling's. λ is 0.8 at first, so at

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
+
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.problem.problem import Problem
@@ -111,6 +113,21 @@ class PixelBatch:
     def targets(self) -> tuple[Array, Array]:
         """Their reference values (N, 3), and the factor of each one's loss (N, 1): view weight * mask / (H * W * 3)."""
         return self.problem.references.at(self.sample.views, self.sample.pixels)
+
+    @cached_property
+    def whole(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
+        """Of views all of whose pixels are here one after the other, as of `pixels.Views`: where they are, and (height, width)."""
+        views, pixels = (arrays.numpy(x).astype(np.int64) for x in (self.sample.views, self.sample.pixels))
+        sizes, found, start = self.problem.sizes, [], 0
+        while start < len(views):
+            height, width = sizes[views[start]]
+            stop = start + height * width
+            of_one = views[start:stop] == views[start]
+            if len(of_one) < height * width or not of_one.all() or not (np.diff(pixels[start:stop]) == 1).all():
+                break
+            found.append((slice(start, stop), (height, width)))
+            start = stop
+        return tuple(found)
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
         """See `Frame.request`."""

@@ -172,7 +172,8 @@ class RenderSession(Protocol):
         images where it has several groups, each from its own samples; of one image where it has one group.
 
         Over tangents that are independent and ±1 its expectation is Σ_k E[(∂f/∂θ_k)²], the second moment of all the single-parameter
-        derivatives of a path.
+        derivatives of a path. Where `adjoint` has a part that no path has, of borders that move, the square of the pixel's derivative by
+        that part is added, its noise included.
         """
         ...
 

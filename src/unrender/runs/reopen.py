@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from unrender import gallery
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
@@ -13,12 +15,13 @@ from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
 from unrender.problem import serialization
 from unrender.problem.problem import Problem
+from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs.callbacks import Callback
-from unrender.runs.folder.reader import read_run_record
+from unrender.runs.folder.reader import RunFolder, read_run_record
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
 
-__all__ = ["problem_of", "resume"]
+__all__ = ["problem_of", "resume", "with_meshes"]
 
 _LONGEST = 1 << 24
 
@@ -53,6 +56,16 @@ def resume(
     """
     found = load_run(directory, steps, seconds)
     return resume_run(found, problem or problem_of(directory), force, callbacks, estimator, optimizer)
+
+
+def with_meshes(problem: Problem, run: RunFolder) -> Problem:
+    """The problem with the triangles that a run's meshes ended with, where they were remeshed on the way."""
+    remeshed = {
+        key: ReplacedMesh(run.parameters[key].reshape(-1, 3), mesh.faces, mesh.uv)
+        for key, mesh in run.meshes.items()
+        if key in problem.faces and not np.array_equal(mesh.faces, problem.faces[key])
+    }
+    return problem.remeshed(remeshed) if remeshed else problem
 
 
 def problem_of(directory: str | Path) -> Problem:

@@ -48,12 +48,13 @@ class Whole:
         """Of the stages' problem file.
 
         Raises:
-            InputError: it is malformed, a stage names what is no parameter of it, or leaves out what no scene can hold.
+            InputError: it is malformed, a stage names what is no parameter of it, leaves out what no scene can hold, or remeshes a mesh
+                that later stages know by its first triangles.
         """
         problem = Problem.from_file(stages.problem)
         known = problem.renderer.parameters()
         parameters = {parameter.key: parameter for parameter in problem.parameters}
-        _check(stages, list(parameters))
+        _check(stages, parameters)
         return cls(
             Path(problem.origin["scene"]),
             parameters,
@@ -112,7 +113,8 @@ class Whole:
         return replace(parameter, coarse_to_fine=coarse if max(coarse.shape(info.shape, 0)[:-1]) > 1 else None)
 
 
-def _check(stages: Stages, keys: list[str]) -> None:
+def _check(stages: Stages, parameters: Mapping[str, Parameter]) -> None:
+    keys = list(parameters)
     moved: dict[str, str] = {}
     for stage in stages.stages:
         for key in stage.unknowns:
@@ -124,4 +126,10 @@ def _check(stages: Stages, keys: list[str]) -> None:
                 raise InputError(
                     f'stage {stage.name}: "{key}" is an unknown of stage {first}, and no scene can hold it: name it here, too'
                 )
+        remeshed = next((key for key in stage.unknowns if parameters[key].remeshing is not None), None)
+        if remeshed and stage is not stages.stages[-1]:
+            raise InputError(
+                f"stage {stage.name}: {remeshed} is remeshed, and later stages know the mesh by its first triangles: move it in the last "
+                "stage alone, or leave out remeshing"
+            )
         moved |= {key: stage.name for key in OF_PHOTOGRAPHS if key in stage.unknowns and key not in moved}

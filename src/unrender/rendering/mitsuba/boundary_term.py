@@ -15,7 +15,7 @@ from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
-from unrender.rendering.mitsuba.view_weights import views_of
+from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
 from unrender.rendering.renderer import SampleRequest
 
 __all__ = ["BoundaryTerm", "moved_shape", "obstacles"]
@@ -83,17 +83,44 @@ class BoundaryTerm:
             request: of the rendering; the boundary's numbers are independent of its own.
             weights: of `RenderSession.adjoint`.
         """
-        key = Key(request.seed, 0, _STREAM)
         for view in views_of(request, weights, self._resolutions):
-            sensor = scene.scene.sensors()[view.sensor]
-            if sensor.class_name() != "PerspectiveCamera":
-                raise InputError(
-                    f"sensor {sensor.id()}: moving shapes have path gradients in perspective views only, and it is another "
-                    f"({sensor.class_name()}): --method smoothed"
-                )
-            seed = key.fold(view.sensor).uint32()
-            # A mini-batch has another number of each view's pixels at each step; kernels are recorded anew for each.
-            samples = view.samples if request.pixels is None else 1 << (view.samples - 1).bit_length()
+            sensor, seed, samples = self._samples(scene, request, view)
             found = self._integrator.weighted_image(scene.scene, sensor, view.image, seed, samples)
             if dr.grad_enabled(found):
                 dr.backward(found, dr.ADFlag.ClearInterior)
+
+    def tangent_moment(self, scene: LoadedScene, request: SampleRequest) -> mi.TensorXf:
+        """The squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3).
+
+        Of as many samples as `accumulate` takes: their noise is part of the second moment, as it is of the gradient.
+
+        Args:
+            scene: its parameters are set, and have tangents.
+            request: of the rendering.
+        """
+        sensor = scene.scene.sensors()[request.sensor]
+        count = dr.prod(sensor.film().crop_size()) if request.pixels is None else dr.width(request.pixels)
+        found = dr.zeros(mi.Float, 3 * int(count))
+        nothing = dr.zeros(mi.TensorXf, (1, int(count), 3))
+        for view in views_of(request, nothing, self._resolutions):
+            sensor, seed, samples = self._samples(scene, request, view)
+            image = self._integrator.tangent_image(scene.scene, sensor, seed, samples)
+            element = dr.arange(mi.UInt32, 3 * dr.width(view.pixels))
+            channel = element % 3
+            of_pixel = dr.gather(mi.UInt32, view.pixels, element // 3) * 3 + channel
+            into = dr.gather(mi.UInt32, view.rows, element // 3) * 3 + channel
+            dr.scatter(found, dr.square(dr.gather(mi.Float, image.array, of_pixel)), into)
+        return mi.TensorXf(found, (int(count), 3))
+
+    @staticmethod
+    def _samples(scene: LoadedScene, request: SampleRequest, view: ViewWeights) -> tuple[mi.Sensor, int, int]:
+        """Of a view: its sensor, and the seed and number of its boundary samples."""
+        sensor = scene.scene.sensors()[view.sensor]
+        if sensor.class_name() != "PerspectiveCamera":
+            raise InputError(
+                f"sensor {sensor.id()}: moving shapes have path gradients in perspective views only, and it is another "
+                f"({sensor.class_name()}): --method smoothed"
+            )
+        # A mini-batch has another number of each view's pixels at each step; kernels are recorded anew for each.
+        samples = view.samples if request.pixels is None else 1 << (view.samples - 1).bit_length()
+        return sensor, Key(request.seed, 0, _STREAM).fold(view.sensor).uint32(), samples

@@ -252,7 +252,8 @@ class MitsubaSession:
         return gradient
 
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
-        """Path replay in forward mode: the squared derivative of each path along the tangents. See `RenderSession.tangent_moment`."""
+        """Path replay in forward mode: the squared derivative of each path along the tangents, and where shapes move the squared boundary
+        derivative of its pixel. See `RenderSession.tangent_moment`."""
         self._check_keys(parameters)
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
@@ -263,6 +264,10 @@ class MitsubaSession:
         squares = self._run(TangentPass(), paths.request, paths.radiance)
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
+        if self._boundary is not None:
+            moments += mi.TensorXf(
+                self._boundary.tangent_moment(self._pair.loaded(), paths.request).array, moments.shape[1:]
+            )
         return moments if paths.request.groups > 1 else moments[0]
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:

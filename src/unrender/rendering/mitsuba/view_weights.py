@@ -24,6 +24,7 @@ class ViewWeights:
         image: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; 0 at pixels that were not asked for.
         pixels: `mi.UInt32`, flat indices of those that were; one may occur twice.
         values: `mi.Float` (3 N,), the weights of these.
+        rows: `mi.UInt32`, where these are among all pixels of the request.
         spp: samples per pixel.
     """
 
@@ -31,6 +32,7 @@ class ViewWeights:
     image: Any
     pixels: Any
     values: Any
+    rows: Any
     spp: int
 
     @property
@@ -60,7 +62,7 @@ def views_of(
     if request.pixels is None:
         shape = (*resolutions[request.sensor], 3)
         pixels = dr.arange(mi.UInt32, size // 3)
-        yield ViewWeights(request.sensor, mi.TensorXf(mean, shape), pixels, mean, request.spp)
+        yield ViewWeights(request.sensor, mi.TensorXf(mean, shape), pixels, mean, pixels, request.spp)
         return
     which = np.full(size // 3, request.sensor) if request.sensors is None else np.array(request.sensors)
     for sensor in np.unique(which).tolist():
@@ -71,4 +73,4 @@ def views_of(
         values = dr.gather(mi.Float, mean, dr.gather(mi.UInt32, own, element // 3) * 3 + element % 3)
         image = dr.zeros(mi.Float, height * width * 3)
         dr.scatter_add(image, values, dr.gather(mi.UInt32, pixels, element // 3) * 3 + element % 3)
-        yield ViewWeights(int(sensor), mi.TensorXf(image, (height, width, 3)), pixels, values, request.spp)
+        yield ViewWeights(int(sensor), mi.TensorXf(image, (height, width, 3)), pixels, values, own, request.spp)

@@ -26,7 +26,14 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgeTable
-from unrender.rendering.mitsuba.integrators.boundary_paths import OFFSET, BoundarySegment, EyePath, Picture
+from unrender.rendering.mitsuba.integrators.boundary_paths import (
+    OFFSET,
+    BoundarySegment,
+    EyePath,
+    Picture,
+    TangentPicture,
+    WeightedPicture,
+)
 from unrender.rendering.mitsuba.integrators.boundary_sampling import (
     EmitterPoints,
     SilhouetteWedge,
@@ -65,9 +72,23 @@ class BoundaryIntegrator:
             seed: in [0, 2**32).
             samples: of each of the three parts.
         """
+        return self._collected(WeightedPicture(scene, sensor, weights, samples), seed)
+
+    def tangent_image(self, scene: Any, sensor: Any, seed: int, samples: int) -> Any:
+        """The derivative of the image, `mi.TensorXf` (H, W, 3), along the tangents that the meshes' positions have; detached. Unbiased.
+
+        Args:
+            scene, sensor, seed, samples: of `weighted_image`.
+        """
+        picture = TangentPicture(scene, sensor, samples)
+        self._collected(picture, seed)
+        return picture.image()
+
+    def _collected(self, picture: Picture, seed: int) -> Any:
+        """What a picture collects of all three parts."""
+        scene = picture.scene
         with dr.resume_grad():
             positions = self._table.positions(scene)
-        picture = Picture(scene, sensor, weights, samples)
         if self._table.moving == 0:
             return mi.Float(0)
         found = self._primary(picture, positions, seed)
@@ -105,11 +126,10 @@ class BoundaryIntegrator:
             ray.maxt = dr.norm(towards) * (1 - _NEAR)
             active &= ~scene.ray_test(ray, active)
             jump = self._picture_jump(picture, uv, normal, dr.norm(towards), active, seed ^ 0x9E3779B9)
-            weighted = picture.weighted(jump, uv * picture.size, active)
-            scale = dr.select(active, weighted * length / pmf, 0)
+            jump *= length / pmf
         with dr.resume_grad():
             moved = picture.project_motion(dr.detach(point), uv, point)
-            return picture.scale * dr.sum(scale * dr.dot(normal, moved))
+            return picture.collect(jump, uv * picture.size, active, dr.dot(normal, moved))
 
     def _picture_jump(self, picture: Picture, uv: Any, normal: Any, distance: Any, active: Any, seed: int) -> Any:
         """Radiance before an edge on the picture (against its normal) less radiance beyond it."""
@@ -160,11 +180,10 @@ class BoundaryIntegrator:
             share = lights.share(distance, which)
         eye = EyePath(picture, segment, sampler, self._max_depth - 2, active)
         with dr.suspend_grad():
-            weighted = picture.weighted(eye.throughput * light, eye.position, eye.active)
             ratio = share(dr.norm(b - eye.first.p))
         with dr.resume_grad():
             motion = dr.dot(segment.normal, point - ratio * eye.moved)
-            return -picture.scale * dr.sum(dr.select(eye.active, weighted, 0) * motion)
+            return picture.collect(-eye.throughput * light, eye.position, eye.active, motion)
 
     # ------------------------------------------------------------------ edges and directions
 
@@ -191,14 +210,14 @@ class BoundaryIntegrator:
             near = dr.norm(segment.point - eye.first.p)
             parts = []
             for side, sign in ((0, 1.0), (1, -1.0)):
-                weighted = picture.weighted(eye.throughput * L[side] * (sign * factor), eye.position, eye.active)
                 ratio = dr.select(dr.isfinite(far[side]), dr.maximum(far[side] - near, 0) / far[side], 1)
-                parts.append((dr.select(eye.active, weighted, 0), ratio))
+                parts.append((eye.throughput * L[side] * (sign * factor), ratio))
         with dr.resume_grad():
             total = mi.Float(0)
-            for weighted, ratio in parts:
-                total += dr.sum(weighted * dr.dot(segment.normal, point - ratio * eye.moved))
-            return picture.scale * total
+            for value, ratio in parts:
+                motion = dr.dot(segment.normal, point - ratio * eye.moved)
+                total += picture.collect(value, eye.position, eye.active, motion)
+            return total
 
     def _both_sides(self, scene: Any, segment: BoundarySegment, eye: EyePath, seed: int) -> tuple[list[Any], list[Any]]:
         """Reflected radiance that arrives at x_a from the inner and from the outer side of an edge, and from what distances."""

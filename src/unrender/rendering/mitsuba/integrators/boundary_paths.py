@@ -10,16 +10,16 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgePoints
 
-__all__ = ["OFFSET", "BoundarySegment", "EyePath", "Picture"]
+__all__ = ["OFFSET", "BoundarySegment", "EyePath", "Picture", "TangentPicture", "WeightedPicture"]
 
 OFFSET = 1e-4
 """To the two sides of an edge: of the picture's side or, in space, of 1 + the largest coordinate."""
 
 
 class Picture:
-    """A perspective sensor's film, and the weights of its pixels."""
+    """A perspective sensor's film, which collects what `samples` boundary samples add to its pixels' derivatives."""
 
-    def __init__(self, scene: Any, sensor: Any, weights: Any, samples: int):
+    def __init__(self, scene: Any, sensor: Any, samples: int):
         size = sensor.film().crop_size()
         self.scene, self.sensor, self.samples = scene, sensor, samples
         self.width, self.height = int(size[0]), int(size[1])
@@ -27,7 +27,6 @@ class Picture:
         # Opaque: of a mini-batch's views the number differs from step to step, and kernels with it.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
         self.time: Any = dr.opaque(mi.Float, float(sensor.shutter_open()))
-        self._weights = weights.array
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
                 sensor.world_transform().inverse().matrix
@@ -57,13 +56,73 @@ class Picture:
         uv = uv + self._shift
         return mi.Vector2f(x - uv.x * change, y - uv.y * change) / w
 
-    def weighted(self, value: Any, position: Any, active: Any) -> Any:
-        """Σ over channels of value times weight of the pixel at `position`, in pixels."""
+    def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
+        """Take in samples whose part of their pixels' derivatives is value times the derivative of motion.
+
+        Args:
+            value: `mi.Spectrum`, detached, over the density of the sample.
+            position: on the film, in pixels.
+            active: whether it counts.
+            motion: `mi.Float`, attached to the meshes' positions.
+
+        Returns:
+            `mi.Float` of width 1, attached to the positions where the picture is for backward mode; sums are over what is returned.
+        """
+        raise NotImplementedError
+
+    def _element(self, position: Any) -> Any:
+        """Index of the first channel of the pixel at `position`, in pixels."""
         x = dr.clip(mi.Int32(dr.floor(position.x)), 0, self.width - 1)
         y = dr.clip(mi.Int32(dr.floor(position.y)), 0, self.height - 1)
-        index = mi.UInt32(y * self.width + x) * 3
-        parts = [value[c] * dr.gather(mi.Float, self._weights, index + c, active) for c in range(3)]
+        return mi.UInt32(y * self.width + x) * 3
+
+
+class WeightedPicture(Picture):
+    """Of which the weighted sum of all pixels is wanted, for backward mode.
+
+    Args:
+        weights: `mi.TensorXf` (H, W, 3).
+    """
+
+    def __init__(self, scene: Any, sensor: Any, weights: Any, samples: int):
+        super().__init__(scene, sensor, samples)
+        self._weights = weights.array
+
+    def weighted(self, value: Any, position: Any, active: Any) -> Any:
+        """Σ over channels of value times weight of the pixel at `position`, in pixels."""
+        first = self._element(position)
+        parts = [value[c] * dr.gather(mi.Float, self._weights, first + c, active) for c in range(3)]
         return parts[0] + parts[1] + parts[2]
+
+    def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
+        """See `Picture.collect`: the samples' part of Σ weights · image."""
+        with dr.suspend_grad():
+            weighted = dr.select(active, self.weighted(value, position, active), 0)
+        return self.scale * dr.sum(weighted * motion)
+
+
+class TangentPicture(Picture):
+    """Of which each pixel's derivative along the tangents of the meshes' positions is wanted: forward mode."""
+
+    def __init__(self, scene: Any, sensor: Any, samples: int):
+        super().__init__(scene, sensor, samples)
+        self._sums = dr.zeros(mi.Float, self.width * self.height * 3)
+
+    def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
+        """See `Picture.collect`: adds to `image`; returns 0."""
+        if dr.grad_enabled(motion):
+            # Edges stay: the two sides of an edge share some.
+            dr.forward_to(motion, flags=dr.ADFlag.ClearInterior)
+            speed = dr.grad(motion) * self.scale
+            with dr.suspend_grad():
+                first = self._element(position)
+                for c in range(3):
+                    dr.scatter_add(self._sums, value[c] * speed, first + c, active & dr.isfinite(speed))
+        return mi.Float(0)
+
+    def image(self) -> Any:
+        """`mi.TensorXf` (H, W, 3)."""
+        return mi.TensorXf(self._sums, (self.height, self.width, 3))
 
 
 class BoundarySegment:

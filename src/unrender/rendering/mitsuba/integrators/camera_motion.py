@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgeTable
-from unrender.rendering.mitsuba.integrators.boundary_paths import OFFSET, Picture
+from unrender.rendering.mitsuba.integrators.boundary_paths import OFFSET, WeightedPicture
 from unrender.rendering.mitsuba.integrators.boundary_sampling import WeightedChoice, lane_sampler
 from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, MirroredView
 from unrender.rendering.mitsuba.integrators.glossy_directions import glossy_radiance, is_glossy
@@ -113,7 +113,7 @@ class CameraMotion:
             self._mirrors = FlatMirrors(scene)
             self._curves = SilhouetteCurves(scene, self._table) if self._table is not None else None
         film = _FilmMap(sensor)
-        picture = Picture(scene, sensor, view.image, view.samples)
+        picture = WeightedPicture(scene, sensor, view.image, view.samples)
         found = self._pixels(picture, film, view, seed)
         if self._curves is not None:
             if self._curves.count:
@@ -124,7 +124,7 @@ class CameraMotion:
 
     # ------------------------------------------------------------------ pixels and their borders
 
-    def _pixels(self, picture: Picture, film: _FilmMap, view: ViewWeights, seed: int) -> Any:
+    def _pixels(self, picture: WeightedPicture, film: _FilmMap, view: ViewWeights, seed: int) -> Any:
         count = picture.samples
         with dr.suspend_grad():
             number = dr.arange(mi.UInt32, _POINTS * count)
@@ -155,7 +155,7 @@ class CameraMotion:
             total = dr.sum(dr.dot(border, film.place(seen.point)) + within * film.stretch(seen))
             return total * dr.opaque(mi.Float, 1 / view.spp)
 
-    def _look(self, picture: Picture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
+    def _look(self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
         """What is seen at `uv`; lanes a period apart share random numbers."""
         sensor, scene = picture.sensor, picture.scene
         ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
@@ -181,7 +181,7 @@ class CameraMotion:
         sampler = lane_sampler(seed, period, dr.width(ray.d))
         return self._radiance.sample(dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si)[0]
 
-    def _directions(self, picture: Picture, view: ViewWeights, seed: int) -> Any:
+    def _directions(self, picture: WeightedPicture, view: ViewWeights, seed: int) -> Any:
         """∫ Df du: what is seen at fixed points changes with the direction towards the sensor."""
         sensor, scene, count = picture.sensor, picture.scene, picture.samples
         with dr.suspend_grad():
@@ -209,7 +209,7 @@ class CameraMotion:
 
     # ------------------------------------------------------------------ silhouettes
 
-    def _silhouettes(self, curves: SilhouetteCurves, picture: Picture, film: _FilmMap, seed: int) -> Any:
+    def _silhouettes(self, curves: SilhouetteCurves, picture: WeightedPicture, film: _FilmMap, seed: int) -> Any:
         scene, count = picture.scene, picture.samples
         with dr.suspend_grad():
             mirrors = self._mirrors

@@ -1,0 +1,1 @@
+"""What the loss sees where a mesh moves."""
