@@ -10,6 +10,7 @@ from; with parameters as they are.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ def run(
     strength: float = 4.0,
     rates: tuple[float, ...] = (0.03, 0.1),
     repetitions: int = 40,
-) -> dict[str, Any]:
+) -> Iterator[dict[str, Any]]:
     """Every way.
 
     Args:
@@ -110,4 +111,4 @@ def run(
             noise = variance(problem, sampler, spp, repetitions)
             found[name]["methods"][way] = {"rate": rate, "variance": noise, "runs": runs}
             print(name, way, rate, [float(np.round(one[what], 3)) for one in runs], noise, flush=True)
-    return {"problems": found}
+            yield {"problems": found}

@@ -16,7 +16,7 @@ def table(record: Record) -> str:
                 markdown.median_range((float(np.median(values)), min(values), max(values))) if values else "–"
                 for values in ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
             ]
-            uniform = methods["uniform"]["variance"]
+            uniform = methods["uniform"]["variance"] if "uniform" in methods else 0.0
             noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
             rows.append([problem, name, f"{of['rate']:g}", *finals, noise])
     settings = record["settings"]
