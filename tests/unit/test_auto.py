@@ -13,6 +13,7 @@ import pytest
 from unrender import images, losses, optimizers, pixels
 from unrender.core import tables
 from unrender.core.errors import InputError
+from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
 from unrender.methods import auto as module
 from unrender.methods import method
@@ -250,3 +251,15 @@ def test_textures_of_one_material_share_the_rate() -> None:
     _, optimizer = chosen(made)
     rates = [optimizer.learning_rate[key] for key in values]
     assert rates == pytest.approx([0.1 / 2**0.5, 0.1 / 2**0.5, 0.1, 0.1])
+
+
+def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = AnalyticRenderer(TRUTH, np.ones((48, 10)), shape=SHAPE).parameters()
+    rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
+    estimator, optimizer = chosen(problem())
+    assert estimator == GaussNewton(module._MOST_IMAGE, module._MOST_IMAGE // module._PER_DERIVATIVE)
+    assert isinstance(optimizer, optimizers.AveragedNewton)
+    assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0)
+    for settings in ({"image": "plain"}, {"pixels": 8}):
+        assert isinstance(chosen(problem(), **settings)[1], optimizers.Adam)

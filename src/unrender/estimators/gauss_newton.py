@@ -75,7 +75,7 @@ class GaussNewton:
     """
 
     spp: int = 256
-    derivative_spp: int = 16
+    derivative_spp: int = 32
     shift: float = 0.3
     width: float = 0.01
     tolerance: float = 2.0

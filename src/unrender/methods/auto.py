@@ -74,7 +74,7 @@ _CAMERA_SHARE = 0.1
 """First steps of sensors' poses by path gradients, in units of the world and radians, over `learning_rate`."""
 _IMAGE_PATHS, _FEWEST_IMAGE, _MOST_IMAGE = 1 << 21, 8, 256
 """Of a Gauss-Newton step: so many paths in all images, as far as that is between 8 and 256 samples per pixel."""
-_PER_DERIVATIVE, _FEWEST_DERIVATIVE, _MOST_ELEMENTS = 16, 4, 1 << 10
+_PER_DERIVATIVE, _FEWEST_DERIVATIVE, _MOST_ELEMENTS = 8, 4, 1 << 10
 """Samples of the images over those of the derivative images, and the fewest of these; elements of poses up to which there is a matrix."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
