@@ -58,7 +58,8 @@ class AveragedNewton:
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
         averaging: r, >= 0.
-        trust_radius: Δ, > 0; None for no limit.
+        trust_radius: Δ, > 0; None for no limit. Where noise alone moves the minimum by more than 1, nothing is averaged: a Δ below 1, such as
+            0.3, averages there, too.
         damping: in (0, 1).
     """
 
