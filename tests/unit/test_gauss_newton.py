@@ -12,7 +12,7 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.estimators import gauss_newton as module
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Hessian, Smoothing
+from unrender.estimators.capabilities import Hessian, HessianNoise, Smoothing
 from unrender.optimizers import AveragedNewton
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
@@ -27,13 +27,14 @@ def problem(loss: Any = None, noise: float = 0.6) -> ur.Problem:
     return ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], loss or ur.losses.L2(), truth=TRUTH)
 
 
-def estimates(made: ur.Problem, count: int = 150) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients (count, n) and Hessians (count, n, n) at the start."""
+def estimates(made: ur.Problem, count: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients (count, n), Hessians (count, n, n) and their noise at the start."""
     estimator = ur.GaussNewton(spp=2, derivative_spp=2)
     state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
     found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(count)]
     gradients = [np.concatenate([one.gradient[key] for key in START]) for one in found]
-    return np.stack(gradients), np.stack([one.require("test", Hessian).matrix for one in found])
+    matrices = (np.stack([one.require("test", kind).matrix for one in found]) for kind in (Hessian, HessianNoise))
+    return np.stack(gradients), *matrices
 
 
 def off(samples: np.ndarray, expected: np.ndarray) -> float:
@@ -43,16 +44,17 @@ def off(samples: np.ndarray, expected: np.ndarray) -> float:
 
 
 def test_gradient_and_matrix_are_unbiased_and_one_half_alone_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a linear image: g = 2 Aᵀ A (θ - θ*) / N and H = 2 Aᵀ A / N. 4.5 standard errors: 1e-5 for each of twelve numbers."""
+    """Of a linear image: g = 2 Aᵀ A (θ - θ*) / N and H = 2 Aᵀ A / N; noise of uniform factors of 1 ± 0.6 adds 0.6² / 3 / 2 of H. 4.5 standard errors: 1e-5 for each of 21 numbers."""
     made = problem()
     hessian = 2.0 * MATRIX.T @ MATRIX / len(MATRIX)
     away = np.concatenate([START[key] - TRUTH[key] for key in START])
-    gradients, hessians = estimates(made)
+    gradients, hessians, noise = estimates(made)
     assert off(gradients, hessian @ away) < 4.5
     assert off(hessians, hessian) < 4.5
+    assert off(noise, 0.06 * hessian) < 4.5
     products = module._products
     monkeypatch.setattr(module, "_products", lambda halves, *rest: products([halves[0], halves[0]], *rest))
-    _, hessians = estimates(made)
+    _, hessians, _ = estimates(made)
     assert off(hessians, hessian) > 4.5
 
 
@@ -145,6 +147,19 @@ def test_noise_falls_as_the_root_of_the_steps() -> None:
         steps, state = optimizer.update(model(HESSIAN, MINIMUM, x, noise), state, {"x": x})
         x = x + steps["x"]
     np.testing.assert_allclose(x - MINIMUM, -np.linalg.solve(HESSIAN, weights @ noises), rtol=1e-2, atol=1e-7)
+
+
+def test_directions_of_noise_alone_hardly_move_until_enough_steps_tell_more() -> None:
+    """Step 1: (H + N)⁻¹ of the gradient; after k models at one place, (H + σ N)⁻¹, with the sum σ of their squared weights."""
+    optimizer, noise, x = AveragedNewton(trust_radius=None), 4.0 * HESSIAN, np.zeros(3)
+    state, share = optimizer.init({"x": x}), 0.0
+    for step in range(8):
+        weight = 3.0 / (step + 3.0)
+        share = (1.0 - weight) ** 2 * share + weight**2
+        steps, state = optimizer.update(
+            model(HESSIAN, 0.1 * MINIMUM, x, noise=0.0, of=HessianNoise(noise)), state, {"x": x}
+        )
+        np.testing.assert_allclose(steps["x"], 0.1 * MINIMUM / (1.0 + 4.0 * share), rtol=0.1)
 
 
 def test_models_from_far_away_are_forgotten_and_those_that_are_not_finite_left_out() -> None:

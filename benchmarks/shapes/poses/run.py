@@ -29,7 +29,7 @@ from benchmarks.internals import scene_description
 from benchmarks.races import TUNING_SEED
 from benchmarks.shapes.equal_time.run import Kept, blind
 
-MERGE = ("problems.*.*",)
+MERGE = ("problems.*.*.methods",)
 QUICK: dict[str, Any] = {
     "problems": ("shadow",), "starts": ("near",), "seconds": 0.2, "seeds": 1, "resolution": 8, "reference_spp": 4,
 }  # fmt: skip
@@ -156,7 +156,8 @@ def tuned(
 def run(
     problems: tuple[str, ...] = tuple(TASKS),
     starts: tuple[str, ...] = ("near", "far"),
-    seconds: float = 3.0,
+    methods: tuple[str, ...] = tuple(METHODS),
+    seconds: float = 2.0,
     seeds: int = 3,
     resolution: int = 32,
     reference_spp: int = 1024,
@@ -166,6 +167,7 @@ def run(
     Args:
         problems: of box10, mug and shadow
         starts: near and far
+        methods: of paths, smoothed, together and gauss-newton
         seconds: of a run, of the processor
         seeds: of the runs that count
         resolution: film size
@@ -176,7 +178,8 @@ def run(
         n = sum(int(np.prod(shape)) for shape in problem.shapes().values())
         for kind in starts:
             found: dict[str, Any] = {}
-            for method, (parts, grid) in METHODS.items():
+            for method in methods:
+                parts, grid = METHODS[method]
 
                 def make(config: Config, seed: int, parts: Any = parts, task: Task = task, kind: str = kind) -> Any:
                     asked = begun(problem, getattr(task, kind), seed)  # noqa: B023 (called within its turn)

@@ -15,7 +15,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, Smoothing
+from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
 from unrender.estimators.damping import damping, smoothed_variance
 from unrender.problem.bounds import project
 from unrender.problem.problem import Problem
@@ -56,7 +56,7 @@ class GaussNewton:
     J is the central difference of renders from the same random numbers, at ± a width. The width is found for each parameter, so that
     both renders differ from the picture by as much as a shift by `shift` pixels does. It is the unit of trust regions, too
     (`Smoothing`). Images and derivative images have samples of their own, and H is the product of two halves of the derivative images,
-    made symmetric: no product contains the square of a noise.
+    made symmetric: no product contains the square of a noise. Their difference tells what noise would add (`HessianNoise`).
 
     Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
     the expected image is the reference, as the loss's does, for a loss whose derivative is linear in the image. H leaves out the
@@ -88,8 +88,8 @@ class GaussNewton:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient, a Hessian and the widths."""
-        return Capabilities(Gradient, Hessian)
+        """A gradient, a Hessian and its noise."""
+        return Capabilities(Gradient, Hessian, HessianNoise)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed or has a preconditioner, and for a loss of
@@ -117,7 +117,7 @@ class GaussNewton:
         estimate = Estimate(
             found.loss,
             vectors.unravel(found.gradient, parameters),
-            (Hessian(found.hessian), Smoothing(dict(state.widths))),
+            (Hessian(found.hessian), HessianNoise(found.noise), Smoothing(dict(state.widths))),
             {"samples": point.samples, "images": found.images},
         )
         return estimate, self._next(state, found, parameters, _CHANGE)
@@ -140,7 +140,7 @@ class _System:
 
     Attributes:
         loss: at the parameters.
-        gradient, hessian: (n,), (n, n).
+        gradient, hessian, noise: (n,), (n, n), (n, n).
         squares: of the derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         images: by view.
@@ -149,13 +149,14 @@ class _System:
     loss: float
     gradient: np.ndarray
     hessian: np.ndarray
+    noise: np.ndarray
     squares: np.ndarray
     slopes: np.ndarray
     images: dict[int, Array]
 
     @classmethod
     def zero(cls, n: int) -> _System:
-        return cls(0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n), {})
+        return cls(0.0, np.zeros(n), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros(n), {})
 
 
 class _Point:
@@ -191,9 +192,10 @@ class _Point:
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             slope = _slope(halves)
             weights = None if image is None else self._weights(view, image, variance)
-            gradient, hessian, squares = _products(halves, distances, weights)
+            gradient, hessian, noise, squares = _products(halves, distances, weights)
             found.gradient[elements] += gradient
             found.hessian[np.ix_(elements, elements)] += hessian
+            found.noise[np.ix_(elements, elements)] += noise
             found.squares[elements] += squares
             found.slopes[elements] += slope
         return found
@@ -249,8 +251,9 @@ def _slope(halves: list[np.ndarray]) -> float:
 
 def _products(
     halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Σ J ℓ', Σ J ℓ'' Jᵀ and the diagonal of Σ J Jᵀ over pixels, from two independent halves of J.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from two
+    independent halves of J.
 
     Args:
         halves: images (2 m, H, W, 3), those at more and those at less.
@@ -258,7 +261,7 @@ def _products(
         weights: ℓ' and ℓ''; None where only the last is wanted.
     """
     m = distances.size
-    gradient, hessian, squares = np.zeros(m), np.zeros((m, m)), np.zeros(m)
+    gradient, hessian, noise, squares = np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
     over = np.divide(1.0, distances, out=np.zeros(m), where=distances != 0.0)[:, None]
     for part in _parts(halves[0][0].size):
         one, other = (_difference(half, part) * over for half in halves)
@@ -267,7 +270,9 @@ def _products(
             first, second = (x.reshape(-1)[part].astype(np.float64) for x in weights)
             gradient += 0.5 * ((one + other) @ first)
             hessian += (one * second) @ other.T
-    return gradient, 0.5 * (hessian + hessian.T), squares
+            apart = 0.5 * (one - other)
+            noise += (apart * second) @ apart.T
+    return gradient, 0.5 * (hessian + hessian.T), noise, squares
 
 
 def _difference(images: np.ndarray, part: slice) -> np.ndarray:
