@@ -44,7 +44,10 @@ def off(samples: np.ndarray, expected: np.ndarray) -> float:
 
 
 def test_gradient_and_matrix_are_unbiased_and_one_half_alone_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a linear image: g = 2 Aᵀ A (θ - θ*) / N and H = 2 Aᵀ A / N; noise of uniform factors of 1 ± 0.6 adds 0.6² / 3 / 2 of H. 4.5 standard errors: 1e-5 for each of 21 numbers."""
+    """Of a linear image: g = 2 Aᵀ A (θ - θ*) / N and H = 2 Aᵀ A / N; noise of uniform factors of 1 ± 0.6 adds 0.6² / 3 / 2 of H.
+
+    4.5 standard errors: 1e-5 for each of 21 numbers.
+    """
     made = problem()
     hessian = 2.0 * MATRIX.T @ MATRIX / len(MATRIX)
     away = np.concatenate([START[key] - TRUTH[key] for key in START])
