@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from unrender.dealing.deal import deal
     from unrender.estimators.base import Estimate
     from unrender.estimators.filtered import FilteredGradient
+    from unrender.estimators.gauss_newton import GaussNewton
     from unrender.estimators.hybrid import HybridGradient
     from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
@@ -89,6 +90,7 @@ _HOMES = {
     "CoarseToFine": "problem.coarse_to_fine",
     "Estimate": "estimators.base",
     "FilteredGradient": "estimators.filtered",
+    "GaussNewton": "estimators.gauss_newton",
     "Grid": "io.volumes",
     "HybridGradient": "estimators.hybrid",
     "ImportOptions": "capture.importing",
@@ -131,6 +133,7 @@ __all__ = [
     "CoarseToFine",
     "Estimate",
     "FilteredGradient",
+    "GaussNewton",
     "Grid",
     "HybridGradient",
     "ImportOptions",

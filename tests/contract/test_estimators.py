@@ -127,6 +127,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "Prodigy": lambda: ur.optimizers.Prodigy(schedule=ur.optimizers.schedules.Exponential(100)),
     "ScheduleFree": lambda: ur.optimizers.ScheduleFree(0.03),
     "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, step_scale=0.1),
+    "AveragedNewton": lambda: ur.optimizers.AveragedNewton(trust_radius=0.3),
     "NewtonCG": lambda: ur.optimizers.NewtonCG(trust_radius=15.0, step_scale=0.1),
     "LBFGS": lambda: ur.optimizers.LBFGS(
         trust_radius=0.1, curvature=0.5, history=20, inner_optimizer=OPTIMIZERS["Adam"]()

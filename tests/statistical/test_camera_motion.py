@@ -207,16 +207,10 @@ def test_the_stock_loop_names_cameras_that_it_cannot_move() -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_is_found() -> None:
-    problem = ur.gallery.problem("camera", resolution=32, reference_spp=256)
-    result = ur.optimize(
-        problem,
-        ur.PathGradient(spp=4),
-        ur.optimizers.Adam(0.004, beta_2=0.99, schedule=ur.schedules.Exponential(20, 0.02)),
-        steps=60,
-    )
-    before, after = (
-        np.sqrt(sum(float(np.square(values[key]).sum()) for key in problem.shapes()))
-        for values in (problem.initial_values(), result.parameters)
-    )
-    assert after < 0.5 * before
+def test_auto_finds_cameras() -> None:
+    """Three of 2 degrees and 2 % off, from pictures of 24² pixels. A fifth of what is asked of larger ones."""
+    problem = ur.gallery.problem("camera", resolution=24, reference_spp=1024)
+    result = ur.optimize(problem, "auto", steps=8, seed=2)
+    for name, distance in (("left", 2.94), ("middle", 2.98), ("right", 2.74)):
+        assert np.degrees(np.linalg.norm(result.parameters[f"{name}.rotation"])) < 0.25
+        assert np.linalg.norm(result.parameters[f"{name}.translation"]) < 0.005 * distance

@@ -13,6 +13,7 @@ import pytest
 from unrender import images, losses, optimizers, pixels
 from unrender.core import tables
 from unrender.core.errors import InputError
+from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
 from unrender.methods import auto as module
 from unrender.methods import method
@@ -243,3 +244,15 @@ def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
     many: Any = SimpleNamespace(views=[None] * 16)
     found = [module._shows_half(many, s) for s in (pixels.All(), pixels.Views(8), pixels.Views(7), pixels.Uniform(4))]
     assert found == [True, True, False, False]
+
+
+def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = AnalyticRenderer(TRUTH, np.ones((48, 10)), shape=SHAPE).parameters()
+    rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
+    estimator, optimizer = chosen(problem())
+    assert estimator == GaussNewton(module._MOST_IMAGE, module._MOST_IMAGE // module._PER_DERIVATIVE)
+    assert isinstance(optimizer, optimizers.AveragedNewton)
+    assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0)
+    for settings in ({"image": "plain"}, {"pixels": 8}):
+        assert isinstance(chosen(problem(), **settings)[1], optimizers.Adam)

@@ -18,6 +18,7 @@ from unrender.estimators.capabilities import (
     Capability,
     FreshGradient,
     Hessian,
+    HessianNoise,
     HessianProduct,
     LossFunction,
     Smoothing,
@@ -102,6 +103,8 @@ def as_numpy(estimate: Estimate) -> Estimate:
                 return FreshGradient(trees.numpy(values))
             case Hessian(matrix):
                 return Hessian(arrays.numpy(matrix))
+            case HessianNoise(matrix):
+                return HessianNoise(arrays.numpy(matrix))
         return capability
 
     converted = tuple(convert(capability) for capability in estimate.capabilities)

@@ -17,6 +17,7 @@ __all__ = [
     "FreshGradient",
     "Gradient",
     "Hessian",
+    "HessianNoise",
     "HessianProduct",
     "LossFunction",
     "Smoothing",
@@ -77,6 +78,19 @@ class Hessian(Capability):
     """
 
     name: ClassVar[str] = "hessian"
+    matrix: Array
+
+
+@dataclass(frozen=True)
+class HessianNoise(Capability):
+    """What the noise of derivative images would add to the Gauss-Newton matrix, if it were made of their squares.
+
+    Attributes:
+        matrix: (n, n), positive semidefinite: Σ ℓ'' N Nᵀ over pixels, with the noise N of the derivative images. Damping by it keeps
+            steps from following noise.
+    """
+
+    name: ClassVar[str] = "hessian_noise"
     matrix: Array
 
 

@@ -13,6 +13,7 @@ from unrender.estimators.capabilities import (
     Capability,
     FreshGradient,
     Hessian,
+    HessianNoise,
     HessianProduct,
     LossFunction,
     Smoothing,
@@ -71,6 +72,9 @@ def _second_order(
             J, bend = _flat(slopes, parameters), _bend(gradient, problem, parameters)
             full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(bend)
             return Hessian(full)
+        case HessianNoise(matrix):
+            J = _flat(slopes, parameters)
+            return HessianNoise(J[:, None] * arrays.numpy(matrix).astype(np.float64) * J)
         case HessianProduct(apply):
             curvatures = problem.coordinates.curvatures(parameters)
 

@@ -15,6 +15,7 @@ from unrender import pixels
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
+from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
@@ -24,6 +25,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Choice, Options, method, parameterised
 from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
@@ -65,7 +67,11 @@ _MOST_NUMBERS, _MOST_MARGINS = 4, 10
 _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
 _CAMERA_SHARE = 0.1
-"""First steps of sensors' poses, in units of the world and radians, over `learning_rate`."""
+"""First steps of sensors' poses by path gradients, in units of the world and radians, over `learning_rate`."""
+_IMAGE_PATHS, _FEWEST_IMAGE, _MOST_IMAGE = 1 << 21, 8, 256
+"""Of a Gauss-Newton step: so many paths in all images, as far as that is between 8 and 256 samples per pixel."""
+_PER_DERIVATIVE, _FEWEST_DERIVATIVE, _MOST_ELEMENTS = 8, 4, 1 << 10
+"""Samples of the images over those of the derivative images, and the fewest of these; elements of poses up to which there is a matrix."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _SIGMA, _STEP = 0.2, 0.5
@@ -96,8 +102,8 @@ class AutoMethod(Options):
     loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
     the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
     steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside
-    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone move along path gradients. Every
-    choice can be set.
+    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps. Every choice
+    can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -138,8 +144,8 @@ class AutoMethod(Options):
 
     def choose(self, problem: Problem) -> Choice:
         """See `Options.choose`."""
-        if _is_of_cameras(problem):
-            return self._of_cameras(problem)
+        if _is_of_cameras(problem) and (choice := self._of_cameras(problem)):
+            return choice
         perturbed = beyond_paths(problem.renderer.parameters(), list(problem.shapes()))
         part = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(perturbed)))
         if 0 < len(perturbed) < len(problem.shapes()) and not _refusal(part):
@@ -210,8 +216,25 @@ class AutoMethod(Options):
             optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_strength(problem)))
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 
-    def _of_cameras(self, problem: Problem) -> Choice:
-        """Where sensors alone are unknown."""
+    def _of_cameras(self, problem: Problem) -> Choice | None:
+        """Where poses of sensors alone are unknown; None where neither way serves."""
+        known = problem.renderer.parameters()
+        elements = sum(math.prod(shape) for shape in problem.shapes().values())
+        wants_paths = self.image is not None or self.pixels is not None
+        if wants_paths or elements > _MOST_ELEMENTS or problem.preconditioners or not problem.loss.pixelwise:
+            reached = all(known[key].differentiable for key in problem.shapes())
+            return self._of_cameras_by_paths(problem) if reached else None
+        whole = self.spp or min(max(_IMAGE_PATHS // problem.pixels, _FEWEST_IMAGE), _MOST_IMAGE)
+        spp, derivative_spp = max(whole, 2), max(whole // _PER_DERIVATIVE, _FEWEST_DERIVATIVE)
+        reason = (
+            f"Gauss-Newton steps of cameras by perturbed renders, {spp} samples per pixel of the image, {derivative_spp} of those; "
+            "the mean of all steps' models"
+        )
+        tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
+        return Choice(GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), (reason,))
+
+    def _of_cameras_by_paths(self, problem: Problem) -> Choice:
+        """Likewise, by path gradients: where they are asked for, by an image or pixels, and where there is no Gauss-Newton step."""
         sampler, drawn = self._sampler(problem)
         spp, rate = self._samples(problem, sampler), _CAMERA_SHARE * self.learning_rate
         image = RecursiveControlVariate("primary") if self.image == "rcv" else Plain()
@@ -285,9 +308,9 @@ def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:
 
 
 def _is_of_cameras(problem: Problem) -> bool:
-    """Whether all parameters are poses of sensors that path gradients reach. Lenses are in other units."""
+    """Whether all parameters are poses of sensors. Lenses are in other units."""
     known = problem.renderer.parameters()
-    return all(known[key].viewpoint and known[key].rigid and known[key].differentiable for key in problem.shapes())
+    return all(known[key].viewpoint and known[key].rigid for key in problem.shapes())
 
 
 def _unreachable(problem: Problem) -> str:

@@ -2,6 +2,7 @@
 
 from unrender import schedules
 from unrender.optimizers.adam import Adam
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.cma_es import CMAES
 from unrender.optimizers.dowg import DoWG
@@ -19,6 +20,7 @@ __all__ = [
     "LBFGS",
     "SGD",
     "Adam",
+    "AveragedNewton",
     "DoWG",
     "MetaAdam",
     "Newton",

@@ -52,6 +52,13 @@ class NewtonState:
         return replace(fresh, step=self.step, adam=adam)
 
 
+class Scaled(Protocol):
+    """The state of an optimizer with a scale for each parameter."""
+
+    @property
+    def learning_rates(self) -> Mapping[str, float]: ...
+
+
 class DirectionOptions(Protocol):
     """The options that the methods share; `Newton` documents them."""
 
@@ -89,7 +96,7 @@ def init_state(
     return NewtonState(0, own, adam)
 
 
-def coordinate_scales(estimate: Estimate, state: NewtonState, parameters: Tree) -> np.ndarray:
+def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np.ndarray:
     """The unit of each element's coordinate u, (n,): its learning rate, times the σ of smoothed derivatives."""
     smoothing = estimate.get(Smoothing)
     scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}

@@ -56,6 +56,7 @@ class ParameterInfo:
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
         viewpoint: whether it is a sensor's pose or lens.
+        sensor: index of the only sensor whose images it changes; None where it may change others'.
         mesh: of values at the V vertices of a mesh, (n V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
         welded: whether they are its positions, which vertices at the same place share.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
@@ -72,6 +73,7 @@ class ParameterInfo:
     resizable: bool = False
     rigid: bool = False
     viewpoint: bool = False
+    sensor: int | None = None
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
     welded: bool = False
 

@@ -46,13 +46,13 @@ def sensor_obstacle(pair: ScenePair, target: str) -> str:
 def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:
     """{key: what the renderer says of it}: Mitsuba's own parameters of perspective sensors, which it marks as not differentiable."""
     found = {}
-    for sensor in pair.current.sensors():
+    for index, sensor in enumerate(pair.current.sensors()):
         for name in _LENSES:
             key = f"{sensor.id()}.{name}"
             if key in pair.current_parameters and not sensor_obstacle(pair, sensor.id()):
                 low, high = (0.1, 179.0) if name == "x_fov" else (None, None)
                 found[key] = ParameterInfo(
-                    (), True, False, "it changes what the sensor sees", low, high, viewpoint=True
+                    (), True, False, "it changes what the sensor sees", low, high, viewpoint=True, sensor=index
                 )
     return found
 

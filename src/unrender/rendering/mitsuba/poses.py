@@ -77,15 +77,23 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     return found
 
 
-def info(key: PoseKey, obstacle: str, viewpoint: bool) -> ParameterInfo:
+def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
     """What the renderer says of a pose parameter; `obstacle`: why path gradients do not serve, "" where they do;
-    `viewpoint`: whether it moves a sensor."""
+    `sensor`: index of the sensor that it moves, None where it moves a shape."""
+    viewpoint = sensor is not None
     why = f"it moves a {'sensor' if viewpoint else 'shape'} as a whole"
     if obstacle:
         why = f"it moves a shape or sensor as a whole, and {obstacle}; SmoothedDerivatives has its derivative"
     low = 1e-3 if key.part == "scale" else None
     return ParameterInfo(
-        key.shape, not obstacle, shares_paths=False, reason=why, lowest=low, rigid=True, viewpoint=viewpoint
+        key.shape,
+        not obstacle,
+        shares_paths=False,
+        reason=why,
+        lowest=low,
+        rigid=True,
+        viewpoint=viewpoint,
+        sensor=sensor,
     )
 
 

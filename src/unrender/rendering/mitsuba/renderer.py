@@ -63,10 +63,10 @@ class MitsubaRenderer:
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
-        sensors = {sensor.id() for sensor in self.pair.current.sensors()}
+        sensors = {sensor.id(): index for index, sensor in enumerate(self.pair.current.sensors())}
         found = self._obstacles({pose.target for pose in self._poses.values()})
         self._info |= {
-            key: poses.info(pose, found[pose.target], pose.target in sensors) for key, pose in self._poses.items()
+            key: poses.info(pose, found[pose.target], sensors.get(pose.target)) for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}

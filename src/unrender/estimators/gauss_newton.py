@@ -1,0 +1,286 @@
+"""Gradient and Gauss-Newton matrix from the derivative image of every parameter, by differences of renders: for poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.core import arrays, checks, vectors
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
+from unrender.estimators.damping import damping, smoothed_variance
+from unrender.problem.bounds import project
+from unrender.problem.problem import Problem
+from unrender.problem.upsampling import Upsampler
+from unrender.rendering.renderer import RenderSession, SampleRequest
+
+__all__ = ["GaussNewton", "GaussNewtonState"]
+
+_PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
+"""Of the widths: passes of their own before the first estimate, and factors by which a width changes at most, there and later."""
+_VALUES = 1 << 20
+"""Of an image, that are turned into double precision at once."""
+_IMAGE = 2
+"""Stream of a view's key: of the image. Those below are of the two halves of the derivative images."""
+
+
+@dataclass(frozen=True)
+class GaussNewtonState:
+    """State between steps.
+
+    Attributes:
+        widths: of the differences, {key: in units of the parameter}; {} before the first estimate.
+    """
+
+    widths: dict[str, float]
+
+    def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
+        """See `Upsamplable`: widths are measured anew."""
+        del upsampler
+        return GaussNewtonState({})
+
+
+@register
+@dataclass(frozen=True)
+class GaussNewton:
+    """g = Σ J ℓ'(I) and H = Σ J ℓ''(I) Jᵀ over pixels, with a derivative image J for every element of every parameter.
+
+    J is the central difference of renders from the same random numbers, at ± a width. The width is found for each parameter, so that
+    both renders differ from the picture by as much as a shift by `shift` pixels does. It is the unit of trust regions, too
+    (`Smoothing`). Images and derivative images have samples of their own, and H is the product of two halves of the derivative images,
+    made symmetric: no product contains the square of a noise. Their difference tells what noise would add (`HessianNoise`).
+
+    Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
+    the expected image is the reference, as the loss's does, for a loss whose derivative is linear in the image. H leaves out the
+    curvature of the image, as Gauss-Newton does, and by its noise it may have negative eigenvalues. Of other losses of single pixels, L1
+    and Huber, ℓ' is damped where noise exceeds the residual (see `PathGradient`, `tolerance`), and the secant ℓ'(r) / r stands for ℓ''.
+
+    For few parameters, such as poses of sensors: each element takes two renders of every view that it changes, and no derivative of the
+    renderer, so whatever can be rendered will do. A sensor's own parameters change its own views alone.
+
+    Args:
+        spp: samples per pixel of the image, >= 2.
+        derivative_spp: of the renders that differences are made of, >= 2.
+        shift: in pixels, > 0. Smaller ones are sharper, with more noise at edges.
+        width: of the differences before the first estimate finds better ones, in units of the parameter, > 0.
+        tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
+    """
+
+    spp: int = 256
+    derivative_spp: int = 32
+    shift: float = 0.3
+    width: float = 0.01
+    tolerance: float = 2.0
+
+    def __post_init__(self):
+        for name in ("spp", "derivative_spp"):
+            checks.integer("GaussNewton", name, getattr(self, name), at_least=2)
+        for name in ("shift", "width", "tolerance"):
+            checks.number("GaussNewton", name, getattr(self, name), above=0.0)
+
+    @property
+    def provides(self) -> Capabilities:
+        """A gradient, a Hessian and its noise."""
+        return Capabilities(Gradient, Hessian, HessianNoise)
+
+    def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
+        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed or has a preconditioner, and for a loss of
+        several pixels together."""
+        if not (problem.loss.linear or problem.loss.pixelwise):
+            raise InputError(
+                f"GaussNewton requires a loss of single pixels, such as L2, got {type(problem.loss).__name__}"
+            )
+        for key in (key for key in problem.preconditioners if key in parameters):
+            raise InputError(f"GaussNewton: parameter {key} has a preconditioner; leave it out, H takes its place")
+        problem.renderer.prepare(list(parameters), None, derivatives=False)
+        return GaussNewtonState({})
+
+    def estimate(
+        self, problem: Problem, parameters: Tree, state: GaussNewtonState, key: Key
+    ) -> tuple[Estimate, GaussNewtonState]:
+        """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view."""
+        point = _Point(self, problem, parameters)
+        if not state.widths:
+            state = GaussNewtonState(dict.fromkeys(parameters, self.width))
+            for index in range(_PASSES):
+                found = point.system(state.widths, key.fold(1 + index), derivatives=False)
+                state = self._next(state, found, parameters, _FIRST_CHANGE)
+        found = point.system(state.widths, key.fold(0))
+        estimate = Estimate(
+            found.loss,
+            vectors.unravel(found.gradient, parameters),
+            (Hessian(found.hessian), HessianNoise(found.noise), Smoothing(dict(state.widths))),
+            {"samples": point.samples, "images": found.images},
+        )
+        return estimate, self._next(state, found, parameters, _CHANGE)
+
+    def _next(self, state: GaussNewtonState, found: _System, parameters: Tree, change: float) -> GaussNewtonState:
+        """With the widths at which renders differ from the picture as a shift by `shift` pixels does, root mean square over the elements of
+        a parameter; no more than `change` times what they were, or less by it."""
+        squares, slopes = vectors.parts(found.squares, parameters), vectors.parts(found.slopes, parameters)
+        widths = {}
+        for key, width in state.widths.items():
+            square, slope = float(squares[key].mean()), float(slopes[key].mean())
+            wanted = self.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
+            widths[key] = float(np.clip(wanted, width / change, width * change))
+        return GaussNewtonState(widths)
+
+
+@dataclass
+class _System:
+    """What the views say together, of n elements.
+
+    Attributes:
+        loss: at the parameters.
+        gradient, hessian, noise: (n,), (n, n), (n, n).
+        squares: of the derivative images, summed over their pixels, (n,).
+        slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
+        images: by view.
+    """
+
+    loss: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    noise: np.ndarray
+    squares: np.ndarray
+    slopes: np.ndarray
+    images: dict[int, Array]
+
+    @classmethod
+    def zero(cls, n: int) -> _System:
+        return cls(0.0, np.zeros(n), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros(n), {})
+
+
+class _Point:
+    """Images and derivative images of a problem at its parameters.
+
+    Attributes:
+        samples: paths traced so far.
+    """
+
+    def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
+        self.options, self.problem, self.parameters = options, problem, parameters
+        self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
+        self.theta = vectors.ravel(parameters)
+        self.samples = 0
+        known = problem.renderer.parameters()
+        sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
+        self._sensors = vectors.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
+
+    def system(self, widths: Mapping[str, float], key: Key, derivatives: bool = True) -> _System:
+        """Gradient and Hessian at differences of these widths; without `derivatives`, what the next widths are found by alone."""
+        found = _System.zero(self.theta.size)
+        steps = vectors.repeat_per_element(widths, self.parameters)
+        for view, of in enumerate(self.problem.views):
+            elements = np.flatnonzero((self._sensors == -1) | (self._sensors == of.sensor))
+            own = key.fold(view)
+            image, variance = self._image(view, own) if derivatives else (None, None)
+            if derivatives:
+                found.images[view] = image
+                found.loss += arrays.number(self.problem.loss_value(view, image))
+            if not elements.size:
+                continue
+            points, distances = self._points(elements, steps)
+            halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
+            slope = _slope(halves)
+            weights = None if image is None else self._weights(view, image, variance)
+            gradient, hessian, noise, squares = _products(halves, distances, weights)
+            found.gradient[elements] += gradient
+            found.hessian[np.ix_(elements, elements)] += hessian
+            found.noise[np.ix_(elements, elements)] += noise
+            found.squares[elements] += squares
+            found.slopes[elements] += slope
+        return found
+
+    def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The parameters with one element more by its step, for each, and then less, (2 m, n), within bounds; how far apart the two are,
+        (m,)."""
+        bounds = self.problem.bounds
+        offsets = np.zeros((2, elements.size, self.theta.size))
+        offsets[0, np.arange(elements.size), elements] = steps[elements]
+        offsets[1, np.arange(elements.size), elements] = -steps[elements]
+        states = vectors.parts(self.theta + offsets, self.parameters)
+        inside = [project(x, *bounds[key]).reshape(*x.shape[:2], -1) for key, x in states.items()]
+        points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
+        distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
+        return points.reshape(-1, self.theta.size), distances
+
+    def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        """Half the samples of images (B, H, W, 3) at points (B, n), all from the same random numbers."""
+        request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32())
+        stacked = {key: x.astype(np.float32) for key, x in vectors.parts(points, self.parameters).items()}
+        for name, x in stacked.items():
+            if (x == x[:1]).all():  # shared by all, see `RenderSession.image_batch`
+                stacked[name] = np.broadcast_to(x[0], x.shape)
+        images = arrays.numpy(self.session.image_batch(stacked, request))
+        self.samples += images.shape[0] * images.shape[1] * images.shape[2] * request.spp
+        return images
+
+    def _image(self, view: int, key: Key) -> tuple[Array, Array]:
+        """The image, and its variance from two halves."""
+        halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
+        mean = 0.5 * (halves[0] + halves[1])
+        return self.problem.renderer.array(mean), self.problem.renderer.array(0.25 * np.square(halves[0] - halves[1]))
+
+    def _weights(self, view: int, image: Array, variance: Array) -> tuple[np.ndarray, np.ndarray]:
+        """ℓ' and ℓ'' at the image, (H, W, 3) each."""
+        problem = self.problem
+        derivative = problem.loss_derivative(view, image)
+        if problem.loss.linear:
+            return arrays.numpy(derivative), arrays.numpy(problem.loss_derivative(view, image + 1.0) - derivative)
+        residual = image - problem.reference(view)
+        derivative = derivative * damping(residual, smoothed_variance(variance), self.options.tolerance)
+        secant = derivative * residual / (residual * residual + 1e-12)
+        return arrays.numpy(derivative), arrays.numpy(secant)
+
+
+def _slope(halves: list[np.ndarray]) -> float:
+    """The squared differences of neighbouring pixels of the mean image, summed, mean of the two directions; without noise, from two
+    independent halves (B, H, W, 3)."""
+    one, other = (half.mean(axis=0, dtype=np.float64) for half in halves)
+    return 0.5 * sum(float((np.diff(one, axis=axis) * np.diff(other, axis=axis)).sum()) for axis in (0, 1))
+
+
+def _products(
+    halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from two
+    independent halves of J.
+
+    Args:
+        halves: images (2 m, H, W, 3), those at more and those at less.
+        distances: of the two parameters of each difference, (m,); an element with 0 has no derivative.
+        weights: ℓ' and ℓ''; None where only the last is wanted.
+    """
+    m = distances.size
+    gradient, hessian, noise, squares = np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
+    over = np.divide(1.0, distances, out=np.zeros(m), where=distances != 0.0)[:, None]
+    for part in _parts(halves[0][0].size):
+        one, other = (_difference(half, part) * over for half in halves)
+        squares += (one * other).sum(axis=1)
+        if weights is not None:
+            first, second = (x.reshape(-1)[part].astype(np.float64) for x in weights)
+            gradient += 0.5 * ((one + other) @ first)
+            hessian += (one * second) @ other.T
+            apart = 0.5 * (one - other)
+            noise += (apart * second) @ apart.T
+    return gradient, 0.5 * (hessian + hessian.T), noise, squares
+
+
+def _difference(images: np.ndarray, part: slice) -> np.ndarray:
+    """Of the first half of the images and the second, (m, values of the part)."""
+    flat = images.reshape(len(images), -1)[:, part].astype(np.float64)
+    return flat[: len(flat) // 2] - flat[len(flat) // 2 :]
+
+
+def _parts(size: int) -> Iterator[slice]:
+    for start in range(0, size, _VALUES):
+        yield slice(start, start + _VALUES)

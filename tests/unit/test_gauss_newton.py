@@ -1,0 +1,192 @@
+"""`GaussNewton` and `AveragedNewton` against closed forms, on a renderer with known derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core.random import Key
+from unrender.estimators import gauss_newton as module
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Hessian, HessianNoise, Smoothing
+from unrender.optimizers import AveragedNewton
+from unrender.rendering.numpy.linear import AnalyticRenderer
+
+TRUTH = {"a": np.array([0.4, -0.2]), "b": np.array([0.7])}
+START = {"a": np.array([0.55, -0.1]), "b": np.array([0.5])}
+MATRIX = np.random.default_rng(3).normal(size=(4 * 5 * 3, 3))
+
+
+def problem(loss: Any = None, noise: float = 0.6) -> ur.Problem:
+    renderer = AnalyticRenderer(TRUTH, MATRIX, 0.1, noise, grain=0.3, shape=(4, 5))
+    unknown = [ur.Parameter(key, initial=value) for key, value in START.items()]
+    return ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], loss or ur.losses.L2(), truth=TRUTH)
+
+
+def estimates(made: ur.Problem, count: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients (count, n), Hessians (count, n, n) and their noise at the start."""
+    estimator = ur.GaussNewton(spp=2, derivative_spp=2)
+    state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+    found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(count)]
+    gradients = [np.concatenate([one.gradient[key] for key in START]) for one in found]
+    matrices = (np.stack([one.require("test", kind).matrix for one in found]) for kind in (Hessian, HessianNoise))
+    return np.stack(gradients), *matrices
+
+
+def off(samples: np.ndarray, expected: np.ndarray) -> float:
+    """The largest deviation of a mean, in its standard errors."""
+    error = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+    return float(np.max(np.abs(samples.mean(axis=0) - expected) / error))
+
+
+def test_gradient_and_matrix_are_unbiased_and_one_half_alone_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a linear image: g = 2 Aᵀ A (θ - θ*) / N and H = 2 Aᵀ A / N; noise of uniform factors of 1 ± 0.6 adds 0.6² / 3 / 2 of H.
+
+    4.5 standard errors: 1e-5 for each of 21 numbers.
+    """
+    made = problem()
+    hessian = 2.0 * MATRIX.T @ MATRIX / len(MATRIX)
+    away = np.concatenate([START[key] - TRUTH[key] for key in START])
+    gradients, hessians, noise = estimates(made)
+    assert off(gradients, hessian @ away) < 4.5
+    assert off(hessians, hessian) < 4.5
+    assert off(noise, 0.06 * hessian) < 4.5
+    products = module._products
+    monkeypatch.setattr(module, "_products", lambda halves, *rest: products([halves[0], halves[0]], *rest))
+    _, hessians, _ = estimates(made)
+    assert off(hessians, hessian) > 4.5
+
+
+def test_losses_that_are_not_linear_have_a_secant_that_is_damped_by_noise() -> None:
+    """L1 of an image without noise: ℓ' is the sign, ℓ'' is 1 / |r|."""
+    made = problem(ur.losses.L1(), noise=0.0)
+    made.renderer.grain = 0.0  # pyright: ignore[reportAttributeAccessIssue]
+    estimate, _ = ur.GaussNewton(2, 2).estimate(made, START, module.GaussNewtonState({"a": 0.1, "b": 0.1}), Key(1))
+    away = MATRIX @ np.concatenate([START[key] - TRUTH[key] for key in START])
+    expected = MATRIX.T @ np.sign(away) / len(MATRIX)
+    np.testing.assert_allclose(np.concatenate([estimate.gradient[key] for key in START]), expected, rtol=1e-5)
+    weighted = MATRIX.T @ (MATRIX / np.abs(away)[:, None]) / len(MATRIX)
+    np.testing.assert_allclose(estimate.hessian, weighted, rtol=1e-3)
+
+
+def test_widths_are_those_of_a_shift_of_the_picture() -> None:
+    made = problem(noise=0.0)
+    estimator = ur.GaussNewton(64, 64, shift=0.5)
+    _, state = estimator.estimate(made, START, estimator.init(made, START), Key(0))
+    image = made.renderer.exact(START)  # pyright: ignore[reportAttributeAccessIssue]
+    slope = 0.5 * sum(np.square(np.diff(image, axis=axis)).sum() for axis in (0, 1))
+    squares = np.square(MATRIX).sum(axis=0)
+    for key, part in (("a", squares[:2]), ("b", squares[2:])):
+        # The slope is that of an image with noise that two halves do not share: no more than its own noise off.
+        assert state.widths[key] == pytest.approx(0.5 * np.sqrt(slope / part.mean()), rel=0.1)
+
+
+def test_views_that_a_parameter_does_not_change_are_not_rendered() -> None:
+    renderer = AnalyticRenderer(TRUTH, MATRIX, 0.1, 0.0, shape=(4, 5), sensors=2)
+    found = renderer.parameters()
+    known = {key: replace(found[key], sensor=index) for index, key in enumerate(found)}
+    renderer.parameters = lambda: known  # pyright: ignore[reportAttributeAccessIssue]
+    views = [ur.View(renderer.exact(TRUTH), sensor) for sensor in (0, 1)]
+    made = ur.Problem(renderer, [ur.Parameter(key) for key in TRUTH], views, ur.losses.L2())
+    state = module.GaussNewtonState({"a": 0.1, "b": 0.1})
+    estimate, _ = ur.GaussNewton(4, 2).estimate(made, START, state, Key(0))
+    assert estimate.info["samples"] == 20 * (2 * 4 + (4 + 2) * 2)
+    assert not estimate.hessian[:2, 2:].any()  # pyright: ignore[reportOptionalSubscript]
+
+
+def test_what_it_refuses() -> None:
+    with pytest.raises(ur.InputError, match="spp must be a whole number of at least 2, got 1"):
+        ur.GaussNewton(spp=1)
+    with pytest.raises(ur.InputError, match="shift must be a finite number > 0, got 0"):
+        ur.GaussNewton(shift=0)
+    with pytest.raises(ur.InputError, match="damping must be"):
+        AveragedNewton(damping=0)
+    made = problem().preconditioned({})
+    object.__setattr__(made, "preconditioners", {"a": ur.preconditioners.LargeSteps(1.0)})
+    with pytest.raises(ur.InputError, match="parameter a has a preconditioner"):
+        ur.GaussNewton().init(made, START)
+
+
+# ---------------------------------------------------------------------- steps
+
+
+def model(hessian: np.ndarray, minimum: np.ndarray, x: np.ndarray, noise: Any = 0.0, **more: Any) -> Estimate:
+    """The exact quadratic model at x, with noise on its gradient."""
+    return Estimate(0.0, {"x": hessian @ (x - minimum) + noise}, (Hessian(hessian), *more.values()))
+
+
+HESSIAN = np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.5]])
+MINIMUM = np.array([0.2, -0.3, 0.4])
+
+
+def test_the_first_step_is_newtons_and_long_ones_end_at_the_trust_region() -> None:
+    optimizer = AveragedNewton(trust_radius=None)
+    x = np.zeros(3)
+    steps, _ = optimizer.update(model(HESSIAN, MINIMUM, x), optimizer.init({"x": x}), {"x": x})
+    np.testing.assert_allclose(steps["x"], MINIMUM, rtol=1e-9)
+    optimizer = AveragedNewton(trust_radius=0.1)
+    sigma = {"sigma": Smoothing({"x": 2.0})}
+    steps, _ = optimizer.update(model(HESSIAN, MINIMUM, x, **sigma), optimizer.init({"x": x}), {"x": x})
+    assert np.linalg.norm(steps["x"][:2]) == pytest.approx(0.2)  # each of what the Hessian does not connect
+    assert abs(steps["x"][2]) == pytest.approx(0.2)
+
+
+def test_noise_falls_as_the_root_of_the_steps() -> None:
+    """Near the minimum, where steps are short: the error after n steps is that of the weighted mean of n gradients, H⁻¹ Σ w e."""
+    optimizer, n = AveragedNewton(averaging=2.0), 60
+    weights = np.ones(n)
+    for step in range(n):
+        share = 3.0 / (step + 3.0)
+        weights[step] = share
+        weights[:step] *= 1.0 - share
+    rng = np.random.default_rng(0)
+    x, state = MINIMUM.copy(), optimizer.init({"x": MINIMUM})
+    noises = 1e-3 * rng.normal(size=(n, 3))
+    for noise in noises:
+        steps, state = optimizer.update(model(HESSIAN, MINIMUM, x, noise), state, {"x": x})
+        x = x + steps["x"]
+    np.testing.assert_allclose(x - MINIMUM, -np.linalg.solve(HESSIAN, weights @ noises), rtol=1e-2, atol=1e-7)
+
+
+def test_directions_of_noise_alone_hardly_move_until_enough_steps_tell_more() -> None:
+    """Step 1: (H + N)⁻¹ of the gradient; after k models at one place, (H + σ N)⁻¹, with the sum σ of their squared weights."""
+    optimizer, noise, x = AveragedNewton(trust_radius=None), 4.0 * HESSIAN, np.zeros(3)
+    state, share = optimizer.init({"x": x}), 0.0
+    for step in range(8):
+        weight = 3.0 / (step + 3.0)
+        share = (1.0 - weight) ** 2 * share + weight**2
+        steps, state = optimizer.update(
+            model(HESSIAN, 0.1 * MINIMUM, x, noise=0.0, of=HessianNoise(noise)), state, {"x": x}
+        )
+        np.testing.assert_allclose(steps["x"], 0.1 * MINIMUM / (1.0 + 4.0 * share), rtol=0.1)
+
+
+def test_models_from_far_away_are_forgotten_and_those_that_are_not_finite_left_out() -> None:
+    optimizer = AveragedNewton(trust_radius=None)
+    x, state = np.zeros(3), optimizer.init({"x": np.zeros(3)})
+    for _ in range(20):
+        _, state = optimizer.update(model(HESSIAN, x, x), state, {"x": x})
+    away = np.array([50.0, 50.0, 50.0])
+    _, state = optimizer.update(model(HESSIAN, 1e4 * away, x), state, {"x": x})  # a long step
+    steps, after = optimizer.update(model(HESSIAN, away + MINIMUM, away), state, {"x": away})
+    np.testing.assert_allclose(steps["x"], MINIMUM, rtol=1e-2)
+    broken, same = optimizer.update(model(HESSIAN, away, away, np.nan), after, {"x": away})
+    assert not broken["x"].any()
+    assert same is after
+
+
+@pytest.mark.mitsuba  # which a run folder asks for its version
+def test_both_find_the_minimum_of_a_noisy_problem_and_go_on_where_they_were(tmp_path: Any) -> None:
+    made = problem()
+    parts = ur.GaussNewton(64, 16), AveragedNewton()
+    whole = ur.optimize(made, *parts, steps=16, seed=1)
+    start = sum(made.parameter_error(made.initial()).values())
+    assert sum(made.parameter_error(whole.parameters).values()) < 0.05 * start
+    ur.optimize(made, *parts, steps=6, seed=1, run_directory=tmp_path / "run")
+    again = ur.resume(tmp_path / "run", made, steps=16)
+    for key, value in whole.parameters.items():
+        np.testing.assert_array_equal(again.parameters[key], value)
