@@ -141,7 +141,12 @@ def run(
     name, folder = prepare(photographs, resolution, voxels)
     held_out, training = ((folder / file, every) for file, every in ((HELD_OUT, 1), (PROBLEM, _TRAINING)))
     judges = tuple(Judge(file, every, final_spp) for file, every in (held_out, training))
-    conditions = {"minutes": minutes, "voxels": voxels, "resolution": resolution, "held_out": len(judges[0].problem.views)}
+    conditions = {
+        "minutes": minutes,
+        "voxels": voxels,
+        "resolution": resolution,
+        "held_out": len(judges[0].problem.views),
+    }
     for one in entrant:
         found = descend(one, folder, minutes * 60, judges, points)
         yield {"captures": {f"{name}, {voxels}": {**conditions, "methods": {one: found}}}}

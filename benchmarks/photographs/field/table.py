@@ -3,6 +3,8 @@
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
+HEAD = ["capture, voxels", "", "minutes", "held-out PSNR half-way", "held-out PSNR (dB)", "training PSNR (dB)", "steps"]
+
 
 def table(record: Record) -> str:
     """Held-out PSNR of each by processor minutes."""
@@ -11,9 +13,8 @@ def table(record: Record) -> str:
         for entrant, found in capture["methods"].items():
             curve = found["curve"]
             middle = min(curve, key=lambda point: abs(point[0] - capture["minutes"] / 2))
+            end, held_out, training = (f"{x:.{digits}f}" for x, digits in zip(curve[-1], (1, 2, 2), strict=True))
             steps = ", ".join(f"{stage}: {count}" for stage, count in found["steps"].items())
-            rows.append(
-                [f"{name}³", entrant, f"{curve[-1][0]:.1f}", f"{middle[1]:.2f} ({middle[0]:.1f})", f"{curve[-1][1]:.2f}", f"{curve[-1][2]:.2f}", steps]
-            )  # fmt: skip
-    head = ["capture, voxels", "", "minutes", "held-out PSNR (dB) on the way (minutes)", "held-out PSNR (dB)", "training PSNR (dB)", "steps"]  # fmt: skip
-    return markdown.table(head, rows)
+            row = [f"{name}³", entrant, end, f"{middle[1]:.2f} ({middle[0]:.1f})", held_out, training, steps]
+            rows.append(row)
+    return markdown.table(HEAD, rows)
