@@ -3,7 +3,15 @@
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
-HEAD = ["capture, voxels", "", "minutes", "held-out PSNR on the way (minutes)", "held-out PSNR (dB)", "training PSNR (dB)", "steps"]
+HEAD = [
+    "capture, voxels",
+    "",
+    "minutes",
+    "held-out PSNR on the way (minutes)",
+    "held-out PSNR (dB)",
+    "training PSNR (dB)",
+    "steps",
+]
 
 
 def table(record: Record) -> str:
