@@ -37,6 +37,8 @@ from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
+from unrender.stages import stages_file
+from unrender.stages.stage_problem import Whole
 from unrender.statistics.recursion import advance
 
 dr: Any = importlib.import_module("drjit")
@@ -57,6 +59,7 @@ __all__ = [
     "Renderer",
     "SampleRequest",
     "Tree",
+    "Whole",
     "advance",
     "arrays",
     "black_box",
@@ -81,6 +84,7 @@ __all__ = [
     "project",
     "scene_description",
     "second_moments",
+    "stages_file",
     "stock_scene",
     "time_run_folder",
     "trees",

@@ -109,6 +109,20 @@ def test_gradients_of_glowing_voxels_agree_with_finite_differences() -> None:
 
 
 @pytest.mark.slow
+def test_gradients_of_a_radiance_field_agree_with_finite_differences() -> None:
+    """With spherical harmonics, the derivative's two estimators are weighted by extinction, also where that is zero."""
+    rng = np.random.default_rng(1)
+    medium = glow(np.array(list(LEVELS.values()))[KIND], rng.uniform(0.6, 2, (*KIND.shape[:3], 3)), "nearest")
+    medium |= {f"emission_{k}": grid(rng.uniform(-0.1, 0.1, (*KIND.shape[:3], 3)), "nearest") for k in range(1, 4)}
+    renderer = MitsubaRenderer(scene(medium, lights="sky"), 1)
+    assert renderer.pair.radiance_field
+    gradients, bound = own(renderer), limit(11)
+    found = scores(renderer, gradients, 24)
+    assert len(found) == 11
+    assert max(map(abs, found.values())) < bound, found
+
+
+@pytest.mark.slow
 def test_both_states_of_a_glow_agree_with_separate_renders() -> None:
     rng = np.random.default_rng(4)
     medium = glow(rng.uniform(0, 3, (4, 4, 4, 1)), rng.uniform(0, 2, (4, 4, 4, 3)))

@@ -49,6 +49,8 @@ def directions(key: str, value: np.ndarray) -> list[Direction]:
             for dark in (True, False):
                 along = (number == KIND) * (dark == DARK) * np.ones_like(value)
                 found.append(Direction(key, f"{name}, {'black' if dark else 'grey'}", along, 0.05, dark))
+    elif ".emission_" in key:
+        found.append(Direction(key, "dense", (KIND == 3) * np.ones_like(value), 0.05))
     else:
         for channel in range(value.size):
             along = np.zeros(value.size)

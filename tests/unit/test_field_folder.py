@@ -42,6 +42,10 @@ def test_stages_double_the_voxels(voxels: int, names: list[int]) -> None:
     assert [stage.name for stage in stages.stages] == [f"voxels-{n}" for n in names]
     assert [voxels // stage.coarser for stage in stages.stages] == names
     assert stages.stages[0].unknowns == ("field.sigma_t.data", "field.emission.data")
+    shares = [stage.share for stage in stages.stages]
+    assert all(share == max(1.0, sum(shares[:index])) for index, share in enumerate(shares))
+    pixels = [int(stages.settings_of(stage)["pixels"]) for stage in stages.stages]
+    assert pixels == [max(4096, 128 * side) for side in names]
 
 
 def test_a_field_has_no_mesh_and_unknowns_of_its_own(tmp_path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as Xml
@@ -42,12 +43,20 @@ _KEYS = {
 }
 _DEPTH = 0.5
 """Optical depth through the cube at first: half of it is seen through."""
-_RATES = {"extinction": 0.4, "light": 0.02, "emission": 0.02, **dict.fromkeys(_HARMONICS[1:], 0.005)}
-"""First steps: of extinction in units of the cube's half side, of the others over the photographs' mean."""
-_COARSEST = 16
+_RATES = {"extinction": 0.1, "light": 0.04, "emission": 0.04, **dict.fromkeys(_HARMONICS[1:], 0.01)}
+"""First steps: of the logarithm of extinction, of the others over the photographs' mean."""
+_LOGARITHM = {"bounds": [0.0, math.inf], "parameterisation": "log"}
+"""Of extinction: steps that are noise and end at 0 would leave fog wherever little is seen; as shares, they leave it as thin as it is."""
+_COARSER = 2
+"""Times fewer voxels a side of harmonics beyond degree 0, from 64 voxels on: what is seen changes more with the place than with the
+direction, they are 24 of 28 numbers a voxel, and a step takes its time for each."""
+_COARSEST, _COARSER_FROM = 16, 64
 _METHOD = "adaptive"
-_SETTINGS = {"scheme": "uniform", "pixels": 4096, "spp": 2, "beta_2": 0.99, "schedule": "exponential(50, 0.05)"}
-"""Of the stages: mini-batches of pixels of all photographs, and rates that fall, since their noise does not."""
+_PIXELS, _PIXELS_FOR = 4096, 32
+"""Pixels of a step up to so many voxels a side, and in proportion to them beyond: steps have a cost by the voxel, too."""
+_SETTINGS = {"scheme": "uniform", "pixels": _PIXELS, "spp": 4, "beta_2": 0.99, "schedule": "exponential(150, 0.05)"}
+"""Of the stages: mini-batches of pixels of all photographs, and rates that fall, since their noise does not. Four samples a pixel: the
+residual that weights a path is that of the three others, which noise of two would drown."""
 _LIGHT_SIZE = 16, 32
 _WHOLE = 0.999
 
@@ -103,12 +112,14 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     level = max(float(np.mean(means)), 1e-4)
     size = (voxels,) * 3
     volumes.write_grid(folder / EXTINCTION, np.full((*size, 1), _DEPTH / (2 * half), np.float32))
+    coarse = (-(-voxels // (_COARSER if voxels >= _COARSER_FROM else 1)),) * 3
     for number, file in enumerate(_HARMONICS):
-        volumes.write_grid(folder / GRIDS / f"{file}.vol", np.full((*size, 3), 0.0 if number else level, np.float32))
+        values = np.zeros((*coarse, 3), np.float32) if number else np.full((*size, 3), level, np.float32)
+        volumes.write_grid(folder / GRIDS / f"{file}.vol", values)
     write_exr(np.full((*_LIGHT_SIZE, 3), level, np.float32), folder / LIGHT)
     (folder / SCENE).write_bytes(_scene(bare, stems, middle, half))
-    rates = {one: rate / half if one == "extinction" else rate * level for one, rate in _RATES.items()}
-    bounds: dict[str, Any] = {"extinction": {"bounds": [0.0, math.inf]}, "light": {"bounds": [0.0, math.inf]}}
+    rates = {one: rate if one == "extinction" else rate * level for one, rate in _RATES.items()}
+    bounds: dict[str, Any] = {"extinction": _LOGARITHM, "light": {"bounds": [0.0, math.inf]}}
     moved = ["extinction", *_HARMONICS, *(one for one in ("light", "exposure") if one in chosen)]
     tables = [
         {"key": _KEYS[one], **bounds.get(one, {}), **({"learning_rate": rates[one]} if one in rates else {})}
@@ -129,13 +140,16 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
 
 
 def _stages(voxels: int, moved: Sequence[str]) -> Stages:
-    """Coarse to fine, by halves, down to 16 voxels or so a side."""
+    """Coarse to fine, by halves, down to 16 voxels or so a side. Each takes as long as those before it together."""
     keys, found, coarser = tuple(_KEYS[one] for one in moved), [], 1
     while voxels / coarser >= 1:
-        found.insert(0, Stage(f"voxels-{-(-voxels // coarser)}", keys, 1.0 if coarser > 1 else 2.0, coarser))
+        side = -(-voxels // coarser)
+        more = {"pixels": _PIXELS * side // _PIXELS_FOR} if side > _PIXELS_FOR else None
+        found.insert(0, Stage(f"voxels-{side}", keys, 1.0, coarser, settings=more))
         if voxels // coarser <= _COARSEST:
             break
         coarser *= 2
+    found[1:] = [replace(stage, share=2.0**number) for number, stage in enumerate(found[1:])]
     return Stages(Path(PROBLEM), tuple(found), _METHOD, dict(_SETTINGS), seconds=600.0)
 
 

@@ -27,7 +27,7 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 
-__all__ = ["COEFFICIENT", "FUNCTIONS", "emits", "harmonics", "register"]
+__all__ = ["COEFFICIENT", "FUNCTIONS", "emits", "harmonics", "is_positive", "register"]
 
 COEFFICIENT = "emission_"
 """What the names of the volumes beyond `emission` begin with."""
@@ -44,6 +44,11 @@ def register() -> None:
 def emits(medium: Any) -> bool:
     """Whether a medium is such a one."""
     return isinstance(medium, _plugin(mi.variant()))
+
+
+def is_positive(medium: Any) -> bool:
+    """Whether a medium is such a one that emits more than nothing in every direction: one of spherical harmonics of degree 1 or 2."""
+    return emits(medium) and bool(medium.more)
 
 
 def _volume(properties: Any, name: str) -> Any:

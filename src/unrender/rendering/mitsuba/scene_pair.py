@@ -250,6 +250,11 @@ class ScenePair:
         """Whether there is a medium that emits."""
         return any(emissive.emits(medium) for medium in media(self.current))
 
+    @property
+    def radiance_field(self) -> bool:
+        """Whether all media emit, and more than nothing in every direction."""
+        return all(emissive.is_positive(medium) for medium in media(self.current))
+
     def parameter_traits(self, key: str) -> ParameterTraits:
         """How the parameter `key` reaches the picture."""
         traits = parameter_traits(self.current_parameters, key)

@@ -142,8 +142,14 @@ class MitsubaSession:
         if not self._pair.volumetric:
             return PathPair(self._max_depth, changing_delta=delta)
         media = any(traits.medium for traits in self._traits)
-        emission = self._pair.emissive
-        return VolumePair(self._max_depth, changing_delta=delta, differentiate_media=media, emission=emission)
+        emission, field = self._pair.emissive, self._pair.radiance_field
+        return VolumePair(
+            self._max_depth,
+            changing_delta=delta,
+            differentiate_media=media,
+            emission=emission,
+            radiance_field=emission and field,
+        )
 
     @cached_property
     def _geometry_kernel(self) -> Kernel:

@@ -74,6 +74,8 @@ class MediumSegment:
         ray: through the medium.
         near, far: of `clip_segment`.
         active: lanes inside the medium.
+        by_extinction: whether the two estimators of in-scattering's derivative are weighted by σₜ in place of σₛ, where that is dear to
+            look up and nowhere 0 unless σₜ is: as the emission of a radiance field.
 
     Attributes:
         majorant: bounds all channels of all states from `near` to `far`.
@@ -87,8 +89,10 @@ class MediumSegment:
         near: Float,
         far: Float,
         active: Bool,
+        by_extinction: bool = False,
     ):
         self.media, self.ray, self.near, self.far = media, ray, near, far
+        self.by_extinction = by_extinction
         self.majorant = self._majorant(tables, active)
 
     def _majorant(self, tables: Mapping[str, Any], active: Bool) -> HomogeneousMajorant | SupergridTraversal:
@@ -324,7 +328,8 @@ def _offer_point(
     t, σ̄ = dda.t, dda.σ̄
     mei = segment.at(t)
     coefficients = [medium.get_scattering_coefficients(mei, walking) for medium in segment.media]
-    offered = [β * mis_complement(σₛ, c) / σ̄ for β, (σₛ, _, _) in zip(walk.β, coefficients, strict=True)]
+    weighed = [σₜ if segment.by_extinction else σₛ for σₛ, _, σₜ in coefficients]
+    offered = [β * mis_complement(σ, c) / σ̄ for β, σ in zip(walk.β, weighed, strict=True)]
     weight = dr.select(walking, total([dr.mean(β) for β in offered]), 0)
     kept = walk.reservoir
     kept.total += weight
@@ -362,18 +367,21 @@ def relative_derivatives(segment: MediumSegment, t: Float, collides: Bool, noise
     with dr.resume_grad():
         for medium in segment.media:
             depth = flown * medium.get_scattering_coefficients(middle, inside)[2]
-            σₛ = medium.get_scattering_coefficients(collision, collides)[0]
+            σₛ, _, σₜ = medium.get_scattering_coefficients(collision, collides)
             either = dr.detach(σₛ) + c
+            if segment.by_extinction:
+                # The weight σₜ/(σₜ + c) over σₛ. At a collision neither is 0.
+                either = dr.detach(σₛ) * (1 + c / dr.detach(σₜ))
             found.append(dr.select(collides & (either > 0), σₛ / either, 0) - depth)
     return found
 
 
 def mis_constant(near: Float, far: Float) -> Float:
-    """The constant c of the two estimators of in-scattering's derivative: a collision is weighted by σₛ/(σₛ + c), a point of
-    differential ratio tracking by the rest. Any c is unbiased; the density of the latter is about 1/(far - near)."""
+    """The constant c of the two estimators of in-scattering's derivative: a collision is weighted by σ/(σ + c), σ being σₛ or σₜ, a
+    point of differential ratio tracking by the rest. Any c is unbiased; the density of the latter is about 1/(far - near)."""
     return dr.select(near < far, dr.rcp(far - near), 0)
 
 
-def mis_complement(σₛ: Spectrum, c: Float) -> Spectrum:
-    """c/(σₛ + c), 0 where both are."""
-    return dr.select(c > 0, c / (σₛ + c), 0)
+def mis_complement(σ: Spectrum, c: Float) -> Spectrum:
+    """c/(σ + c), 0 where both are."""
+    return dr.select(c > 0, c / (σ + c), 0)

@@ -48,6 +48,7 @@ class VolumePair:
         changing_delta: as for `PathPair`.
         differentiate_media: whether parameters of media are to be recovered: only then is their derivative looked for.
         emission: whether there are media that emit (`emissive.py`).
+        radiance_field: whether all media do, with a radiance above 0 wherever there is extinction.
 
     Collisions, directions and roulette depend on both states, so the adjoint of a pair needs both (`adjoint_pair`), also where only
     one gradient is wanted.
@@ -60,7 +61,8 @@ class VolumePair:
     point, uniform and independent of the collisions that C is made of. The first is found twice, at the path's
     own collisions and, where σₛ is small, by differential ratio tracking (`update_reservoir`), weighted by σₛ/(σₛ + c) and c/(σₛ + c):
     neither divides by σₛ or σₜ, nor by σ̄ - σₜ. So gradients are unbiased wherever density or albedo is zero, and where
-    density is at the majorant.
+    density is at the majorant. In a radiance field, where σₛ stands for what is emitted, the weights are σₜ/(σₜ + c) and c/(σₜ + c): so
+    points are offered without looking up its many coefficients.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class VolumePair:
         changing_delta: bool = False,
         differentiate_media: bool = True,
         emission: bool = False,
+        radiance_field: bool = False,
     ):
         # No dataclass: Dr.Jit would take it for state of the loop below.
         self.max_depth = max_depth
@@ -77,6 +80,7 @@ class VolumePair:
         self.changing_delta = changing_delta
         self.differentiate_media = differentiate_media
         self.emission = emission
+        self.radiance_field = radiance_field
 
     def sample(
         self,
@@ -198,7 +202,7 @@ class VolumePair:
         media = context.states.media(medium)
         inside = path.active & (medium != None)  # noqa: E711 (a comparison per lane)
         near, far = tracking.clip_segment(medium, ray, si.t, inside)
-        segment = MediumSegment(tables, media, ray, near, far, inside)
+        segment = MediumSegment(tables, media, ray, near, far, inside, self.radiance_field)
         may_scatter = path.active & (path.depth + 1 < self.max_depth)
         emits = mi.Bool(False)
         if self.emission:
@@ -309,7 +313,11 @@ class VolumePair:
         active = kept.total > 0
         start = PathStart(kept.ray, kept.medium, kept.depth, active, kept.t)
         primal = VolumeContext(start, dr.ADMode.Primal, context.scene, context.tables, (), context.pair)
-        path = self._trace(primal, self._begin(primal), noise, None)
+        path = self._begin(primal)
+        if self.radiance_field:
+            path.L = [mi.Spectrum(1) for _ in path.L]  # No path: its radiance is what the coefficient below holds.
+        else:
+            path = self._trace(primal, path, noise, None)
         share = kept.inverse_probability
         mei = tracking.medium_interaction(kept.ray, kept.t)
         with dr.resume_grad():
