@@ -42,7 +42,7 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
-_MESH_SHARE = 1.0
+_MESH_SHARE = 2.0
 """First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
 _VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
 """λ of the large steps of vertices is their number over 128, within limits: steps are smooth over the same share of any mesh, since √λ is a

@@ -73,7 +73,7 @@ class AveragedNewton:
 
     learning_rate: float = 1.0
     averaging: float = 2.0
-    trust_radius: float | None = 8.0
+    trust_radius: float | None = 2.0
     damping: float = 1e-3
 
     def __post_init__(self):
