@@ -72,6 +72,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "smoothed Hessian, joint": lambda: ur.SmoothedDerivatives(0.03, samples=64, order="hessian"),
     "smoothed products, joint": lambda: ur.SmoothedDerivatives({"colour": 0.03, "*": 0.02}, samples=64, order="hvp"),
     "loss values": lambda: ur.LossValues(spp=4),
+    "Gauss-Newton": lambda: ur.GaussNewton(spp=8, derivative_spp=4),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
     "coupled, control variate": lambda: ur.MetaEstimator(coupled=True, spp=2, image=CV()),
@@ -116,6 +117,7 @@ DEAR = {
     "coupled, other statistics",
     "filtered",
     "filtered, control variate",
+    "Gauss-Newton",
 }
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""
 OPTIMIZERS: dict[str, Callable[[], Any]] = {

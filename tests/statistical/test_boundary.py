@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -71,6 +72,28 @@ def smooth() -> dict[str, Any]:
     return described
 
 
+def beside(**bsdf: Any) -> Callable[[], dict[str, Any]]:
+    """The block above a floor, and before a wall, of another material, which show it again."""
+
+    def described() -> dict[str, Any]:
+        found = block()
+        for name in ("floor", "back"):
+            found[name]["bsdf"] = bsdf
+        return found
+
+    return described
+
+
+def sky() -> dict[str, Any]:
+    """The block above a floor, out of doors."""
+    found = block()
+    for name in ("light", "ceiling", "red-wall", "green-wall", "back"):
+        del found[name]
+    y, x = np.mgrid[:8, :16].astype(np.float32)
+    light = np.stack([1 + np.sin(x / 3), 1.5 + 0 * x, 2 - y / 8], axis=-1).astype(np.float32)
+    return found | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(light)}}
+
+
 def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool = True) -> np.ndarray:
     """(RUNS, n)."""
     renderer = MitsubaRenderer(description, depth, [key])
@@ -85,12 +108,14 @@ def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool =
     return np.stack(found).astype(float)
 
 
-def differences(description: Any, key: str, depth: int, spp: int, step: float = STEP) -> np.ndarray:
-    """(RUNS, n), central, with the same random numbers on both sides."""
+def differences(
+    description: Any, key: str, depth: int, spp: int, step: float = STEP, directions: np.ndarray | None = None
+) -> np.ndarray:
+    """(RUNS, n), central, with the same random numbers on both sides; along directions (n, size), or each element's."""
     renderer = MitsubaRenderer(description, depth)
     session = renderer.prepare([key], None, derivatives=False)
     loaded = np.array(renderer.values([key])[key])
-    steps = np.eye(max(loaded.size, 1)) * step
+    steps = (np.eye(max(loaded.size, 1)) if directions is None else directions) * step
     states = np.concatenate([loaded + steps.reshape(-1, *loaded.shape), loaded - steps.reshape(-1, *loaded.shape)])
     found = []
     for run in range(RUNS):
@@ -126,8 +151,38 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
         (block, "moving.translation.z", 6),
         (receiver, "moving.translation.y", 2),
         (smooth, "moving.translation.y", 2),
+        (beside(type="roughconductor", alpha=0.2), "moving.translation.y", 3),
+        (beside(type="roughplastic", alpha=0.1), "moving.rotation.y", 4),
+        (beside(type="conductor"), "moving.translation.y", 3),
+        (sky, "moving.translation.x", 2),
+        (sky, "moving.scale", 3),
     ],
 )
 def test_poses_at_several_depths(description: Any, key: str, depth: int) -> None:
     found, expected = gradients(description, key, depth, 48), differences(description, key, depth, 256)
     assert np.abs(scores(found, expected)).max() < LIMIT, (found.mean(axis=0), expected.mean(axis=0))
+
+
+def waves(positions: np.ndarray) -> np.ndarray:
+    """Three ways (3, 3 V) to bend a mesh of positions (3 V,); vertices at one place move as one."""
+    place = positions.reshape(-1, 3).astype(float)
+    phases = 6 * place.sum(axis=1)[:, None] + np.arange(3)
+    return np.stack([np.sin(phases + 2 * n).ravel() for n in range(3)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("description", "depth"), [(block, 3), (smooth, 2), (sky, 2)])
+def test_vertices_along_waves(description: Any, depth: int) -> None:
+    key = "moving.vertex_positions"
+    directions = waves(np.array(MitsubaRenderer(description, depth).values([key])[key]))
+    found = gradients(description, key, depth, 48) @ directions.T
+    expected = differences(description, key, depth, 256, 0.003, directions)
+    assert np.abs(scores(found, expected)).max() < LIMIT, (found.mean(axis=0), expected.mean(axis=0))
+
+
+@pytest.mark.slow
+def test_a_planted_fault_of_three_per_cent() -> None:
+    """From many samples of the pose that moves most."""
+    found, expected = gradients(block, "moving.translation.z", 2, 512), differences(block, "moving.translation.z", 2, 4096)
+    assert np.abs(scores(found, expected)).max() < LIMIT
+    assert np.abs(scores(1.03 * found, expected)).max() > LIMIT

@@ -195,7 +195,7 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     assert isinstance(choice.estimator, ur.HybridGradient)
     assert choice.estimator.keys == ("pose",)
     assert isinstance(choice.estimator.path, ur.PathGradient)
-    assert choice.estimator.path.image == CV("primary")
+    assert choice.estimator.path.image == CV("primary", max_weight=0.95)
     assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
     assert dict(choice.optimizer.learning_rate)["pose"] == pytest.approx(0.2)  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert choice.reasons[0] == "perturbed renders of pose: it moves"
