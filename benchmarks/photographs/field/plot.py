@@ -16,7 +16,9 @@ def plot(record: Record) -> Figure:
         for entrant, found in capture["methods"].items():
             minutes, held_out, training = zip(*found["curve"], strict=True)
             axis.plot(minutes, held_out, "o-", color=COLOURS[entrant], label=f"{entrant}: {held_out[-1]:.1f} dB")
-            axis.plot(minutes, training, "x--", color=COLOURS[entrant], label=f"{entrant}, training: {training[-1]:.1f} dB")
+            axis.plot(
+                minutes, training, "x--", color=COLOURS[entrant], label=f"{entrant}, training: {training[-1]:.1f} dB"
+            )
         axis.set(title=f"{name}³", xlabel="processor minutes", ylabel="PSNR (dB)")
         axis.set_xlim(0, 1.1 * max(found["curve"][-1][0] for found in capture["methods"].values()))
         axis.legend()
