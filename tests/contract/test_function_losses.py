@@ -39,6 +39,7 @@ WHOLE = [
     name
     for name in ESTIMATORS
     if not any(word in name for word in ("pixels", "counts", "all four", "denoised"))  # all four: pixels among them
+    and name != "Gauss-Newton"
 ]
 
 
@@ -59,6 +60,11 @@ def test_it_is_the_loss_that_it_computes(name: str, framework: str) -> None:
 def test_it_takes_no_mini_batches(name: str) -> None:
     with pytest.raises(InputError, match="of whole images, so it takes no pixel mini-batches"):
         ur.estimate(problem(of_drjit), ESTIMATORS[name]())
+
+
+def test_it_has_no_gauss_newton_matrix() -> None:
+    with pytest.raises(InputError, match="GaussNewton requires a loss of single pixels, such as L2, got FunctionLoss"):
+        ur.estimate(problem(of_drjit), ESTIMATORS["Gauss-Newton"]())
 
 
 @pytest.mark.parametrize("framework", ["drjit", slow("torch")])
