@@ -18,6 +18,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import method, mi
 from benchmarks.shapes.equal_time.run import Kept, blind
+from unrender.gallery import parts
 
 DEGREES, PERCENT = 2.0, 2.0
 ASKED = (0.05, 0.1)
@@ -79,21 +80,10 @@ def _models(assets: Path, resolution: int, reference_spp: int) -> Case:
     def bitmap(file: str) -> dict[str, Any]:
         return {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": str(assets / file)}}
 
-    def camera(place: tuple[float, float, float]) -> dict[str, Any]:
-        film = {
-            "type": "hdrfilm",
-            "width": resolution,
-            "height": resolution,
-            "pixel_format": "rgb",
-            "rfilter": {"type": "box"},
-        }
-        look = to().look_at(list(place), [0, 0, 0], [0, 1, 0])
-        return {"type": "perspective", "fov": 42.0, "to_world": look, "film": film}
-
     def scene() -> dict[str, Any]:
         return {
             "type": "scene",
-            **{name: camera(place) for name, place in places.items()},
+            **{name: parts.camera(place, (0, 0, 0), 42.0, resolution) for name, place in places.items()},
             "sky": {"type": "envmap", "filename": str(assets / "textures/museum.exr")},
             "table": {
                 "type": "rectangle",

@@ -149,15 +149,17 @@ def blind(problem: ur.Problem) -> ur.Problem:
 
 
 def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
-    """The curve of the surface's error over seconds, and what was reached in the end."""
+    """What was reached in the end, and the curve of the surface's error over seconds; pictures alone where no surface is known."""
+    first, last = _picture_error(problem, problem.initial_values()), _picture_error(problem, found[-1][1])
+    if not problem.surfaces:
+        return {"pictures": last / first}
     (key,) = problem.faces
     start = problem.parameter_error(problem.initial())[key]
     curve = [(0.0, 1.0), *((seconds, problem.parameter_error(values)[key] / start) for seconds, values in found)]
-    first, last = picture_error(problem, problem.initial_values()), picture_error(problem, found[-1][1])
     return {"curve": [list(x) for x in zip(*curve, strict=True)], "surface": curve[-1][1], "pictures": last / first}
 
 
-def picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
+def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
     """Of two halves of the samples, so that their noise does not count."""
     found = 0.0
     for index, view in enumerate(problem.views):

@@ -16,7 +16,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import method
-from benchmarks.shapes.equal_time.run import Kept, blind, measured, picture_error
+from benchmarks.shapes.equal_time.run import Kept, blind, measured
 from unrender.gallery import mesh_files, meshes, parts
 from unrender.gallery.specification import reference
 from unrender.rendering.mitsuba.scene_loading import load
@@ -74,13 +74,9 @@ def descend(problem: ur.Problem, options: dict[str, Any], seconds: float, seed: 
     result = ur.optimize(
         blind(problem), choice.estimator, choice.optimizer, seconds=100 * seconds, seed=seed, callbacks=[kept]
     )
-    kept.found = kept.found[-1:]
-    steps = float(len(result.history))
-    if problem.surfaces:
-        found = measured(problem, kept.found)
-        return {"surface": found["surface"], "pictures": found["pictures"], "steps": steps}
-    start = picture_error(problem, problem.initial_values())
-    return {"pictures": picture_error(problem, kept.found[-1][1]) / start, "steps": steps}
+    found = measured(problem, kept.found[-1:])
+    ends = {what: found[what] for what in ("surface", "pictures") if what in found}
+    return {**ends, "steps": float(len(result.history))}
 
 
 def run(

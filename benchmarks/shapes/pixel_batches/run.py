@@ -18,7 +18,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import Key, PixelSampler
 from benchmarks.races import TUNING_SEED, search
-from benchmarks.shapes.equal_time.run import Kept, blind, measured, picture_error
+from benchmarks.shapes.equal_time.run import Kept, blind, measured
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "resolution": 8, "subdivisions": 1, "views": 2, "pixels": 16, "rates": [0.01],
@@ -61,10 +61,7 @@ def descend(
     estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=spp)
     descent = ur.optimizers.Adam(rate, uniform=True)
     ur.optimize(blind(problem), estimator, descent, seconds=100 * seconds, seed=seed, callbacks=[kept])
-    if problem.surfaces:
-        return measured(problem, kept.found)
-    start = picture_error(problem, problem.initial_values())
-    return {"pictures": picture_error(problem, kept.found[-1][1]) / start}
+    return measured(problem, kept.found)
 
 
 def run(

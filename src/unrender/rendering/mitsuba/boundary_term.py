@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -98,10 +99,9 @@ class BoundaryTerm:
             scene: its parameters are set, and have tangents.
             request: of the rendering.
         """
-        sensor = scene.scene.sensors()[request.sensor]
-        count = dr.prod(sensor.film().crop_size()) if request.pixels is None else dr.width(request.pixels)
-        found = dr.zeros(mi.Float, 3 * int(count))
-        nothing = dr.zeros(mi.TensorXf, (1, int(count), 3))
+        count = math.prod(self._resolutions[request.sensor]) if request.pixels is None else dr.width(request.pixels)
+        found = dr.zeros(mi.Float, 3 * count)
+        nothing = dr.zeros(mi.TensorXf, (1, count, 3))
         for view in views_of(request, nothing, self._resolutions):
             sensor, seed, samples = self._samples(scene, request, view)
             image = self._integrator.tangent_image(scene.scene, sensor, seed, samples)
@@ -110,7 +110,7 @@ class BoundaryTerm:
             of_pixel = dr.gather(mi.UInt32, view.pixels, element // 3) * 3 + channel
             into = dr.gather(mi.UInt32, view.rows, element // 3) * 3 + channel
             dr.scatter(found, dr.square(dr.gather(mi.Float, image.array, of_pixel)), into)
-        return mi.TensorXf(found, (int(count), 3))
+        return mi.TensorXf(found, (count, 3))
 
     @staticmethod
     def _samples(scene: LoadedScene, request: SampleRequest, view: ViewWeights) -> tuple[mi.Sensor, int, int]:
