@@ -18,6 +18,7 @@ from fog import grid
 from scipy import stats
 
 from tiers import quick
+from unrender.rendering.mitsuba import frozen
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -152,6 +153,47 @@ def test_gradients_of_each_sensor_before_a_cloud(name: str) -> None:
     """The volumetric kernel: a pair's collisions are those of both states, and its replay is in both."""
     renderer = MitsubaRenderer(room(name, foggy=True), DEPTH)
     check_replay(renderer, SampleRequest(0, 1024, 7), KEY)
+
+
+@pytest.mark.parametrize("name", quick(("thinlens", "orthographic", "batch"), "thinlens"))
+def test_sensors_that_no_recording_may_hold(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their rays are made outside of it: kernels are recorded, pictures are Mitsuba's own, also where the sensor has moved since, and
+    gradients those of kernels that are traced at each call."""
+    warned: list[str] = []
+    monkeypatch.setattr(frozen, "_warn", warned.append)
+    scene = mi.load_dict(room(name))
+    renderer = MitsubaRenderer(scene, DEPTH)
+    session, current = renderer.prepare([KEY], None), renderer.values([KEY])
+
+    def pictures(first: int) -> np.ndarray:
+        requests = [SampleRequest(0, 64, seed) for seed in range(first, first + 12)]
+        return np.array([numbers(session.image(current, request).images)[0] for request in requests])
+
+    stale, parameters = pictures(0), mi.traverse(scene)
+    key = next(key for key in parameters.keys() if key.startswith(name) and key.endswith("to_world"))  # noqa: SIM118
+    parameters[key] = mi.Transform4f().look_at([0.3, -4, 2.0], [0.2, 0, 0.6], [0, 0, 1])  # pyright: ignore[reportCallIssue]
+    parameters.update()
+    ours = pictures(100)
+    integrator: Any = mi.load_dict({"type": "path", "max_depth": DEPTH})
+    theirs = np.array([numbers(mi.render(scene, integrator=integrator, spp=64, seed=seed)) for seed in range(12)])  # pyright: ignore[reportArgumentType]
+    limit = stats.t.isf((1 - (1 - 1e-3) ** (1 / theirs[0].size)) / 2, 11)
+
+    def z(found: np.ndarray) -> float:
+        error = np.sqrt((found.var(0, ddof=1) + theirs.var(0, ddof=1)) / len(found))
+        return float((np.abs(found.mean(0) - theirs.mean(0)) / np.maximum(error, 1e-6)).max())
+
+    assert z(ours) < limit
+    assert z(stale) > limit, "too noisy to see that the sensor has moved"
+
+    request = SampleRequest(0, 64, 3)
+    weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1.5, theirs[:1].shape))
+    recorded = session.adjoint(current, session.image(current, request).paths, weight)[KEY]
+    assert not warned
+    monkeypatch.setattr("unrender.rendering.mitsuba.session.is_recordable", lambda sensor: True)
+    traced = MitsubaRenderer(scene, DEPTH).prepare([KEY], None)
+    traced._recordable = False
+    expected = traced.adjoint(current, traced.image(current, request).paths, weight)[KEY]
+    np.testing.assert_allclose(numbers(recorded), numbers(expected), rtol=1e-4)
 
 
 def test_tangents_of_a_weighted_path_are_its_derivative() -> None:

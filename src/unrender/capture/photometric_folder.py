@@ -48,7 +48,7 @@ _KEYS = {
 _BRIGHTEST = 0.8
 """Reflectance of the brightest pixels but one in a hundred."""
 _FAR, _DISTANCE = 1e4, 100.0
-"""Of the light, and of the camera in half the plate's width: nearly orthographic, and recorded kernels know no orthographic camera."""
+"""Of the light, and of the camera in half the plate's width: nearly orthographic, and recorded kernels make its rays themselves."""
 
 
 def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> None:

@@ -12,7 +12,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["Films", "RepeatingSampler", "develop", "film_adjoint", "per_sample", "rays", "rays_of_many", "sampler_at"]
+__all__ = [
+    "CameraSamples",
+    "Films",
+    "RepeatingSampler",
+    "camera_samples",
+    "camera_samples_of_many",
+    "develop",
+    "film_adjoint",
+    "per_sample",
+    "rays",
+    "sampler_at",
+]
 
 
 @dataclass
@@ -53,8 +64,29 @@ class RepeatingSampler:
         return mi.Point2f(first, self.rng.next_float32())
 
 
-def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1) -> tuple[Any, Any]:
-    """Camera rays, samples of a pixel side by side.
+@dataclass(frozen=True)
+class CameraSamples:
+    """What a sensor makes camera rays of, per lane; samples of a pixel side by side.
+
+    Attributes:
+        sensor: `mitsuba.Sensor`, or `mitsuba.SensorPtr` where each pixel has its own.
+        time: `mi.Float`.
+        position: `mi.Point2f` on the film, in [0, 1).
+        aperture: `mi.Point2f` in [0, 1).
+        spp: rays per pixel.
+    """
+
+    sensor: Any
+    time: Any
+    position: Any
+    aperture: Any
+    spp: int
+
+
+def camera_samples(
+    sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1
+) -> CameraSamples:
+    """Samples of one sensor's film; copies * count * spp lanes.
 
     Args:
         sensor: `mitsuba.Sensor`.
@@ -64,9 +96,6 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
         pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
         count: how many pixels.
         copies: of the whole image, one behind the other.
-
-    Returns:
-        `mi.RayDifferential3f` and its weight per lane; copies * count * spp lanes.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
@@ -83,26 +112,19 @@ def rays(sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
         sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0
     )
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    ray, weight = sensor.sample_ray_differential(
-        mi.Float(time), 0.5, mi.Point2f(position.x / width, position.y / height), aperture
-    )
-    ray.scale_differential(spp**-0.5)
-    return ray, weight
+    return CameraSamples(sensor, mi.Float(time), mi.Point2f(position.x / width, position.y / height), aperture, spp)
 
 
-def rays_of_many(
+def camera_samples_of_many(
     sensors: Any, settings: Films, which: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
-) -> tuple[Any, Any]:
-    """Camera rays of pixels that belong to different sensors, samples of a pixel side by side.
+) -> CameraSamples:
+    """Samples of pixels that belong to different sensors; count * spp lanes.
 
     Args:
         sensors: `mitsuba.SensorPtr`, all of the scene's.
         settings: of all of them.
         which: `mi.UInt32`, the index of each pixel's sensor.
-        sampler, seed, spp, pixels, count: see `rays`.
-
-    Returns:
-        `mi.RayDifferential3f` and its weight per lane; count * spp lanes.
+        sampler, seed, spp, pixels, count: see `camera_samples`.
     """
     lanes = count * spp
     sampler.seed(seed, lanes)
@@ -116,13 +138,14 @@ def rays_of_many(
         opening, open_time = settings.shutters
         time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
     aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
-    ray, weight = dr.gather(mi.SensorPtr, sensors, which).sample_ray_differential(
-        time,  # pyright: ignore[reportArgumentType]
-        0.5,  # pyright: ignore[reportArgumentType]
-        mi.Point2f(position.x / width, position.y / height),
-        aperture,  # pyright: ignore[reportArgumentType]
-    )
-    ray.scale_differential(spp**-0.5)
+    position = mi.Point2f(position.x / width, position.y / height)
+    return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp)
+
+
+def rays(samples: CameraSamples) -> tuple[Any, Any]:
+    """`mi.RayDifferential3f` and its weight per lane."""
+    ray, weight = samples.sensor.sample_ray_differential(samples.time, 0.5, samples.position, samples.aperture)
+    ray.scale_differential(samples.spp**-0.5)
     return ray, weight
 
 
@@ -178,7 +201,7 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any
     """The mean of each pixel's samples, per group.
 
     Args:
-        radiance: `mi.Spectrum`, evaluated, lanes ordered as `rays` makes them.
+        radiance: `mi.Spectrum`, evaluated, lanes ordered as `camera_samples` makes them.
         spp: samples per pixel, in all groups.
         groups: the samples of a pixel are cut into that many equal runs.
         shape: of one image, (H, W, 3) or (N, 3).

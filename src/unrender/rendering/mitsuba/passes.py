@@ -1,6 +1,6 @@
 """The launches that answer a sample request, one class each: which scene is traced, with which tables, and what for.
 
-A pass makes the function that is recorded. Its arguments after the first six are the pass's own, see `trace`.
+A pass makes the function that is recorded. Its arguments after the first seven are the pass's own, see `trace`.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ Kernel = PathPair | VolumePair | PrbKernel
 Tables = dict[str, Any]
 """{name: `mi.UInt32`}."""
 
+Rays = list[tuple[Any, Any]]
+"""(`mi.Ray3f`, `mi.Spectrum`): camera rays and their weights, of each state that is traced."""
+
 
 @dataclass(frozen=True)
 class LaunchSize:
@@ -70,6 +73,28 @@ class Pass(ABC):
         """What is handed to the kernel as the scene."""
         return pair.loaded(self.previous).scene
 
+    def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
+        """The scenes that camera rays are made for."""
+        return (pair.loaded(self.previous).scene,)
+
+    def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
+        """Where the random numbers come from, yet to be seeded."""
+        # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
+        return sampler.clone() if positions is None else film.sampler_at(positions, size.spp, size.pixels)
+
+    def camera_rays(
+        self, pair: ScenePair, sampler: mi.Sampler, size: LaunchSize, seeds: Any, pixels: Any, sensors: Any
+    ) -> Rays:
+        """The camera rays that `function` takes, made outside of it. Arguments: see `function`."""
+        seed, positions = seeds
+        found = []
+        with dr.suspend_grad():
+            for scene in self.states(pair):
+                numbers = self.numbers(sampler, size, positions)
+                ray, weight = film.rays(_camera_samples(scene, numbers, size, seed, pixels, sensors))
+                found.append((mi.Ray3f(ray), weight))
+        return found
+
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
         """The tables that the kernel looks up; `sensor`: None where each pixel has its own."""
         tables = self._surface_tables(pair, delta)
@@ -84,24 +109,24 @@ class Pass(ABC):
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
         """What is recorded: of the scene, all loaded scenes, tables, the seed with each pixel's position or None, pixels or None, the
-        films and each pixel's sensor or None, and the pass's own arrays.
+        films and each pixel's sensor or None, `camera_rays` or None to make them, and the pass's own arrays.
 
         With `posed`, what is handed as the scene is its `scenes()` and its `numbers()` of one pose, raveled.
         """
 
-        def launch(scene, loaded, tables, seeds, pixels, sensors, *own):
+        def launch(scene, loaded, tables, seeds, pixels, sensors, rays, *own):
             del loaded  # read through pointers, if at all
             assembly = None
             if posed is not None:
                 scenes, numbers_of_pose = scene
                 assembly = posed.at(scenes, numbers_of_pose, mi.UInt32(0))
                 scene = assembly.static
-            # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
             seed, positions = seeds
-            whole = positions is None
-            numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
+            numbers = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
-                ray, ray_weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
+                # Also where the rays are given: paths go on with the numbers after these.
+                samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
+                ray, ray_weight = film.rays(samples) if rays is None else (mi.Ray3f(rays[0][0]), rays[0][1])
                 if assembly is not None:
                     ray = _posed_rays(assembly, ray, size, sensors)
                 if sensors is not None and "camera" in tables:
@@ -223,6 +248,10 @@ class MovedPairPass(Pass):
         """Both."""
         return pair.current, pair.previous
 
+    def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
+        """Both."""
+        return pair.current, pair.previous
+
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
         """See `MovedPair.sample`."""
         return pair.moved_tables(self.moving)
@@ -233,20 +262,18 @@ class MovedPairPass(Pass):
         """See `Pass.function`. Each state has the rays of its own sensors; the kernel is its own."""
         del kernel, posed
 
-        def launch(scenes, loaded, tables, seeds, pixels, sensors):
+        def launch(scenes, loaded, tables, seeds, pixels, sensors, rays):
             del loaded
             seed, positions = seeds
             with dr.suspend_grad():
-                rays, weights = [], []
-                for scene in scenes:  # equal numbers
-                    whole = positions is None
-                    numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
-                    ray, weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
-                    rays.append(ray)
-                    weights.append(weight)
+                made: list[tuple[Any, Any]] = []
+                for state, scene in enumerate(scenes):  # equal numbers
+                    numbers = self.numbers(sampler, size, positions)
+                    samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
+                    made.append(film.rays(samples) if rays is None else rays[state])
                 choices = independent(numbers, size.pixels * size.spp)
-                found = self.tracer.sample(scenes, tables, numbers, choices, (rays[0], rays[1]))
-                return tuple(L * weight for L, weight in zip(found, weights, strict=True))
+                found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[1][0]))
+                return tuple(L * weight for L, (_, weight) in zip(found, made, strict=True))
 
         return launch
 
@@ -332,22 +359,28 @@ class PosesPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
+    def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
+        """The same for every pose."""
+        del sampler, positions
+        return film.RepeatingSampler(size.pixels * size.spp)
+
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
         """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled. `posed` is its own."""
         del posed
 
-        def launch(scenes, loaded, tables, seeds, pixels, sensors, numbers):
+        def launch(scenes, loaded, tables, seeds, pixels, sensors, rays, numbers):
             del loaded, tables, sensors
-            seed, _ = seeds
+            seed, positions = seeds
             lanes = size.pixels * size.spp
             batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes
             assembly = self.posed.at(scenes, numbers, batch)
-            repeating = film.RepeatingSampler(lanes)
+            repeating = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
                 camera = assembly.static.sensors()[size.sensor]
-                ray, ray_weight = film.rays(camera, repeating, seed, size.spp, pixels, size.pixels, self.copies)
+                samples = film.camera_samples(camera, repeating, seed, size.spp, pixels, size.pixels, self.copies)
+                ray, ray_weight = film.rays(samples) if rays is None else _repeated(rays[0], lanes, self.copies)
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
                 L, _ = kernel.sample(dr.ADMode.Primal, assembly.static, {}, repeating, ray, geometry=assembly)
@@ -360,18 +393,24 @@ class PosesPass(Pass):
         raise NotImplementedError
 
 
-def _camera_rays(
+def _camera_samples(
     scene: mi.Scene,
     sampler: Any,
     size: LaunchSize,
     seed: mi.UInt32,
     pixels: mi.UInt32 | None,
     sensors: tuple[film.Films, mi.UInt32] | None,
-) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+) -> film.CameraSamples:
     if sensors is None:
-        return film.rays(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
+        return film.camera_samples(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
     films, which = sensors
-    return film.rays_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
+    return film.camera_samples_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
+
+
+def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tuple[Any, Any]:
+    """The rays of one image, one image behind the other."""
+    lane = dr.arange(mi.UInt32, copies * lanes) % lanes
+    return dr.gather(mi.Ray3f, rays[0], lane), dr.gather(mi.Spectrum, rays[1], lane)
 
 
 def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, sensors: tuple[film.Films, mi.UInt32] | None) -> Any:

@@ -37,6 +37,7 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
+from unrender.rendering.mitsuba.recordable import is_recordable
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import Rendering, SampleRequest, Space
@@ -337,9 +338,11 @@ class MitsubaSession:
         pair = self._pair
         size = LaunchSize(request.sensor, request.spp, self._count(request))
         several = request.sensors is not None
+        outside = self._rays_outside(request)
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
-        key = (task, size, request.groups, request.pixels is None, several, request.positions is None, shapes)
+        pixels = request.pixels is None, several, request.positions is None
+        key = (task, size, request.groups, pixels, outside, shapes)
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size, posed)
@@ -348,9 +351,21 @@ class MitsubaSession:
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
         seeds = mi.UInt32(request.seed), request.positions
+        rays = None
+        if outside:
+            # A constant would be compiled into the kernel.
+            opaque = dr.opaque(mi.UInt32, request.seed), request.positions
+            rays = task.camera_rays(pair, self._sampler, size, opaque, request.pixels, sensors)
         before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, *own)
+        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
+
+    def _rays_outside(self, request: SampleRequest) -> bool:
+        """Whether the camera rays are made outside of the recording, since it cannot hold the sensor."""
+        if request.sensors is None:
+            return not is_recordable(self._pair.current.sensors()[request.sensor])
+        # A call through a pointer sees every sensor of the process.
+        return not all(is_recordable(sensor) for loaded in loaded_scenes() for sensor in loaded.scene.sensors())
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
