@@ -150,3 +150,34 @@ def test_kernels_of_a_textured_area_light_are_recorded(warned: list[str]) -> Non
     )
     assert not warned
     assert bright.mean() > 1.2 * dark.mean()
+
+
+def test_later_steps_replay_what_two_have_recorded() -> None:
+    """Whatever the seed, and although two scenes share what their replays let them share."""
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+    from unrender.rendering.renderer import SampleRequest
+
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    scene = {
+        "type": "scene",
+        "camera": {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 2, 4], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+        },
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90), "bsdf": grey},
+        "lamp": {"type": "constant"},
+    }
+    key = "floor.bsdf.reflectance.value"
+    session = MitsubaRenderer(scene).prepare([key], "path")
+
+    def value(x: float) -> dict[str, Any]:
+        return {key: mi.TensorXf(np.full(3, x, np.float32))}
+
+    recordings = []
+    states = [value(x) for x in (0.1, 0.2, 0.3, 0.4)]
+    # Two steps as a run's warm-up takes them, and then others.
+    for seed, now, before in [(7, 0, 0), (7, 1, 0), (1, 0, 0), (2, 1, 0), (3, 2, 1), (4, 3, 2)]:
+        session.image_pair(states[now], states[before], SampleRequest(0, 4, seed, 1), "path")
+        recordings.append(sum(getattr(once._frozen, "n_recordings", 0) for once in session._functions.values()))
+    assert recordings[1:] == recordings[1:2] * 5

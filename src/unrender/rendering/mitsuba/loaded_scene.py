@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
@@ -28,7 +29,7 @@ from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
 
-__all__ = ["LoadedScene", "detach_all", "loaded_scenes"]
+__all__ = ["LoadedScene", "detach_all", "loaded_scenes", "share_addresses"]
 
 
 class _Registry:
@@ -37,6 +38,7 @@ class _Registry:
     Attributes:
         any_died: whether one died since the last `collect`: its Mitsuba objects may live on in reference cycles.
         any_tangents: whether any has ever had tangents.
+        any_new: whether one was loaded since the last `share_addresses`.
     """
 
     def __init__(self) -> None:
@@ -44,6 +46,7 @@ class _Registry:
         self._serial = itertools.count()
         self.any_died = False
         self.any_tangents = False
+        self.any_new = False
 
     def add(self, scene: LoadedScene) -> None:
         number = next(self._serial)
@@ -54,6 +57,7 @@ class _Registry:
             self.any_died = True
 
         self._scenes[number] = weakref.ref(scene, died)
+        self.any_new = True
 
     def scenes(self) -> list[LoadedScene]:
         return [scene for reference in list(self._scenes.values()) if (scene := reference()) is not None]
@@ -78,6 +82,24 @@ def detach_all() -> None:
     if _registry.any_tangents:
         for scene in loaded_scenes():
             scene.detach()
+
+
+def share_addresses() -> None:
+    """Have scenes that were loaded since the last call share what they would share after the first replay of a recording.
+
+    On a CPU, each scene holds the addresses of Embree's functions in variables of its own. A replay takes equal addresses for one variable
+    and hands that to all scenes, which is another input to every recording: all would be recorded anew in the midst of a run.
+    """
+    scenes = [loaded.scene for loaded in loaded_scenes()]
+    if _registry.any_new and len(scenes) > 1:
+        recorded = FrozenFunction(lambda scenes, number: number + 1)
+        for _ in range(2):
+            dr.eval(recorded(_nothing, scenes, dr.opaque(mi.Float, 0)))
+    _registry.any_new = False
+
+
+def _nothing() -> None:
+    return None
 
 
 @dataclass(frozen=True)

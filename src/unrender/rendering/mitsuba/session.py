@@ -22,7 +22,7 @@ from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
-from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes
+from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
@@ -347,15 +347,13 @@ class MitsubaSession:
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size, posed)
             self._functions[key] = FrozenFunction(traced, self._recordable)
+        share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
-        seeds = mi.UInt32(request.seed), request.positions
-        rays = None
-        if outside:
-            # A constant would be compiled into the kernel.
-            opaque = dr.opaque(mi.UInt32, request.seed), request.positions
-            rays = task.camera_rays(pair, self._sampler, size, opaque, request.pixels, sensors)
+        # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
+        seeds = dr.opaque(mi.UInt32, request.seed), request.positions
+        rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
         before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
         return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
