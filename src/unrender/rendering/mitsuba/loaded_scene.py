@@ -10,7 +10,7 @@ import contextlib
 import gc
 import itertools
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
@@ -84,14 +84,14 @@ def detach_all() -> None:
             scene.detach()
 
 
-def share_addresses() -> None:
-    """Have scenes that were loaded since the last call share what they would share after the first replay of a recording.
+def share_addresses(others: Sequence[mi.Scene] = ()) -> None:
+    """Have scenes that were loaded since the last call, and `others`, share what they would share after the first replay of a recording.
 
     On a CPU, each scene holds the addresses of Embree's functions in variables of its own. A replay takes equal addresses for one variable
     and hands that to all scenes, which is another input to every recording: all would be recorded anew in the midst of a run.
     """
-    scenes = [loaded.scene for loaded in loaded_scenes()]
-    if _registry.any_new and len(scenes) > 1:
+    scenes = [*(loaded.scene for loaded in loaded_scenes()), *others]
+    if (others or _registry.any_new) and len(scenes) > 1:
         recorded = FrozenFunction(lambda scenes, number: number + 1)
         for _ in range(2):
             dr.eval(recorded(_nothing, scenes, dr.opaque(mi.Float, 0)))

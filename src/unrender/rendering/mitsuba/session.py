@@ -127,6 +127,8 @@ class MitsubaSession:
             # Path gradients of an earlier session may have left shapes where it moved them.
             pair.loaded().set_parameters({})
         self._posed = PosedScene(pair.current, fixed) if fixed else None
+        if self._posed is not None:
+            share_addresses(self._posed.scenes())
         self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
         self._max_depth, self._sampler = max_depth, sampler
@@ -316,6 +318,7 @@ class MitsubaSession:
             return self._posed
         if self._posed_previous is None:
             self._posed_previous = PosedScene(self._pair.previous, self._poses)
+            share_addresses([*self._posed.scenes(), *self._posed_previous.scenes()])
         return self._posed_previous
 
     def _check_keys(self, parameters: Tree) -> None:
