@@ -44,9 +44,9 @@ _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
 _MESH_SHARE = 4.0
 """First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
-_VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
-"""λ of the large steps of vertices is their number over 128, within limits: steps are smooth over the same share of any mesh, since √λ is a
-number of edges. 19 or so for some 2500, as in Nicolet et al. 2021."""
+_VERTICES_PER_STRENGTH, _STRENGTHS = 192, (1.0, 64.0)
+"""λ of the large steps of vertices is their number over 192, within limits: steps are smooth over the same share of any mesh, since √λ is a
+number of edges. 13 or so for some 2500; 19 in Nicolet et al. 2021."""
 _MESH_TIME = 15.0
 """Steps after which the rate of vertices is 1/√2 of the first: a shape's first steps are the longest that it bears."""
 _MANY_VIEWS, _MOST_VIEWS = 4, 8
