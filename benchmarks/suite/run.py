@@ -36,6 +36,7 @@ TUNING_SEED = 1000
 QUICK = {
     "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "spp": (4,), "rates": (0.02,), "gallery_reference_spp": 1, "every": 1,
 }  # fmt: skip
+MERGE = ("problems.*",)
 FIXED_POINT_SPP = 16
 Points = list[tuple[float, float]]
 

@@ -34,7 +34,7 @@ from unrender.preconditioners import LargeSteps, Sobolev, grid
 from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
-from unrender.schedules import Exponential
+from unrender.schedules import Exponential, InverseRoot
 
 __all__ = ["AutoMethod"]
 
@@ -42,13 +42,13 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
-_MESH_SHARE = 2.0
+_MESH_SHARE = 4.0
 """First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
-_VERTICES_PER_STRENGTH, _STRENGTHS = 128, (1.0, 64.0)
-"""λ of the large steps of vertices is their number over 128, within limits: steps are smooth over the same share of any mesh, since √λ is a
-number of edges. 19 or so for some 2500, as in Nicolet et al. 2021."""
-_MESH_HALVING, _MESH_FLOOR = 200.0, 0.1
-"""Steps after which the rate of vertices is half of what it was, and the least share of the first one."""
+_VERTICES_PER_STRENGTH, _STRENGTHS = 192, (1.0, 64.0)
+"""λ of the large steps of vertices is their number over 192, within limits: steps are smooth over the same share of any mesh, since √λ is a
+number of edges. 13 or so for some 2500; 19 in Nicolet et al. 2021."""
+_MESH_TIME = 15.0
+"""Steps after which the rate of vertices is 1/√2 of the first: a shape's first steps are the longest that it bears."""
 _MANY_VIEWS, _MOST_VIEWS = 4, 8
 """Of meshes: from how many views on a step takes half of them, and how many at most."""
 _ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
@@ -212,7 +212,7 @@ class AutoMethod(Options):
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
         if meshes:
             rate = min(rates[key] for key in meshes)
-            descent = Adam(rate, schedule=Exponential(_MESH_HALVING, _MESH_FLOOR), uniform=True)
+            descent = Adam(rate, schedule=InverseRoot(_MESH_TIME), uniform=True)
             optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_strength(problem)))
         return Choice(estimator, optimizer, tuple(filter(None, reasons)))
 

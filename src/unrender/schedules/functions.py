@@ -14,7 +14,7 @@ from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
-__all__ = ["Constant", "Cosine", "Exponential", "Schedule", "Steps", "Warmup"]
+__all__ = ["Constant", "Cosine", "Exponential", "InverseRoot", "Schedule", "Steps", "Warmup"]
 
 
 class Schedule(Protocol):
@@ -66,6 +66,24 @@ class Exponential:
 
 @register(position=3)
 @dataclass(frozen=True)
+class InverseRoot:
+    """1 / √(1 + step / time): a rate that falls early and never stops, whatever the number of steps.
+
+    Args:
+        time: steps after which the rate is 1/√2 of the first, > 0.
+    """
+
+    time: float
+
+    def __post_init__(self):
+        checks.number("InverseRoot", "time", self.time, above=0.0)
+
+    def __call__(self, step: float) -> float:
+        return 1.0 / math.sqrt(1.0 + step / self.time)
+
+
+@register(position=4)
+@dataclass(frozen=True)
 class Cosine:
     """Half a cosine from 1 at step 0 down to `floor` at step `steps`, and `floor` ever after.
 
@@ -86,7 +104,7 @@ class Cosine:
         return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
-@register(position=4)
+@register(position=5)
 @dataclass(frozen=True)
 class Steps:
     """Multiplied by `factor` once every `every` steps.
@@ -107,7 +125,7 @@ class Steps:
         return float(self.factor) ** (step // self.every)
 
 
-@register(position=5)
+@register(position=6)
 @dataclass(frozen=True)
 class Warmup:
     """A linear rise over the first `steps` steps, 1/steps, 2/steps … 1, then another schedule, which starts at its

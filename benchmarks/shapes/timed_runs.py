@@ -1,0 +1,64 @@
+"""Runs of `unrender` over processor time, and what they reach: errors of surfaces and of pictures."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+
+POINTS = 40
+"""Of a curve."""
+_PICTURE_SPP = 64
+
+
+class Kept(ur.Callback):
+    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
+
+    def __init__(self, seconds: float):
+        self.found: list[tuple[float, dict[str, np.ndarray]]] = []
+        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
+        self._since: float | None = None
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        now = time.process_time()
+        # The first step is only known by what the others take.
+        self._clock += 0.0 if self._since is None else now - self._since
+        if self._clock >= self._next or self._clock >= self._seconds:
+            self._next = self._clock + self._seconds / POINTS
+            self.found.append((self._clock, run.full()))
+        if self._clock >= self._seconds:
+            run.stop()
+        self._since = time.process_time()
+
+
+def blind(problem: ur.Problem) -> ur.Problem:
+    """The same without the truth: errors are no part of a run's time."""
+    found = copy.copy(problem)
+    found.surfaces, found.truth = {}, {}
+    return found
+
+
+def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
+    """What was reached in the end, and the curve of the surface's error over seconds; pictures alone where no surface is known."""
+    first, last = _picture_error(problem, problem.initial_values()), _picture_error(problem, found[-1][1])
+    if not problem.surfaces:
+        return {"pictures": last / first}
+    (key,) = problem.faces
+    start = problem.parameter_error(problem.initial())[key]
+    curve = [(0.0, 1.0), *((seconds, problem.parameter_error(values)[key] / start) for seconds, values in found)]
+    return {"curve": [list(x) for x in zip(*curve, strict=True)], "surface": curve[-1][1], "pictures": last / first}
+
+
+def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
+    """Of two halves of the samples, so that their noise does not count."""
+    found = 0.0
+    for index, view in enumerate(problem.views):
+        one, two = (ur.render(problem, values, index, spp=_PICTURE_SPP, seed=seed) for seed in (1, 2))
+        reference = np.asarray(view.reference)
+        found += float(np.mean((one - reference) * (two - reference)))
+    return float(np.sqrt(max(found / len(problem.views), 0.0)))
