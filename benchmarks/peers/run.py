@@ -256,7 +256,7 @@ def run(
     svbrdf_python: Path | None = None,
     assets: Path | None = None,
     problem: tuple[str, ...] = tuple(scenes.SCENES),
-    seconds: float = 45.0,
+    seconds: float = 30.0,
     seeds: int = 2,
     resolution: int = 64,
     texture: int = 64,
