@@ -1,0 +1,305 @@
+"""`auto` beside the pipelines of others: Weier et al. 2025 and svbrdf_uncertainty, each in its own environment, at equal processor time.
+
+Neither is part of this repository. Of each, clone the repository, make an environment with what it asks for, and name both:
+`--weier FOLDER --weier-python PYTHON`, `--svbrdf FOLDER --svbrdf-python PYTHON`; either pair may be left out. A small driver of ours
+(drivers/) runs theirs as it is and keeps the textures on the way; what they leave is written below out/.
+
+All start from 0.5 everywhere with the same pictures. `auto` has no option given. A peer has the settings that its authors published, and
+once more, where another is better, the rate that is best on a seed of its own. Errors are of the texels that the views see, and of pictures
+by cameras that nobody was given, rendered by us with the textures that each side found. Time is the processor's, of all threads, without
+compilation and the first step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.internals import mi
+from benchmarks.peers import scenes
+from benchmarks.races import search, total_error
+from benchmarks.runner.records import scratch
+from benchmarks.suite.run import visible
+
+_POINTS = 20
+_PICTURE_SPP = 256
+TUNING_SEED = 1000
+MERGE = ("problems",)
+QUICK = {"problem": ("plane",), "seconds": 4.0, "seeds": 1, "resolution": 16, "reference_spp": 64}
+NOTHING_GIVEN = (
+    "no peer is given: clone github.com/google/practical-inverse-rendering-of-textured-and-translucent-appearance or "
+    "github.com/rubenwiersma/svbrdf_uncertainty, make an environment for it as its README says, and name both, "
+    "as in --weier FOLDER --weier-python ENVIRONMENT/bin/python; benchmarks/peers/notes.md has the details"
+)
+PYRAMID = {
+    "approach": "MIPMAP_PYRAMID",
+    "base_learning_rate": 0.1,
+    "samples_per_pixel_primal": 16,
+    "samples_per_pixel_gradient": 1,
+    "shares": {"base_color": 1.0, "roughness": 0.1, "metallic": 0.1},
+}
+"""Weier et al.'s: their `painting/mipmap_pyramid.gin`, for metallic their default."""
+FILTER = {
+    **PYRAMID,
+    "approach": "NAIVE",
+    "use_gradient_filtering": True,
+    "filtering_sigma_d": 0.1,
+    "a_trous_filtering_steps": 5,
+    "log_domain_filtering": True,
+    "beta_1": 0.2,
+}
+"""The filter of Chang et al. 2024 as Weier et al. wrote it, at what Chang et al. published: σ_d 0.1, five levels, β₁ 0.2."""
+LOOP = {"learning_rate": 0.01, "grad_spp": 32, "smoothness_weight": 1e-3}
+"""svbrdf_uncertainty's: the defaults of `optimize_material`."""
+
+Points = list[tuple[float, dict[str, np.ndarray]]]
+
+
+class Kept(ur.Callback):
+    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
+
+    def __init__(self, seconds: float):
+        self.found: Points = []
+        self.steps = 0
+        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
+        self._since: float | None = None
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        now = time.process_time()
+        self._clock += 0.0 if self._since is None else now - self._since
+        self.steps += 1
+        if self._clock >= self._next or self._clock >= self._seconds:
+            self._next = self._clock + self._seconds / _POINTS
+            self.found.append((self._clock, run.full()))
+        if self._clock >= self._seconds:
+            run.stop()
+        self._since = time.process_time()
+
+
+class Judge:
+    """Errors of textures, relative to the start.
+
+    Args:
+        case: whose truth and held-out pictures are known.
+    """
+
+    def __init__(self, case: scenes.Case):
+        self.case, self._truth = case, case.problem.truth
+        self._seen = visible(case.problem)
+        with np.load(case.folder / "others.npz") as found:
+            self._pictures = [found[f"arr_{n}"] for n in range(len(found.files))]
+        self._scene = mi.load_file(str(case.folder / "others.xml"))
+        self._parameters = mi.traverse(self._scene)
+        self._path = mi.load_dict({"type": "path", "max_depth": scenes.DEPTH})
+        begin = {key: np.full(truth.shape, 0.5, np.float32) for key, truth in self._truth.items()}
+        self._start, self._begin = self._rmse(begin), self._others(begin)
+
+    def _rmse(self, values: dict[str, np.ndarray]) -> dict[str, float]:
+        return {
+            key: float(np.sqrt(np.mean((values[key].reshape(truth.shape) - truth)[self._seen[key]] ** 2)))
+            for key, truth in self._truth.items()
+        }
+
+    def textures(self, values: dict[str, np.ndarray]) -> float:
+        """The mean over textures of the error where seen."""
+        return total_error(self._rmse(values), self._start)
+
+    def each(self, values: dict[str, np.ndarray]) -> dict[str, float]:
+        """Of each texture, by its channel."""
+        return {key.split(".")[-2]: error / self._start[key] for key, error in self._rmse(values).items()}
+
+    def pictures(self, values: dict[str, np.ndarray]) -> float:
+        """Of held-out pictures."""
+        return self._others(values) / self._begin
+
+    def _others(self, values: dict[str, np.ndarray]) -> float:
+        for key, value in values.items():
+            self._parameters[key] = mi.TensorXf(np.ascontiguousarray(value.reshape(self._truth[key].shape)))
+        self._parameters.update()
+        square = 0.0
+        for n, picture in enumerate(self._pictures):  # two halves of the samples, so that their noise does not count
+            one, two = (
+                np.array(mi.render(self._scene, sensor=n, integrator=self._path, spp=_PICTURE_SPP, seed=seed))
+                for seed in (1, 2)
+            )
+            square += float(np.mean((one - picture) * (two - picture)))
+        return float(np.sqrt(max(square, 0.0)))
+
+    def run(self, found: Points, steps: int) -> dict[str, Any]:
+        """The record of a run."""
+        last = {key: found[-1][1][key] for key in self.case.keys}
+        return {
+            "curve": [[seconds, self.textures(values)] for seconds, values in found],
+            "textures": self.textures(last),
+            "each": self.each(last),
+            "pictures": self.pictures(last),
+            "steps": steps,
+        }
+
+
+def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
+    """`auto`, no option given; errors are no part of the time."""
+    blind = copy(judge.case.problem)
+    blind.truth = {}
+    kept = Kept(seconds)
+    ur.optimize(blind, seconds=100 * seconds, seed=seed, callbacks=[kept])  # a limit of the clock, never reached
+    return judge.run(kept.found, kept.steps)
+
+
+class Peer:
+    """A pipeline of others, in a process of its own.
+
+    Args:
+        driver: the file under drivers/.
+        python: of its environment.
+        path: what its modules are imported from.
+    """
+
+    def __init__(self, driver: str, python: Path, path: Path):
+        self._driver, self._python, self._path = Path(__file__).parent / f"drivers/{driver}.py", python, path
+
+    def run(
+        self, judge: Judge, scene: str, seconds: float, seed: int, settings: dict[str, Any], check: bool
+    ) -> dict[str, Any]:
+        """One run with the given settings."""
+        folder = judge.case.folder.resolve()
+        asked = {
+            "scene": str(folder / scene), "references": str(folder / "references.npz"), "out": str(folder / "found.npz"),
+            "folder": str(folder), "keys": judge.case.keys, "material": scenes.MATERIAL, "depth": scenes.DEPTH,
+            "seconds": seconds, "points": _POINTS, "seed": seed, "settings": settings, "check": check,
+        }  # fmt: skip
+        (folder / "task.json").write_text(json.dumps(asked))
+        command = [str(self._python.absolute()), str(self._driver), str(folder / "task.json")]
+        environment = {**os.environ, "PYTHONPATH": str(self._path.resolve()), "MPLBACKEND": "Agg"}
+        environment["HOME"] = str(scratch(f"peers/kernels-{self._driver.stem}"))  # older Dr.Jit keeps its kernels there
+        done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            (folder / "failed.txt").write_text(done.stdout + done.stderr)
+            last = (done.stderr.strip() or "no message").splitlines()[-1]
+            sys.exit(f"{self._driver.name} failed in {self._python}: {last} (more in {folder / 'failed.txt'})")
+        with np.load(folder / "found.npz") as found:
+            textures = {key: found[f"texture/{key}"] for key in judge.case.keys}
+            points = [(float(s), {key: textures[key][n] for key in textures}) for n, s in enumerate(found["seconds"])]
+            seen = {"check": float(found["check"])} if check else {}
+            return {**judge.run(points, int(found["steps"][-1])), **seen}
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A peer with the settings that its authors published.
+
+    Attributes:
+        name: in the record.
+        peer: what runs it.
+        scene: the file it reads.
+        settings: as published.
+        rate: the name of the learning rate among them.
+        tuned: whether the rate is tuned, too.
+    """
+
+    name: str
+    peer: Peer
+    scene: str
+    settings: dict[str, Any]
+    rate: str
+    tuned: bool = True
+
+    def run(
+        self, judge: Judge, seconds: float, seed: int, rate: float | None = None, check: bool = False
+    ) -> dict[str, Any]:
+        """One run, at the published rate where none is given; `check` has its rendering of the true scene compared with the references."""
+        settings = self.settings if rate is None else {**self.settings, self.rate: rate}
+        found = self.peer.run(judge, self.scene, seconds, seed, settings, check)
+        line = f"rate {settings[self.rate]:g} seed {seed}: {found['textures']:.4f} in {found['steps']} steps"
+        print(f"  {judge.case.problem.name} {self.name} {line}", flush=True)
+        return found
+
+    def best_rate(self, judge: Judge, seconds: float) -> tuple[float, list[dict[str, float]]]:
+        """The rate of least texture error on a seed of its own, from the published one and thrice that on; and all that were tried."""
+        published = self.settings[self.rate]
+        return search((published, 3 * published), lambda rate: self.run(judge, seconds, TUNING_SEED, rate)["textures"])
+
+
+def entrants(
+    weier: Path | None, weier_python: Path | None, svbrdf: Path | None, svbrdf_python: Path | None, texture: int
+) -> list[Entrant]:
+    """Of the peers that are given."""
+    found = []
+    if svbrdf is not None and svbrdf_python is not None:
+        peer, loop = Peer("svbrdf", svbrdf_python, svbrdf), {**LOOP, "texture_res": texture}
+        found.append(Entrant("svbrdf_uncertainty", peer, "scene.xml", loop, "learning_rate"))
+    if weier is not None and weier_python is not None:
+        peer = Peer("weier", weier_python, weier / "python")
+        found.append(Entrant("Weier et al.", peer, "mipmaps.xml", PYRAMID, "base_learning_rate"))
+        found.append(Entrant("filter, by Weier et al.", peer, "mipmaps.xml", FILTER, "base_learning_rate", tuned=False))
+    if not found:
+        sys.exit(NOTHING_GIVEN)
+    return found
+
+
+def run(
+    weier: Path | None = None,
+    weier_python: Path | None = None,
+    svbrdf: Path | None = None,
+    svbrdf_python: Path | None = None,
+    assets: Path | None = None,
+    problem: tuple[str, ...] = tuple(scenes.SCENES),
+    seconds: float = 30.0,
+    seeds: int = 2,
+    resolution: int = 64,
+    texture: int = 64,
+    reference_spp: int = 4096,
+    weier_rate: float | None = None,
+    svbrdf_rate: float | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Every problem.
+
+    Args:
+        weier: checkout of Weier et al.'s repository
+        weier_python: interpreter of its environment, with Mitsuba 3.6.4
+        svbrdf: checkout of svbrdf_uncertainty
+        svbrdf_python: interpreter of its environment, with Mitsuba 3.5.0
+        assets: folder with spot/ and textures/, for the problem spot
+        seconds: budget of a run, of the processor
+        seeds: runs of each side
+        resolution: of pictures
+        texture: side of the textures
+        reference_spp: of the pictures that are given, and held out
+        weier_rate: their tuned rate, where it is known; none to look for it
+        svbrdf_rate: likewise
+    """
+    peers = entrants(weier, weier_python, svbrdf, svbrdf_python, texture)
+    known = {"Weier et al.": weier_rate, "svbrdf_uncertainty": svbrdf_rate}
+    found: dict[str, Any] = {"problems": {}}
+    for name in problem:
+        folder = scratch(f"peers/{name}-{resolution}-{texture}-{reference_spp}")
+        judge = Judge(scenes.case(name, folder, assets, svbrdf, resolution, texture, reference_spp))
+        ours(judge, seconds / 4, TUNING_SEED)  # its kernels
+        sides: dict[str, Any] = {"auto": {"runs": [ours(judge, seconds, seed) for seed in range(seeds)]}}
+        print(f"  {name} auto: {[round(one['textures'], 4) for one in sides['auto']['runs']]}", flush=True)
+        found["problems"][name] = sides
+        for peer in peers:
+            runs = [peer.run(judge, seconds, seed, check=seed == 0) for seed in range(seeds)]
+            sides[peer.name] = {"settings": peer.settings, "runs": runs}
+            yield found
+            if not peer.tuned:
+                continue
+            rate = known[peer.name]
+            if rate is None:
+                rate, sides[peer.name]["tried"] = peer.best_rate(judge, seconds)
+            if rate != peer.settings[peer.rate]:
+                runs = [peer.run(judge, seconds, seed, rate) for seed in range(seeds)]
+                sides[f"{peer.name}, tuned"] = {"settings": {**peer.settings, peer.rate: rate}, "runs": runs}
+                yield found
