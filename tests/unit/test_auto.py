@@ -150,7 +150,7 @@ def test_it_says_what_it_has_chosen_and_why() -> None:
     assert said[1] == "L1 damped where noise exceeds the residual"
     assert said[2] == "Sobolev gradients of map"
     assert said[3] == "moved as log (gain)"
-    assert said[4] == "schedule-free Adam, first rate 0.1 (map), 0.1 (gain)"
+    assert said[4] == "schedule-free Adam, first rate 0.1 (map, gain)"
     assert method("rcv").choose(problem()).reasons == ()
 
 

@@ -118,6 +118,8 @@ def test_references_are_float32_and_alpha_is_dropped():
     assert [view.reference.dtype for view in made.views] == [np.float32] * 2  # pyright: ignore
     np.testing.assert_array_equal(made.views[0].reference, REFERENCE)
     np.testing.assert_array_equal(made.views[1].reference, np.repeat(REFERENCE[..., :1], 3, axis=2))
+    (notice,) = made.notices
+    assert notice.startswith("view 1: reference of one channel")
 
 
 def test_eight_bit_values_are_linearised_and_it_says_so():
@@ -259,7 +261,7 @@ def test_refuses_views(view: View, message: str):
         ({"loss": losses.L1}, "loss: expected one of unrender.losses"),
         ({"loss": "L1"}, "loss: expected one of unrender.losses"),
         ({"max_depth": 0}, "max_depth: expected a whole number of at least 1, got 0"),
-        ({"max_depth": -1}, "max_depth: expected a whole number of at least 1, got -1"),
+        ({"max_depth": -1}, "max_depth: expected a whole number of at least 1, got -1; Mitsuba's -1, no limit"),
         ({"max_depth": 2.5}, "max_depth: expected a whole number of at least 1, got 2.5"),
         ({"truth": {"wall.valu": 0.5}}, r"truth\.wall\.valu: not one of the parameters; did you mean wall.value\?"),
         ({"truth": {"wall.value": [0.5, 0.5]}}, r"truth\.wall\.value: expected"),

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from unrender.core.errors import InputError, VariantError
 from unrender.core.suggestions import did_you_mean
-from unrender.core.text import LONGEST_LINE, one_line, printable, shorten, visible
+from unrender.core.text import LONGEST_LINE, grouped, listed, one_line, printable, shorten, visible
 from unrender.display.terminal import Console, echo
 from unrender.report import html
 
@@ -129,3 +129,10 @@ def test_suggestions_take_no_time():
     assert did_you_mean("a" * 100, (f"{n:0100d}" for n in range(400_000))) == ""
     assert did_you_mean("wall", ["wal", "x" * 10**6]) == "; did you mean wal?"
     assert time.process_time() - began < 1
+
+
+def test_long_lists_of_names_are_cut():
+    eight = [f"lamp{n}" for n in range(8)]
+    assert listed(eight) == ", ".join(eight)
+    assert listed([*eight, "lamp8"]) == "lamp0, lamp1, lamp2, lamp3 and 5 more"
+    assert grouped({"wall": "0.1", "roughness": "0.05", "floor": "0.1"}) == "0.1 (wall, floor), 0.05 (roughness)"

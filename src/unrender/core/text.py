@@ -6,12 +6,15 @@ the clipboard, and direction marks (U+202E and the like) show a name in another 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["LONGEST_LINE", "one_line", "printable", "reason_of", "shorten", "visible"]
+__all__ = ["LONGEST_LINE", "grouped", "listed", "one_line", "printable", "reason_of", "shorten", "visible"]
 
 LONGEST_LINE = 1000
 """Characters of the longest message."""
+_NAMED = 4
+"""Names of a list that are given where it has more than twice as many."""
 
 
 def visible(text: str, keep: str = "") -> str:
@@ -27,6 +30,21 @@ def shorten(text: str, longest: int) -> str:
         return text
     tail = longest // 3
     return f"{text[: longest - tail - 5]} ... {text[-tail:]}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names one after another: "a, b"; of more than eight, the first four, and how many there are besides."""
+    if len(names) <= 2 * _NAMED:
+        return ", ".join(names)
+    return f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
+
+
+def grouped(values: Mapping[str, str]) -> str:
+    """{name: words} by words: "0.1 (a, b), 0.05 (c)"."""
+    names: dict[str, list[str]] = {}
+    for name, words in values.items():
+        names.setdefault(words, []).append(name)
+    return ", ".join(f"{words} ({listed(which)})" for words, which in names.items())
 
 
 def one_line(text: str) -> str:

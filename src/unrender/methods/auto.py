@@ -14,6 +14,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from unrender import pixels
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import grouped, listed
 from unrender.estimators.base import Estimator
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
@@ -195,16 +196,14 @@ class AutoMethod(Options):
         biased = problem.loss.pixelwise and not problem.loss.linear
         tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
-        first = ", ".join(f"{rate:.3g} ({key})" for key, rate in {**rates, **problem.learning_rates}.items())
+        first = grouped({key: f"{rate:.3g}" for key, rate in {**rates, **problem.learning_rates}.items()})
         reasons = (
             f"{kind}, {spp} samples per pixel: {image.reason}",
             drawn,
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
-            f"Sobolev gradients of {', '.join(smoothed)}" if smoothed else "",
+            f"Sobolev gradients of {listed(smoothed)}" if smoothed else "",
             *parameterised(problem),
-            f"large steps of {', '.join(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}"
-            if meshes
-            else "",
+            f"large steps of {listed(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}" if meshes else "",
             f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
         )
         remembers = image.name == "rcv" and isinstance(sampler, pixels.All)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from unrender.core import registry, short_forms
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
+from unrender.core.text import grouped
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
@@ -120,9 +121,8 @@ class Method:
 
 def parameterised(problem: Problem) -> tuple[str, ...]:
     """A line on which parameterisations parameters have: "moved as log (lamp.radiance)"; none where none has one."""
-    found = problem.parameterisations.items()
-    named = ", ".join(f"{type(given).__name__.lower()} ({key})" for key, given in found)
-    return (f"moved as {named}",) if named else ()
+    named = {key: type(given).__name__.lower() for key, given in problem.parameterisations.items()}
+    return (f"moved as {grouped(named)}",) if named else ()
 
 
 def methods() -> dict[str, Method]:

@@ -11,6 +11,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
@@ -37,6 +38,8 @@ _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 """Independent pairs of gradients of which a plain mean would tell as much."""
 _MOST_GROWTH = 3.0
 """Times the first rate, and times what the parameters themselves have grown by."""
+_REFINED = 0.3
+"""The greatest rate, over the first one, at a step that reduces smoothing."""
 _NOT_FITTED = StrengthFit()
 _PROJECTED = 1e-5
 """Difference, relative to parameter and first rate, from which a parameter counts as moved by its bounds; below it, as rounded."""
@@ -130,6 +133,8 @@ class ScheduleFree:
     mean over many steps tells signal from noise, and the falling rate sees to that.
 
     Parameters that bounds have moved take their iterates along. Where smoothing changes, v̂ becomes as large as the gradients of then.
+    Where it becomes weaker, the rate begins at 0.3 η_0 or less: detail that is left is smaller than what the first steps were for, and
+    noise is no longer shared among neighbours.
     Where it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
 
     Args:
@@ -283,22 +288,24 @@ class ScheduleFree:
 
     def choices(self, state: ScheduleFreeState) -> tuple[str, ...]:
         """See `Choosing`: how strongly gradients are smoothed, and how far the rate has come."""
-        fitted = (f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count)
-        changed = (f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items() if state.step > state.begun)
+        fitted = [f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count]
+        changed = [f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items() if state.step > state.begun]
         lines = {"smoothing, as a share of the strongest": fitted, "learning rate, over the first": changed}
-        return tuple(f"{what}: {found}" for what, parts in lines.items() if (found := ", ".join(parts)))
+        return tuple(f"{what}: {listed(parts)}" for what, parts in lines.items() if parts)
 
     def _rates(
         self, state: ScheduleFreeState, gradient: Tree, parameters: Tree, strengths: Mapping[str, StrengthFit]
     ) -> tuple[dict[str, float], dict[str, float]]:
-        """The next mean correlations, and logarithms of the rates' factors: where smoothing has changed, no rate is above its first."""
+        """The next mean correlations, and logarithms of the rates' factors: at a step that changes the smoothing, no rate is
+        above its first, or 0.3 of that where it becomes weaker.
+        """
         correlation, log_rate = {}, {}
         for key, (cosine, size) in _measured(gradient, state.gradient, parameters).items():
             rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
             fit, shape = strengths.get(key, _NOT_FITTED), arrays.shape(gradient[key])
             change = self._change(min(rho, rho * fit.confirmed), shape, state.step - state.begun)
             grown = 1.0 if key in self.parameterisations else max(1.0, size / state.sizes[key])
-            most = math.log(_MOST_GROWTH * grown) if fit.gain == 1.0 else 0.0
+            most = math.log(_MOST_GROWTH * grown if fit.gain == 1.0 else _REFINED if fit.gain > 1.0 else 1.0)
             log_rate[key] = min(state.log_rate[key] + change, most)
         return correlation, log_rate
 

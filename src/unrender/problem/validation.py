@@ -106,7 +106,9 @@ class CheckedParameter:
 def check_max_depth(max_depth: Any) -> int:
     """Raise `FieldError` for what is no longest path length."""
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {shorten(repr(max_depth), 60)}")
+        hint = "; Mitsuba's -1, no limit, is a number that light hardly reaches, such as 32" if max_depth == -1 else ""
+        given = shorten(repr(max_depth), 60)
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {given}{hint}")
     if max_depth > _DEEPEST:
         raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(max_depth), 60)}")
     return max_depth

@@ -45,6 +45,10 @@ def check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -
             image = images.read(view.reference)
             _check_size(image.values, height, width, view.sensor)
             notices += [f"{owner}: reference {image.notice}"] if image.notice else []
+            if image.values.shape[2] == 1:
+                notices.append(
+                    f"{owner}: reference of one channel, which red, green and blue of the image are each compared with"
+                )
             reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
     except InputError as error:
         raise wrong("reference", error) from error
