@@ -22,6 +22,7 @@ from unrender.rendering.mitsuba import emissive, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
+from unrender.rendering.mitsuba.integrators.slab_bounds import slab_bounds
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
@@ -167,9 +168,11 @@ class ScenePair:
                 "shape_back": _table(previous, current),
                 "triangles": mi.UInt32(triangles),
             }
+        positions = [[dr.detach(of.vertex_positions_buffer()) for of in states] for states in meshes]
         with dr.suspend_grad():
             ratios = [_areas(before) / _areas(now) for now, before in meshes]
-            return {**self._moved[frozenset(moving)], "area_ratios": dr.concat([mi.Float(1), *ratios])}
+            found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "slabs": slab_bounds(positions)}
+            return self._moved[frozenset(moving)] | found
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current

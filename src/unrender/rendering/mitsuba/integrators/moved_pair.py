@@ -23,6 +23,7 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
+from unrender.rendering.mitsuba.integrators.slab_bounds import meets
 
 __all__ = ["CARRIED_SHARE", "MovedPair"]
 
@@ -60,11 +61,32 @@ class _PairState:
     Attributes:
         depth: segments traced.
         current, previous: see `_State`.
+        same: lanes whose vertices are one point of a shape that stands still, or of which neither path has met anything.
     """
 
     depth: UInt32
     current: _State
     previous: _State
+    same: Bool
+
+
+@dataclass(frozen=True)
+class _Vertex:
+    """What one state's path finds at a vertex.
+
+    Attributes:
+        si, bsdf: there.
+        Le: emitted there, times what the path carries.
+        Ld: from the point `to` of an emitter, likewise, if nothing is between.
+        active: lanes from which the path may go on.
+    """
+
+    si: Any
+    bsdf: Any
+    Le: Spectrum
+    Ld: Spectrum
+    to: Any
+    active: Bool
 
 
 @dataclass(frozen=True)
@@ -98,6 +120,7 @@ class _Continuation:
         pdf: solid angle density with which the BSDF alone samples that direction.
         delta: lanes whose direction is perfectly specular.
         η: relative index of refraction of the step.
+        same: lanes whose next vertex is that of the current state's path, see `_PairState`.
     """
 
     ray: mi.Ray3f
@@ -106,6 +129,7 @@ class _Continuation:
     pdf: Float
     delta: Bool
     η: Float
+    same: Bool
 
 
 class MovedPair:
@@ -140,7 +164,8 @@ class MovedPair:
             scenes: the current and the previous one.
             tables: "shape" and "shape_back", from registry ids of the current scene's shapes to those of the previous one's, and back;
                 "triangles", of each of the current scene's shapes, where its triangles begin in "area_ratios", 0 for shapes
-                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0.
+                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "slabs", see
+                `SlabBounds`, of what moves.
             sampler: seeded; both states use its numbers.
             choices: numbers apart, for what is carried along.
             rays: camera rays of each state.
@@ -148,13 +173,15 @@ class MovedPair:
         Returns:
             radiance per lane of the current and of the previous state.
         """
+        (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(of) for of in rays)
+        every = mi.Bool(True)
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=every)
+        piₚ, same = _follow(sceneₚ, tables, (ray, rayₚ), pi, _is_clear(tables, ray, pi), every, coherent=True)
         states = []
-        for scene, ray in zip(scenes, rays, strict=True):
-            plain, every = mi.Ray3f(ray), mi.Bool(True)
-            pi = scene.ray_intersect_preliminary(plain, coherent=True, active=every)
+        for of, hit in ((ray, pi), (rayₚ, piₚ)):
             last = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every)
-            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), plain, pi, last, every))
-        path = self._trace(scenes, tables, _PairState(mi.UInt32(0), *states), sampler, choices)
+            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, every))
+        path = self._trace(scenes, tables, _PairState(mi.UInt32(0), *states, same), sampler, choices)
         return path.current.L, path.previous.L
 
     @dr.syntax
@@ -175,7 +202,11 @@ class MovedPair:
         now, before = path.current, path.previous
         numbers = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
         deeper = path.depth + 1 < self.max_depth
-        out, outₚ = (self._scatter(s, of, numbers, deeper) for s, of in ((scene, now), (sceneₚ, before)))
+        si = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, now.active)
+        siₚ = _interaction_before(tables, si, before, path.same)
+        near, nearₚ = (self._gather(s, of, at, numbers[0], deeper) for s, of, at in ((scene, now, si), (sceneₚ, before, siₚ)))
+        self._connect(scenes, tables, path, near, nearₚ)
+        out, outₚ = (self._scatter(of, numbers[1:]) for of in (near, nearₚ))
 
         # ------------------ Which connections are carried ------------------
         diffuse = _is_diffuse(out.bsdf) & _is_diffuse(outₚ.bsdf)
@@ -195,7 +226,7 @@ class MovedPair:
         pi = scene.ray_intersect_preliminary(out.ray, coherent=False, active=following)
 
         # ----------------- The previous path's next vertex -----------------
-        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried)
+        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path.same, following)
         beforeβ = before.β * way.weight
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
@@ -203,14 +234,13 @@ class MovedPair:
         path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going)
         last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
         path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ)
+        path.same = way.same
         path.depth += 1
         return path
 
-    def _scatter(self, scene: Any, path: _State, numbers: tuple[Any, Any, Any], deeper: Bool) -> _Direction:
-        """What one state gathers at its vertex, and a direction off it."""
+    def _gather(self, scene: Any, path: _State, si: Any, number: Any, deeper: Bool) -> _Vertex:
+        """What one state's path has come to, and a point of an emitter that it may be connected to."""
         ctx, last = mi.BSDFContext(), path.last
-        number, number_lobe, number_bsdf = numbers
-        si: Any = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)  # pyright: ignore[reportArgumentType]
         bsdf = si.bsdf()
 
         # ---------------------- Direct emission ----------------------
@@ -221,16 +251,30 @@ class MovedPair:
         # ---------------------- Emitter sampling ----------------------
         active = path.active & deeper & si.is_valid()
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = scene.sample_emitter_direction(si, number, True, active_em)
+        ds, weight = scene.sample_emitter_direction(si, number, False, active_em)
         active_em &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
         Ld = path.β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
-        path.L += dr.select(path.active, Le, 0) + dr.select(active_em, Ld, 0)
+        return _Vertex(si, bsdf, dr.select(path.active, Le, 0), dr.select(active_em, Ld, 0), ds.p, active)
 
-        # ---------------------- BSDF sampling ----------------------
-        bs, weight = bsdf.sample(ctx, si, number_lobe, number_bsdf, active)
+    def _connect(
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, now: _Vertex, before: _Vertex
+    ) -> None:
+        """Add what emitters give, where they are to be seen. What adds nothing is not asked for, nor what is known from the other state."""
+        scene, sceneₚ = scenes
+        ray, asked, askedₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
+        hidden = scene.ray_test(ray, asked)
+        known = path.same & asked & dr.all(now.to == before.to) & ~meets(tables["slabs"], ray, ray.maxt)
+        hiddenₚ = sceneₚ.ray_test(before.si.spawn_ray_to(before.to), askedₚ & ~known)
+        path.current.L += now.Le + dr.select(hidden, 0, now.Ld)
+        path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
+
+    def _scatter(self, vertex: _Vertex, numbers: tuple[Any, Any]) -> _Direction:
+        """A direction off a vertex."""
+        si, active = vertex.si, vertex.active
+        bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return _Direction(si, bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
+        return _Direction(si, vertex.bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
 
     def _continue(
         self,
@@ -240,14 +284,23 @@ class MovedPair:
         pi: Any,
         share: Float,
         carried: Bool,
+        same: Bool,
+        followed: Bool,
     ) -> _Continuation:
-        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was."""
+        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was.
+
+        Args:
+            pi: the current path's next vertex, of the lanes `followed`.
+            share, carried: probability, and which.
+            same: see `_PairState`.
+        """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
         own = before.active & ~carried
-        piₚ: Any = sceneₚ.ray_intersect_preliminary(before.ray, coherent=False, active=own)
+        clear = same & followed & _is_clear(tables, now.ray, pi)
+        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, own, same=same & followed)
         if self.max_depth <= 2:
             bs = before.bs
-            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta)
+            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
         asked = own & (share > 0)
         mixed = carried | asked
 
@@ -259,9 +312,9 @@ class MovedPair:
         forward = now.bsdf.pdf(ctx, now.si, wo, mixed)
         value, pdf = before.bsdf.eval_pdf(ctx, before.si, woₚ, mixed)
         free = carried & (forward > 0) & (dr.max(value) > 0)
-        free &= ~sceneₚ.ray_test(link.ray(before.si), free)
+        free &= clear | ~sceneₚ.ray_test(link.ray(before.si), free & ~clear)
         seen = asked & (forward > 0)
-        seen &= ~scene.ray_test(link.ray(now.si), seen)
+        seen &= met | ~scene.ray_test(link.ray(now.si), seen & ~met)
         change = link.density_ratio() * (link.area_ratio(tables) if self.areas else 1)
         forward = dr.select(carried | seen, forward * dr.select(link.valid, change, 1), 0)
 
@@ -275,6 +328,7 @@ class MovedPair:
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
+            dr.select(carried, ~_moves(tables, pi.shape), met),
         )
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
@@ -333,6 +387,59 @@ class _Link:
         """Area of the triangle in the current over that in the previous state."""
         first = dr.gather(mi.UInt32, tables["triangles"], registry_id(self._shape))
         return dr.rcp(dr.gather(mi.Float, tables["area_ratios"], dr.select(first > 0, first + self._triangle, 0)))
+
+
+def _moves(tables: Mapping[str, Any], shape: Any) -> Bool:
+    """Whether a shape of the current scene is one that moves."""
+    return dr.gather(mi.UInt32, tables["triangles"], registry_id(shape)) > 0
+
+
+def _is_clear(tables: Mapping[str, Any], ray: Any, pi: Any) -> Bool:
+    """Whether nothing that moves is near a ray of the current scene, up to what it meets: in the previous scene it meets the same."""
+    return ~_moves(tables, pi.shape) & ~meets(tables["slabs"], ray, pi.t)
+
+
+def _follow(
+    sceneₚ: Any,
+    tables: Mapping[str, Any],
+    rays: tuple[Any, Any],
+    pi: Any,
+    clear: Bool,
+    active: Bool,
+    same: Bool | bool = True,
+    coherent: bool = False,
+) -> tuple[Any, Bool]:
+    """What the previous state's ray meets. Rays that equal one of the current state's meet what that has met, if nothing moves there.
+
+    Args:
+        rays: of either state.
+        pi: what the current state's ray has met.
+        clear: see `_is_clear`.
+        same: lanes in which the rays begin at one point, and `pi` is known.
+        coherent: whether neighbouring rays are alike.
+
+    Returns:
+        the primitive, and lanes in which both rays meet the same point of a shape that stands still, or nothing.
+    """
+    ray, rayₚ = rays
+    alike = same & dr.all((ray.o == rayₚ.o) & (ray.d == rayₚ.d))
+    known, shape = alike & clear, remap(tables["shape"], pi.shape)
+    piₚ = sceneₚ.ray_intersect_preliminary(rayₚ, coherent=coherent, active=active & ~known)
+    found = mi.PreliminaryIntersection3f(pi)
+    found.shape = shape
+    piₚ = dr.select(known, found, piₚ)
+    one = ~pi.is_valid() & ~piₚ.is_valid()
+    one |= pi.is_valid() & piₚ.is_valid() & (shape == piₚ.shape) & (pi.prim_index == piₚ.prim_index)
+    return piₚ, alike & one & ~_moves(tables, pi.shape)
+
+
+def _interaction_before(tables: Mapping[str, Any], si: Any, path: _State, same: Bool) -> Any:
+    """At the vertex of the previous state's path; where both vertices are the same, `si`, seen from where that path comes from."""
+    own: Any = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active & ~same)  # pyright: ignore[reportArgumentType]
+    found = mi.SurfaceInteraction3f(si)
+    found.shape = remap(tables["shape"], si.shape)
+    found.wi = dr.select(si.is_valid(), si.to_local(-path.ray.d), -path.ray.d)
+    return dr.select(same, found, own)
 
 
 def _is_diffuse(bsdf: mi.BSDFPtr) -> Bool:
