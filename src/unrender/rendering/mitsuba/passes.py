@@ -214,10 +214,12 @@ class MovedPairPass(Pass):
     Attributes:
         moving: ids of the meshes that move.
         tracer: what traces both.
+        still_sensors: whether both states have the same sensors.
     """
 
     moving: frozenset[str]
     tracer: MovedPair
+    still_sensors: bool
 
     def scene(self, pair: ScenePair) -> Any:
         """Both."""
@@ -238,15 +240,15 @@ class MovedPairPass(Pass):
             seed, positions = seeds
             with dr.suspend_grad():
                 rays, weights = [], []
-                for scene in scenes:  # equal numbers
+                for scene in scenes[: 1 if self.still_sensors else 2]:  # equal numbers
                     whole = positions is None
                     numbers: Any = sampler.clone() if whole else film.sampler_at(positions, size.spp, size.pixels)
                     ray, weight = _camera_rays(scene, numbers, size, seed, pixels, sensors)
                     rays.append(ray)
                     weights.append(weight)
                 choices = independent(numbers, size.pixels * size.spp)
-                found = self.tracer.sample(scenes, tables, numbers, choices, (rays[0], rays[1]))
-                return tuple(L * weight for L, weight in zip(found, weights, strict=True))
+                found = self.tracer.sample(scenes, tables, numbers, choices, (rays[0], rays[-1]))
+                return found[0] * weights[0], found[1] * weights[-1]
 
         return launch
 

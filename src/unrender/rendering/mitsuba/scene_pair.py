@@ -22,7 +22,7 @@ from unrender.rendering.mitsuba import emissive, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
-from unrender.rendering.mitsuba.integrators.slab_bounds import slab_bounds
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
@@ -73,6 +73,7 @@ class ScenePair:
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
         self._moved: dict[frozenset[str], dict[str, mi.UInt32]] = {}
+        self._moved_values: tuple[list[list[int]], Any, dict[str, mi.Float]] | None = None
         self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
@@ -169,10 +170,15 @@ class ScenePair:
                 "triangles": mi.UInt32(triangles),
             }
         positions = [[dr.detach(of.vertex_positions_buffer()) for of in states] for states in meshes]
-        with dr.suspend_grad():
-            ratios = [_areas(before) / _areas(now) for now, before in meshes]
-            found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "slabs": slab_bounds(positions)}
-            return self._moved[frozenset(moving)] | found
+        # The same memory, which nobody can have written to since it is referenced here, has the same tables.
+        indices = [[of.index for of in states] for states in positions]
+        if self._moved_values is None or self._moved_values[0] != indices:
+            with dr.suspend_grad():
+                ratios = [_areas(before) / _areas(now) for now, before in meshes]
+                found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "ellipsoids": bounding_ellipsoids(positions)}
+            dr.eval(found)
+            self._moved_values = indices, positions, found
+        return self._moved[frozenset(moving)] | self._moved_values[2]
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current

@@ -23,7 +23,7 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
-from unrender.rendering.mitsuba.integrators.slab_bounds import meets
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 
 __all__ = ["CARRIED_SHARE", "MovedPair"]
 
@@ -141,14 +141,16 @@ class MovedPair:
         rr_depth: the depth from which roulette may end a path; from there on nothing is carried along.
         share: the probability of the carried connection, in [0, 1).
         areas: whether the change of a triangle's area is part of the density. Without, the previous image is biased: for tests.
+        shared: whether rays that are the same in both states, and near nothing that moves, are traced for the current one alone. Not
+            where anything but meshes and sensors moves, which the bounds do not know.
 
     Carried are connections between vertices with diffuse lobes only: where a lobe is narrow, a direction that is a little off is another.
     The last segment is not: it can meet emitters only.
     """
 
-    def __init__(self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True):
+    def __init__(self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True, shared: bool = True):
         # No dataclass: Dr.Jit would take it for state of the loop below.
-        self.max_depth, self.rr_depth, self.share, self.areas = max_depth, rr_depth, share, areas
+        self.max_depth, self.rr_depth, self.share, self.areas, self.shared = max_depth, rr_depth, share, areas, shared
 
     def sample(
         self,
@@ -164,8 +166,8 @@ class MovedPair:
             scenes: the current and the previous one.
             tables: "shape" and "shape_back", from registry ids of the current scene's shapes to those of the previous one's, and back;
                 "triangles", of each of the current scene's shapes, where its triangles begin in "area_ratios", 0 for shapes
-                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "slabs", see
-                `SlabBounds`, of what moves.
+                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "ellipsoids", see
+                `BoundingEllipsoids`, about what moves in either state.
             sampler: seeded; both states use its numbers.
             choices: numbers apart, for what is carried along.
             rays: camera rays of each state.
@@ -174,22 +176,29 @@ class MovedPair:
             radiance per lane of the current and of the previous state.
         """
         (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(of) for of in rays)
+        tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"])}
         every = mi.Bool(True)
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=every)
-        piₚ, same = _follow(sceneₚ, tables, (ray, rayₚ), pi, _is_clear(tables, ray, pi), every, coherent=True)
+        clear = _is_clear(tables, ray, pi)
+        piₚ, same = _follow(sceneₚ, tables, (ray, rayₚ), pi, clear, every, mi.Bool(self.shared), coherent=True)
         states = []
-        for of, hit in ((ray, pi), (rayₚ, piₚ)):
-            last = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every)
-            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, every))
-        path = self._trace(scenes, tables, _PairState(mi.UInt32(0), *states, same), sampler, choices)
-        return path.current.L, path.previous.L
+        for state, of, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
+            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), _goes_on(state, hit)
+            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
+        path = _PairState(mi.UInt32(0), *states, same)
+        if self.max_depth > 1:
+            path = self._trace(scenes, tables, path, sampler, choices)
+        # Where the longest paths end, there is nothing but what is emitted.
+        ends = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
+        now, before = (of.L + _emission(scene, of, si) for scene, of, si in ends)
+        return now, before
 
     @dr.syntax
     def _trace(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
     ) -> _PairState:
         while dr.hint(
-            path.current.active | path.previous.active, max_iterations=self.max_depth, label="moved path pair"
+            (path.current.active | path.previous.active) & (path.depth + 1 < self.max_depth), label="moved path pair"
         ):
             path = self._bounce(scenes, tables, path, sampler, choices)
         return path
@@ -201,10 +210,9 @@ class MovedPair:
         scene, sceneₚ = scenes
         now, before = path.current, path.previous
         numbers = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
-        deeper = path.depth + 1 < self.max_depth
-        si = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, now.active)
-        siₚ = _interaction_before(tables, si, before, path.same)
-        near, nearₚ = (self._gather(s, of, at, numbers[0], deeper) for s, of, at in ((scene, now, si), (sceneₚ, before, siₚ)))
+        si, siₚ = self._meet(tables, path)
+        near = self._gather(scene, now, si, numbers[0])
+        nearₚ = self._gather(sceneₚ, before, siₚ, numbers[0])
         self._connect(scenes, tables, path, near, nearₚ)
         out, outₚ = (self._scatter(of, numbers[1:]) for of in (near, nearₚ))
 
@@ -212,7 +220,7 @@ class MovedPair:
         diffuse = _is_diffuse(out.bsdf) & _is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
-        carried = choices.next_1d() < share
+        carried = choices.next_1d() < share if self.max_depth > 2 else mi.Bool(False)
 
         # -------------------- Roulette, as in `prb` --------------------
         number = sampler.next_1d()
@@ -231,31 +239,36 @@ class MovedPair:
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
         last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
-        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going)
+        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & _goes_on(scene, pi))
         last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
-        path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ)
+        path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ & _goes_on(sceneₚ, way.pi))
         path.same = way.same
         path.depth += 1
         return path
 
-    def _gather(self, scene: Any, path: _State, si: Any, number: Any, deeper: Bool) -> _Vertex:
-        """What one state's path has come to, and a point of an emitter that it may be connected to."""
-        ctx, last = mi.BSDFContext(), path.last
-        bsdf = si.bsdf()
+    def _meet(self, tables: Mapping[str, Any], path: _PairState) -> tuple[Any, Any]:
+        """The vertices that both paths have come to. Where they are one, the previous state's is the current one's, seen from where its
+        path comes from."""
+        now, before = path.current, path.previous
+        si: Any = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, now.active)  # pyright: ignore[reportArgumentType]
+        own: Any = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.All, before.active & ~path.same)  # pyright: ignore[reportArgumentType]
+        one = mi.SurfaceInteraction3f(si)
+        one.shape = remap(tables["shape"], si.shape)
+        one.wi = dr.select(si.is_valid(), si.to_local(-before.ray.d), -before.ray.d)
+        return si, dr.select(path.same, one, own)
 
-        # ---------------------- Direct emission ----------------------
-        ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
-        mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
-        Le = path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
+    def _gather(self, scene: Any, path: _State, si: Any, number: Any) -> _Vertex:
+        """What one state's path has come to, and a point of an emitter that it may be connected to."""
+        ctx, bsdf, Le = mi.BSDFContext(), si.bsdf(), _emission(scene, path, si)
 
         # ---------------------- Emitter sampling ----------------------
-        active = path.active & deeper & si.is_valid()
+        active = path.active & si.is_valid()
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, weight = scene.sample_emitter_direction(si, number, False, active_em)
         active_em &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
         Ld = path.β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
-        return _Vertex(si, bsdf, dr.select(path.active, Le, 0), dr.select(active_em, Ld, 0), ds.p, active)
+        return _Vertex(si, bsdf, Le, dr.select(active_em, Ld, 0), ds.p, active)
 
     def _connect(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, now: _Vertex, before: _Vertex
@@ -264,7 +277,7 @@ class MovedPair:
         scene, sceneₚ = scenes
         ray, asked, askedₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
         hidden = scene.ray_test(ray, asked)
-        known = path.same & asked & dr.all(now.to == before.to) & ~meets(tables["slabs"], ray, ray.maxt)
+        known = path.same & asked & dr.all(now.to == before.to) & ~tables["bounds"].meet(ray, ray.maxt)
         hiddenₚ = sceneₚ.ray_test(before.si.spawn_ray_to(before.to), askedₚ & ~known)
         path.current.L += now.Le + dr.select(hidden, 0, now.Ld)
         path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
@@ -297,7 +310,7 @@ class MovedPair:
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
         own = before.active & ~carried
         clear = same & followed & _is_clear(tables, now.ray, pi)
-        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, own, same=same & followed)
+        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, own, same & followed)
         if self.max_depth <= 2:
             bs = before.bs
             return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
@@ -328,7 +341,7 @@ class MovedPair:
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
-            dr.select(carried, ~_moves(tables, pi.shape), met),
+            dr.select(carried, self.shared & ~_moves(tables, pi.shape), met),
         )
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
@@ -396,7 +409,7 @@ def _moves(tables: Mapping[str, Any], shape: Any) -> Bool:
 
 def _is_clear(tables: Mapping[str, Any], ray: Any, pi: Any) -> Bool:
     """Whether nothing that moves is near a ray of the current scene, up to what it meets: in the previous scene it meets the same."""
-    return ~_moves(tables, pi.shape) & ~meets(tables["slabs"], ray, pi.t)
+    return ~_moves(tables, pi.shape) & ~tables["bounds"].meet(ray, pi.t)
 
 
 def _follow(
@@ -406,7 +419,7 @@ def _follow(
     pi: Any,
     clear: Bool,
     active: Bool,
-    same: Bool | bool = True,
+    same: Bool,
     coherent: bool = False,
 ) -> tuple[Any, Bool]:
     """What the previous state's ray meets. Rays that equal one of the current state's meet what that has met, if nothing moves there.
@@ -433,13 +446,22 @@ def _follow(
     return piₚ, alike & one & ~_moves(tables, pi.shape)
 
 
-def _interaction_before(tables: Mapping[str, Any], si: Any, path: _State, same: Bool) -> Any:
-    """At the vertex of the previous state's path; where both vertices are the same, `si`, seen from where that path comes from."""
-    own: Any = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active & ~same)  # pyright: ignore[reportArgumentType]
-    found = mi.SurfaceInteraction3f(si)
-    found.shape = remap(tables["shape"], si.shape)
-    found.wi = dr.select(si.is_valid(), si.to_local(-path.ray.d), -path.ray.d)
-    return dr.select(same, found, own)
+def _emission(scene: Any, path: _State, si: Any) -> Spectrum:
+    """What is emitted at a vertex, times what the path carries and the weight of coming upon it by chance."""
+
+    def emitted(path: _State, si: Any) -> Spectrum:
+        last = path.last
+        ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
+        mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
+        return path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
+
+    shines = path.active & (si.emitter(scene, path.active) != None)  # noqa: E711 (lane by lane)
+    return dr.if_stmt((path, si), shines, emitted, lambda path, si: mi.Spectrum(0), label="emission")
+
+
+def _goes_on(scene: Any, pi: Any) -> Bool:
+    """Lanes whose next vertex may still add something: without an environment, those that have one."""
+    return mi.Bool(True) if scene.environment() is not None else pi.is_valid()
 
 
 def _is_diffuse(bsdf: mi.BSDFPtr) -> Bool:
