@@ -106,6 +106,7 @@ class MitsubaSession:
         # Of pairs: what moves, and what stands still.
         self._moving = frozenset(moved.values()) - {""}
         self._still_sensors = not cameras
+        self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
@@ -162,6 +163,11 @@ class MitsubaSession:
     def _moved_kernel(self) -> MovedPair:
         return MovedPair(self._max_depth, shared=self._only_meshes)
 
+    @cached_property
+    def _unrelated_kernel(self) -> MovedPair:
+        """Of equal random numbers: nothing is carried along."""
+        return MovedPair(self._max_depth, share=0.0, shared=self._only_meshes)
+
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
@@ -210,13 +216,14 @@ class MitsubaSession:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
         self._set_parameters(current)
         self._set_parameters(previous, previous=True)
-        if space == "primary":
+        if space == "primary" and not (self._geometric and self._related):
             radiance = self._run(ImagePass(), request)
             radiance_previous = self._run(ImagePass(previous=True), request)
         else:
             task: Pass = ImagePairPass()
             if self._geometric:
-                task = MovedPairPass(self._moving, self._moved_kernel, self._still_sensors and self._only_meshes)
+                tracer = self._moved_kernel if space == "path" else self._unrelated_kernel
+                task = MovedPairPass(self._moving, tracer, self._still_sensors and self._only_meshes)
             radiance, radiance_previous = self._run(task, request)
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, request), self._develop(radiance_previous, request)

@@ -53,6 +53,10 @@ class _State:
     last: ScatteringVertex
     active: Bool
 
+    def scatters(self) -> Bool:
+        """Lanes whose path has come to a surface."""
+        return self.active & self.pi.is_valid()
+
 
 @dataclass
 class _PairState:
@@ -148,7 +152,9 @@ class MovedPair:
     The last segment is not: it can meet emitters only.
     """
 
-    def __init__(self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True, shared: bool = True):
+    def __init__(
+        self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True, shared: bool = True
+    ):
         # No dataclass: Dr.Jit would take it for state of the loop below.
         self.max_depth, self.rr_depth, self.share, self.areas, self.shared = max_depth, rr_depth, share, areas, shared
 
@@ -167,7 +173,8 @@ class MovedPair:
             tables: "shape" and "shape_back", from registry ids of the current scene's shapes to those of the previous one's, and back;
                 "triangles", of each of the current scene's shapes, where its triangles begin in "area_ratios", 0 for shapes
                 that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "ellipsoids", see
-                `BoundingEllipsoids`, about what moves in either state.
+                `BoundingEllipsoids`, about what moves in either state; "emitters", likewise about all that emits, or None
+                where that is everywhere or not known.
             sampler: seeded; both states use its numbers.
             choices: numbers apart, for what is carried along.
             rays: camera rays of each state.
@@ -176,7 +183,8 @@ class MovedPair:
             radiance per lane of the current and of the previous state.
         """
         (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(of) for of in rays)
-        tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"])}
+        lights = None if tables["emitters"] is None else BoundingEllipsoids(tables["emitters"])
+        tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"]), "lights": lights}
         every = mi.Bool(True)
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=every)
         clear = _is_clear(tables, ray, pi)
@@ -188,17 +196,27 @@ class MovedPair:
         path = _PairState(mi.UInt32(0), *states, same)
         if self.max_depth > 1:
             path = self._trace(scenes, tables, path, sampler, choices)
-        # Where the longest paths end, there is nothing but what is emitted.
-        ends = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
-        now, before = (of.L + _emission(scene, of, si) for scene, of, si in ends)
-        return now, before
+
+        # Where the longest paths end, and those that meet nothing, there is nothing but what is emitted.
+        def end(path: _PairState) -> tuple[Spectrum, Spectrum]:
+            ends = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
+            now, before = (of.L + _emission(scene, of, si) for scene, of, si in ends)
+            return now, before
+
+        def over(path: _PairState) -> tuple[Spectrum, Spectrum]:
+            return path.current.L, path.previous.L
+
+        return dr.if_stmt(
+            (path,), path.current.active | path.previous.active, end, over, label="ends of moved path pair"
+        )
 
     @dr.syntax
     def _trace(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
     ) -> _PairState:
         while dr.hint(
-            (path.current.active | path.previous.active) & (path.depth + 1 < self.max_depth), label="moved path pair"
+            (path.current.scatters() | path.previous.scatters()) & (path.depth + 1 < self.max_depth),
+            label="moved path pair",
         ):
             path = self._bounce(scenes, tables, path, sampler, choices)
         return path
@@ -220,7 +238,7 @@ class MovedPair:
         diffuse = _is_diffuse(out.bsdf) & _is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
-        carried = choices.next_1d() < share if self.max_depth > 2 else mi.Bool(False)
+        carried = choices.next_1d() < share if self._carries else mi.Bool(False)
 
         # -------------------- Roulette, as in `prb` --------------------
         number = sampler.next_1d()
@@ -231,17 +249,27 @@ class MovedPair:
         # ----------------- The current path's next vertex -----------------
         # Where it has ended, it may still tell the other where to go.
         following = going | (carried & (out.bs.pdf > 0))
-        pi = scene.ray_intersect_preliminary(out.ray, coherent=False, active=following)
+        pi = scene.ray_intersect_preliminary(
+            out.ray, coherent=False, active=following & self._may_add(tables, path, out.ray)
+        )
 
         # ----------------- The previous path's next vertex -----------------
-        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path.same, following)
+        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path, following)
         beforeβ = before.β * way.weight
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
         last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
         path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & _goes_on(scene, pi))
         last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
-        path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ & _goes_on(sceneₚ, way.pi))
+        path.previous = _State(
+            before.L,
+            beforeβ,
+            before.η * way.η,
+            way.ray,
+            way.pi,
+            last,
+            outₚ.active & survivesₚ & _goes_on(sceneₚ, way.pi),
+        )
         path.same = way.same
         path.depth += 1
         return path
@@ -297,7 +325,7 @@ class MovedPair:
         pi: Any,
         share: Float,
         carried: Bool,
-        same: Bool,
+        path: _PairState,
         followed: Bool,
     ) -> _Continuation:
         """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was.
@@ -305,13 +333,14 @@ class MovedPair:
         Args:
             pi: the current path's next vertex, of the lanes `followed`.
             share, carried: probability, and which.
-            same: see `_PairState`.
+            path: so far.
         """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
-        own = before.active & ~carried
+        same, own = path.same, before.active & ~carried
+        looked = own & self._may_add(tables, path, before.ray)
         clear = same & followed & _is_clear(tables, now.ray, pi)
-        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, own, same & followed)
-        if self.max_depth <= 2:
+        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, looked, same & followed)
+        if not self._carries:
             bs = before.bs
             return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
         asked = own & (share > 0)
@@ -343,6 +372,17 @@ class MovedPair:
             dr.select(carried, 1, before.bs.eta),
             dr.select(carried, self.shared & ~_moves(tables, pi.shape), met),
         )
+
+    @property
+    def _carries(self) -> bool:
+        """Whether anything is carried along."""
+        return self.max_depth > 2 and self.share > 0
+
+    def _may_add(self, tables: Mapping[str, Any], path: _PairState, ray: Any) -> Bool:
+        """Lanes whose next segment may add something: the last one must meet an emitter."""
+        if tables["lights"] is None:
+            return mi.Bool(True)
+        return (path.depth + 2 < self.max_depth) | tables["lights"].meet(ray, mi.Float(dr.inf))
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
         """Which lanes go on, and their throughput."""
