@@ -21,8 +21,8 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
-from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
+from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range

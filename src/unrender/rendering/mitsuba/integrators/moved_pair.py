@@ -21,9 +21,9 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
-from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 
 __all__ = ["CARRIED_SHARE", "MovedPair"]
 
@@ -278,8 +278,10 @@ class MovedPair:
         """The vertices that both paths have come to. Where they are one, the previous state's is the current one's, seen from where its
         path comes from."""
         now, before = path.current, path.previous
-        si: Any = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, now.active)  # pyright: ignore[reportArgumentType]
-        own: Any = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.All, before.active & ~path.same)  # pyright: ignore[reportArgumentType]
+        alone = before.active & ~path.same
+        here = now.active | (before.active & path.same)
+        si: Any = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, here)  # pyright: ignore[reportArgumentType]
+        own: Any = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.All, alone)  # pyright: ignore[reportArgumentType]
         one = mi.SurfaceInteraction3f(si)
         one.shape = remap(tables["shape"], si.shape)
         one.wi = dr.select(si.is_valid(), si.to_local(-before.ray.d), -before.ray.d)
