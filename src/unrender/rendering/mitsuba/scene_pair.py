@@ -188,7 +188,7 @@ class ScenePair:
         if self.current.environment() is not None or any(shape.id() in moving for shape in shapes):
             return None
         boxes = [shape.bbox() for shape in shapes]
-        corners = [[mi.Float(np.ravel([box.corner(k) for k in range(8)]))] for box in boxes]
+        corners = [[mi.Float(np.ravel([np.array(box.corner(k)) for k in range(8)]))] for box in boxes]
         return bounding_ellipsoids(corners) if corners else None
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:

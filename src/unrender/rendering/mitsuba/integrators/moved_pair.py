@@ -193,22 +193,21 @@ class MovedPair:
         for state, of, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
             last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), _goes_on(state, hit)
             states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
-        path = _PairState(mi.UInt32(0), *states, same)
+        path = _PairState(mi.UInt32(0), states[0], states[1], same)
         if self.max_depth > 1:
             path = self._trace(scenes, tables, path, sampler, choices)
 
         # Where the longest paths end, and those that meet nothing, there is nothing but what is emitted.
         def end(path: _PairState) -> tuple[Spectrum, Spectrum]:
-            ends = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
-            now, before = (of.L + _emission(scene, of, si) for scene, of, si in ends)
+            both = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
+            now, before = (of.L + _emission(scene, of, si) for scene, of, si in both)
             return now, before
 
         def over(path: _PairState) -> tuple[Spectrum, Spectrum]:
             return path.current.L, path.previous.L
 
-        return dr.if_stmt(
-            (path,), path.current.active | path.previous.active, end, over, label="ends of moved path pair"
-        )
+        ends: Any = path.current.active | path.previous.active
+        return dr.if_stmt((path,), ends, end, over, label="ends of moved path pair")
 
     @dr.syntax
     def _trace(
@@ -491,14 +490,15 @@ def _follow(
 def _emission(scene: Any, path: _State, si: Any) -> Spectrum:
     """What is emitted at a vertex, times what the path carries and the weight of coming upon it by chance."""
 
-    def emitted(path: _State, si: Any) -> Spectrum:
+    def emitted(at: tuple[_State, Any]) -> Spectrum:
+        path, si = at
         last = path.last
         ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
         mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
         return path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
 
-    shines = path.active & (si.emitter(scene, path.active) != None)  # noqa: E711 (lane by lane)
-    return dr.if_stmt((path, si), shines, emitted, lambda path, si: mi.Spectrum(0), label="emission")
+    shines: Any = path.active & (si.emitter(scene, path.active) != None)  # noqa: E711 (lane by lane)
+    return dr.if_stmt(((path, si),), shines, emitted, lambda at: mi.Spectrum(0), label="emission")
 
 
 def _goes_on(scene: Any, pi: Any) -> Bool:
