@@ -14,12 +14,14 @@ import pytest
 from zscores import agree
 
 from unrender.gallery import meshes
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids, bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest, Space
 
 VERTICES, SCALE, DEPTH = "ball.vertex_positions", "ball.scale", 4
 RUNS, SPP = 32, 32
+CLAY = {"type": "twosided", "b": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.6, 0.5]}}}
 
 pytestmark = pytest.mark.slow
 
@@ -29,8 +31,7 @@ def room(fineness: int = 1, **more: Any) -> dict[str, Any]:
     points, faces = meshes.icosphere(fineness)
     found = {key: value for key, value in mi.cornell_box().items() if not key.endswith("-box") and key != "integrator"}
     found["sensor"]["film"] = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    bsdf = {"type": "twosided", "b": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.6, 0.5]}}}
-    return {**found, "ball": meshes.triangles("ball", np.array([0.0, -0.3, 0.0]) + 0.5 * points, faces, bsdf), **more}
+    return {**found, "ball": meshes.triangles("ball", np.array([0.0, -0.3, 0.0]) + 0.5 * points, faces, CLAY), **more}
 
 
 @cache
@@ -89,6 +90,69 @@ def test_other_materials_agree() -> None:
     _, before = pair(of, VERTICES, 0.1, "path", RUNS, SPP)
     verdict, figures = agree(before, alone(of, VERTICES, 0.1, previous=True, seed=2), size=4)
     assert verdict, figures
+
+
+def crowded(tracer: MovedPair, sky: bool = False) -> tuple[Any, Any, Any]:
+    """The room with a small ball, between a shelf that shadows it and the floor that it shadows, and a mirror: its session, and two
+    states .15 apart."""
+    points, faces = meshes.icosphere(1)
+    shelf = mi.ScalarTransform4f().translate([0.35, 0.35, 0.1]).rotate([1, 0, 0], 90).scale(0.35)
+
+    def scene() -> dict[str, Any]:
+        more: dict[str, Any] = {"sky": {"type": "constant", "radiance": 0.3}} if sky else {}
+        return room() | more | {
+            "ball": meshes.triangles("ball", np.array([0.1, -0.2, 0.1]) + 0.25 * points, faces, CLAY),
+            "shelf": {"type": "rectangle", "to_world": shelf, "bsdf": CLAY},
+            "glass": meshes.triangles("glass", np.array([-0.55, -0.6, 0.2]) + 0.3 * points, faces, {"type": "conductor"}),
+        }  # fmt: skip
+
+    of = MitsubaRenderer(scene, DEPTH, [VERTICES])
+    session, before = of.prepare([VERTICES], "path"), of.values([VERTICES])
+    session._moved_kernel = tracer
+    return session, {VERTICES: of.array(np.array(before[VERTICES]) + 0.15)}, before
+
+
+@pytest.mark.parametrize("sky", [False, True])
+def test_rays_that_both_states_share_change_nothing(sky: bool) -> None:
+    """Where something that moves shadows what stands still and is shadowed by it: sample for sample, up to rounding."""
+    found = []
+    for shared in (True, False):
+        session, now, before = crowded(MovedPair(DEPTH, shared=shared), sky)
+        rendering = session.image_pair(now, before, SampleRequest(0, RUNS, 1, RUNS), "path")
+        found.append([np.array(images, float) for images in (rendering.images, rendering.previous)])
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    differ = np.abs(found[0][1] - found[1][1]) > 1e-3 * (1 + found[1][1])
+    assert differ.mean() < 1e-3, differ.mean()
+
+
+def test_moving_shadows_agree_and_bounds_that_miss_what_moves_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, now, before = crowded(MovedPair(DEPTH))
+    request, other = SampleRequest(0, RUNS * SPP, 1, RUNS), SampleRequest(0, RUNS * SPP, 2, RUNS)
+    apart = np.array(session.image(before, other).images, float)
+    verdict, figures = agree(np.array(session.image_pair(now, before, request, "path").previous, float), apart, size=4)
+    assert verdict, figures
+    monkeypatch.setattr(BoundingEllipsoids, "meet", lambda self, ray, t: t < 0)
+    session._moved_kernel = MovedPair(DEPTH)
+    wrong = np.array(session.image_pair(now, before, request, "path").previous, float)
+    verdict, figures = agree(wrong, apart, size=4)
+    assert not verdict, f"rays that what moves is in the way of went unseen: {figures}"
+
+
+def test_segments_that_meet_what_is_bounded_meet_its_ellipsoid() -> None:
+    """Through points of triangles of flat, thin and round clouds, near and far; and not those that end before, or pass by."""
+    generator = np.random.default_rng(0)
+    cloud = generator.normal(size=(40, 3)) * [[1.0, 0.5, 0.0]] + [[3.0, 0.0, -2.0]]
+    bounds = BoundingEllipsoids(bounding_ellipsoids([[mi.Float(cloud.ravel())], [mi.Float(cloud.ravel() + 100)]]))
+    corners = cloud[generator.integers(40, size=(1000, 3))]
+    through = np.einsum("nk,nkd->nd", generator.dirichlet(np.ones(3), 1000), corners)
+    d = generator.normal(size=(1000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    far = 10.0 ** generator.uniform(-1, 3, size=(1000, 1))
+    rays = mi.Ray3f(mi.Point3f((through - far * d).T), mi.Vector3f(d.T))
+    assert np.all(bounds.meet(rays, mi.Float(far[:, 0] * 1.00001)))
+    assert not np.any(np.array(bounds.meet(rays, mi.Float(far[:, 0] - 8)))[far[:, 0] > 9])
+    aside = mi.Ray3f(mi.Point3f(3, 0, 0), mi.Vector3f(0.6, 0.8, 0))
+    assert not np.any(bounds.meet(aside, mi.Float(np.inf)))
 
 
 def test_carried_paths_differ_less_than_those_of_equal_random_numbers() -> None:

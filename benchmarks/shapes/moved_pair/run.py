@@ -3,7 +3,7 @@
 Variance: a ball of triangles in the Cornell box (and `sphere-to-bunny` at its start), moved smoothly by steps of some size (root mean
 square; the ball's radius is .45); one sample per pixel, many times. Of F the current and H the previous state: Var[F - H] / Var F, summed
 over pixels that do not see the lamp, and its geometric mean over pixels; the weight cov(F, H) / Var H, clamped to [0, 1]; processor time
-of the pair over that of one image.
+of the pair over that of one image of Mitsuba's `prb`, in one thread, with both scenes built.
 
 Descent: `sphere-to-bunny` with L1, large steps, equal numbers of steps: the plain image, and control variates in both spaces. Surface error
 over the start's, and processor time of a step over the plain one's.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ _MATERIALS = {
     "mirror": {"type": "conductor"},
 }
 _DEPTH = 4
-_TIMED = 6
+_TIMED, _WARM = 40, 4
 _BRIGHT = 4.0
 """Of pixels that see the lamp."""
 
@@ -93,22 +94,27 @@ def variances(name: str, resolution: int, samples: int, moves: tuple[float, ...]
         pair = session.image_pair(current, previous, request, space)
         dr.eval(pair.images, pair.previous)
 
-    single = processor_seconds(alone)
-    for space in SPACES:
-        found[space]["cost"] = processor_seconds(lambda space=space: both(space)) / single
+    calls = [alone, *(partial(both, space) for space in SPACES)]
+    single, *pairs = processor_seconds(calls)
+    for space, seconds in zip(SPACES, pairs, strict=True):
+        found[space]["cost"] = seconds / single
     return found
 
 
-def processor_seconds(call: Callable[[], None]) -> float:
-    """The least of several."""
-    times = []
-    for number in range(_TIMED + 2):
-        began = time.process_time()
-        call()
-        dr.sync_thread()
-        if number >= 2:
-            times.append(time.process_time() - began)
-    return min(times)
+def processor_seconds(calls: list[Callable[[], None]]) -> list[float]:
+    """The least of several of each, in turns. In one thread: what others wait counts as well."""
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    times: list[list[float]] = [[] for _ in calls]
+    for number in range(_TIMED + _WARM):
+        for of, call in zip(times, calls, strict=True):
+            began = time.process_time()
+            call()
+            dr.sync_thread()
+            if number >= _WARM:
+                of.append(time.process_time() - began)
+    dr.set_thread_count(threads)
+    return [min(of) for of in times]
 
 
 class _Clock(ur.Callback):

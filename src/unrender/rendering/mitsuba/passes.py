@@ -239,18 +239,20 @@ class MovedPairPass(Pass):
     Attributes:
         moving: ids of the meshes that move.
         tracer: what traces both.
+        still_sensors: whether both states have the same sensors.
     """
 
     moving: frozenset[str]
     tracer: MovedPair
+    still_sensors: bool
 
     def scene(self, pair: ScenePair) -> Any:
         """Both."""
         return pair.current, pair.previous
 
     def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
-        """Both."""
-        return pair.current, pair.previous
+        """Both, or one where both have the same sensors."""
+        return (pair.current,) if self.still_sensors else (pair.current, pair.previous)
 
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
         """See `MovedPair.sample`."""
@@ -267,13 +269,13 @@ class MovedPairPass(Pass):
             seed, positions = seeds
             with dr.suspend_grad():
                 made: list[tuple[Any, Any]] = []
-                for state, scene in enumerate(scenes):  # equal numbers
-                    numbers = self.numbers(sampler, size, positions)
+                for state, scene in enumerate(scenes[: 1 if self.still_sensors else 2]):  # equal numbers
+                    numbers: Any = self.numbers(sampler, size, positions)
                     samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
                     made.append(film.rays(samples) if rays is None else rays[state])
                 choices = independent(numbers, size.pixels * size.spp)
-                found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[1][0]))
-                return tuple(L * weight for L, (_, weight) in zip(found, made, strict=True))
+                found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[-1][0]))
+                return found[0] * made[0][1], found[1] * made[-1][1]
 
         return launch
 

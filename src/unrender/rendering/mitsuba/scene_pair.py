@@ -21,6 +21,7 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
@@ -71,7 +72,8 @@ class ScenePair:
         sizes = [sensor.film().crop_size() for sensor in self.current.sensors()]
         self.resolutions = [(int(size[1]), int(size[0])) for size in sizes]
         self._tables: dict[str, mi.UInt32] | None = None
-        self._moved: dict[frozenset[str], dict[str, mi.UInt32]] = {}
+        self._moved: dict[frozenset[str], dict[str, Any]] = {}
+        self._moved_values: tuple[list[list[int]], Any, dict[str, mi.Float]] | None = None
         self._media: dict[tuple[bool, int | None], dict[str, mi.UInt32]] = {}
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
@@ -166,10 +168,28 @@ class ScenePair:
                 "shape": _table(current, previous),
                 "shape_back": _table(previous, current),
                 "triangles": mi.UInt32(triangles),
+                "emitters": self._emitter_bounds(moving),
             }
-        with dr.suspend_grad():
-            ratios = [_areas(before) / _areas(now) for now, before in meshes]
-            return {**self._moved[frozenset(moving)], "area_ratios": dr.concat([mi.Float(1), *ratios])}
+        positions = [[dr.detach(of.vertex_positions_buffer()) for of in states] for states in meshes]
+        # The same memory, which nobody can have written to since it is referenced here, has the same tables.
+        indices = [[of.index for of in states] for states in positions]
+        if self._moved_values is None or self._moved_values[0] != indices:
+            with dr.suspend_grad():
+                ratios = [_areas(before) / _areas(now) for now, before in meshes]
+                found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "ellipsoids": bounding_ellipsoids(positions)}
+            dr.eval(found)
+            self._moved_values = indices, positions, found
+        return self._moved[frozenset(moving)] | self._moved_values[2]
+
+    def _emitter_bounds(self, moving: AbstractSet[str]) -> mi.Float | None:
+        """About all that emits; None where there is an environment, or an emitter that moves."""
+        shapes = [emitter.get_shape() for emitter in self.current.emitters()]
+        shapes = [shape for shape in shapes if shape is not None]
+        if self.current.environment() is not None or any(shape.id() in moving for shape in shapes):
+            return None
+        boxes = [shape.bbox() for shape in shapes]
+        corners = [[mi.Float(np.ravel([np.array(box.corner(k)) for k in range(8)]))] for box in boxes]
+        return bounding_ellipsoids(corners) if corners else None
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current

@@ -103,20 +103,24 @@ class MitsubaSession:
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
-        self._moving: frozenset[str] = frozenset()
+        moved = {key: moved_shape(pair.loaded(), key) for key in (*keys, *poses) if key not in cameras}
+        # Of pairs: what moves, and what stands still.
+        self._moving = frozenset(moved.values()) - {""}
+        self._still_sensors = not cameras
+        self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
+        self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
             # Path gradients move the shapes and sensors of the scene itself.
             slots(poses)
             everything = [key for key in (*keys, *poses) if key in derivatives]
             cameras = [key for key in cameras if key in derivatives]
-            if fixed and (moved := next((key for key in everything if key in poses or key in cameras), None)):
+            if fixed and (other := next((key for key in everything if key in poses or key in cameras), None)):
                 raise InputError(
-                    f"parameter {moved}: path gradients move it in the scene itself, which cannot go with the pose "
+                    f"parameter {other}: path gradients move it in the scene itself, which cannot go with the pose "
                     f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
                 )
-            shapes = {moved_shape(pair.loaded(), key) for key in everything if key not in cameras} - {""}
-            self._moving = frozenset(shapes)
+            shapes = {moved[key] for key in everything if key not in cameras} - {""}
             self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
             self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
@@ -160,7 +164,12 @@ class MitsubaSession:
 
     @cached_property
     def _moved_kernel(self) -> MovedPair:
-        return MovedPair(self._max_depth)
+        return MovedPair(self._max_depth, shared=self._only_meshes)
+
+    @cached_property
+    def _unrelated_kernel(self) -> MovedPair:
+        """Of equal random numbers: nothing is carried along."""
+        return MovedPair(self._max_depth, share=0.0, shared=self._only_meshes)
 
     # ------------------------------------------------------------------ rendering
 
@@ -210,11 +219,14 @@ class MitsubaSession:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
         self._set_parameters(current)
         self._set_parameters(previous, previous=True)
-        if space == "primary":
+        if space == "primary" and not (self._geometric and self._related):
             radiance = self._run(ImagePass(), request)
             radiance_previous = self._run(ImagePass(previous=True), request)
         else:
-            task = MovedPairPass(self._moving, self._moved_kernel) if self._geometric else ImagePairPass()
+            task: Pass = ImagePairPass()
+            if self._geometric:
+                tracer = self._moved_kernel if space == "path" else self._unrelated_kernel
+                task = MovedPairPass(self._moving, tracer, self._still_sensors and self._only_meshes)
             radiance, radiance_previous = self._run(task, request)
         dr.eval(radiance, radiance_previous)
         images = self._develop(radiance, request), self._develop(radiance_previous, request)

@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
+from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
 
@@ -52,6 +53,10 @@ class _State:
     last: ScatteringVertex
     active: Bool
 
+    def scatters(self) -> Bool:
+        """Lanes whose path has come to a surface."""
+        return self.active & self.pi.is_valid()
+
 
 @dataclass
 class _PairState:
@@ -60,11 +65,32 @@ class _PairState:
     Attributes:
         depth: segments traced.
         current, previous: see `_State`.
+        same: lanes whose vertices are one point of a shape that stands still, or of which neither path has met anything.
     """
 
     depth: UInt32
     current: _State
     previous: _State
+    same: Bool
+
+
+@dataclass(frozen=True)
+class _Vertex:
+    """What one state's path finds at a vertex.
+
+    Attributes:
+        si, bsdf: there.
+        Le: emitted there, times what the path carries.
+        Ld: from the point `to` of an emitter, likewise, if nothing is between.
+        active: lanes from which the path may go on.
+    """
+
+    si: Any
+    bsdf: Any
+    Le: Spectrum
+    Ld: Spectrum
+    to: Any
+    active: Bool
 
 
 @dataclass(frozen=True)
@@ -98,6 +124,7 @@ class _Continuation:
         pdf: solid angle density with which the BSDF alone samples that direction.
         delta: lanes whose direction is perfectly specular.
         η: relative index of refraction of the step.
+        same: lanes whose next vertex is that of the current state's path, see `_PairState`.
     """
 
     ray: mi.Ray3f
@@ -106,6 +133,7 @@ class _Continuation:
     pdf: Float
     delta: Bool
     η: Float
+    same: Bool
 
 
 class MovedPair:
@@ -117,14 +145,18 @@ class MovedPair:
         rr_depth: the depth from which roulette may end a path; from there on nothing is carried along.
         share: the probability of the carried connection, in [0, 1).
         areas: whether the change of a triangle's area is part of the density. Without, the previous image is biased: for tests.
+        shared: whether rays that are the same in both states, and near nothing that moves, are traced for the current one alone. Not
+            where anything but meshes and sensors moves, which the bounds do not know.
 
     Carried are connections between vertices with diffuse lobes only: where a lobe is narrow, a direction that is a little off is another.
     The last segment is not: it can meet emitters only.
     """
 
-    def __init__(self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True):
+    def __init__(
+        self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True, shared: bool = True
+    ):
         # No dataclass: Dr.Jit would take it for state of the loop below.
-        self.max_depth, self.rr_depth, self.share, self.areas = max_depth, rr_depth, share, areas
+        self.max_depth, self.rr_depth, self.share, self.areas, self.shared = max_depth, rr_depth, share, areas, shared
 
     def sample(
         self,
@@ -140,7 +172,9 @@ class MovedPair:
             scenes: the current and the previous one.
             tables: "shape" and "shape_back", from registry ids of the current scene's shapes to those of the previous one's, and back;
                 "triangles", of each of the current scene's shapes, where its triangles begin in "area_ratios", 0 for shapes
-                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0.
+                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "ellipsoids", see
+                `BoundingEllipsoids`, about what moves in either state; "emitters", likewise about all that emits, or None
+                where that is everywhere or not known.
             sampler: seeded; both states use its numbers.
             choices: numbers apart, for what is carried along.
             rays: camera rays of each state.
@@ -148,21 +182,40 @@ class MovedPair:
         Returns:
             radiance per lane of the current and of the previous state.
         """
+        (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(of) for of in rays)
+        lights = None if tables["emitters"] is None else BoundingEllipsoids(tables["emitters"])
+        tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"]), "lights": lights}
+        every = mi.Bool(True)
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=every)
+        clear = _is_clear(tables, ray, pi)
+        piₚ, same = _follow(sceneₚ, tables, (ray, rayₚ), pi, clear, every, mi.Bool(self.shared), coherent=True)
         states = []
-        for scene, ray in zip(scenes, rays, strict=True):
-            plain, every = mi.Ray3f(ray), mi.Bool(True)
-            pi = scene.ray_intersect_preliminary(plain, coherent=True, active=every)
-            last = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every)
-            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), plain, pi, last, every))
-        path = self._trace(scenes, tables, _PairState(mi.UInt32(0), *states), sampler, choices)
-        return path.current.L, path.previous.L
+        for state, of, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
+            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), _goes_on(state, hit)
+            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
+        path = _PairState(mi.UInt32(0), states[0], states[1], same)
+        if self.max_depth > 1:
+            path = self._trace(scenes, tables, path, sampler, choices)
+
+        # Where the longest paths end, and those that meet nothing, there is nothing but what is emitted.
+        def end(path: _PairState) -> tuple[Spectrum, Spectrum]:
+            both = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
+            now, before = (of.L + _emission(scene, of, si) for scene, of, si in both)
+            return now, before
+
+        def over(path: _PairState) -> tuple[Spectrum, Spectrum]:
+            return path.current.L, path.previous.L
+
+        ends: Any = path.current.active | path.previous.active
+        return dr.if_stmt((path,), ends, end, over, label="ends of moved path pair")
 
     @dr.syntax
     def _trace(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
     ) -> _PairState:
         while dr.hint(
-            path.current.active | path.previous.active, max_iterations=self.max_depth, label="moved path pair"
+            (path.current.scatters() | path.previous.scatters()) & (path.depth + 1 < self.max_depth),
+            label="moved path pair",
         ):
             path = self._bounce(scenes, tables, path, sampler, choices)
         return path
@@ -174,14 +227,17 @@ class MovedPair:
         scene, sceneₚ = scenes
         now, before = path.current, path.previous
         numbers = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
-        deeper = path.depth + 1 < self.max_depth
-        out, outₚ = (self._scatter(s, of, numbers, deeper) for s, of in ((scene, now), (sceneₚ, before)))
+        si, siₚ = self._meet(tables, path)
+        near = self._gather(scene, now, si, numbers[0])
+        nearₚ = self._gather(sceneₚ, before, siₚ, numbers[0])
+        self._connect(scenes, tables, path, near, nearₚ)
+        out, outₚ = (self._scatter(of, numbers[1:]) for of in (near, nearₚ))
 
         # ------------------ Which connections are carried ------------------
         diffuse = _is_diffuse(out.bsdf) & _is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
-        carried = choices.next_1d() < share
+        carried = choices.next_1d() < share if self._carries else mi.Bool(False)
 
         # -------------------- Roulette, as in `prb` --------------------
         number = sampler.next_1d()
@@ -192,45 +248,75 @@ class MovedPair:
         # ----------------- The current path's next vertex -----------------
         # Where it has ended, it may still tell the other where to go.
         following = going | (carried & (out.bs.pdf > 0))
-        pi = scene.ray_intersect_preliminary(out.ray, coherent=False, active=following)
+        pi = scene.ray_intersect_preliminary(
+            out.ray, coherent=False, active=following & self._may_add(tables, path, out.ray)
+        )
 
         # ----------------- The previous path's next vertex -----------------
-        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried)
+        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path, following)
         beforeβ = before.β * way.weight
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
         last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
-        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going)
+        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & _goes_on(scene, pi))
         last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
-        path.previous = _State(before.L, beforeβ, before.η * way.η, way.ray, way.pi, last, outₚ.active & survivesₚ)
+        path.previous = _State(
+            before.L,
+            beforeβ,
+            before.η * way.η,
+            way.ray,
+            way.pi,
+            last,
+            outₚ.active & survivesₚ & _goes_on(sceneₚ, way.pi),
+        )
+        path.same = way.same
         path.depth += 1
         return path
 
-    def _scatter(self, scene: Any, path: _State, numbers: tuple[Any, Any, Any], deeper: Bool) -> _Direction:
-        """What one state gathers at its vertex, and a direction off it."""
-        ctx, last = mi.BSDFContext(), path.last
-        number, number_lobe, number_bsdf = numbers
-        si: Any = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)  # pyright: ignore[reportArgumentType]
-        bsdf = si.bsdf()
+    def _meet(self, tables: Mapping[str, Any], path: _PairState) -> tuple[Any, Any]:
+        """The vertices that both paths have come to. Where they are one, the previous state's is the current one's, seen from where its
+        path comes from."""
+        now, before = path.current, path.previous
+        alone = before.active & ~path.same
+        here = now.active | (before.active & path.same)
+        si: Any = now.pi.compute_surface_interaction(now.ray, mi.RayFlags.All, here)  # pyright: ignore[reportArgumentType]
+        own: Any = before.pi.compute_surface_interaction(before.ray, mi.RayFlags.All, alone)  # pyright: ignore[reportArgumentType]
+        one = mi.SurfaceInteraction3f(si)
+        one.shape = remap(tables["shape"], si.shape)
+        one.wi = dr.select(si.is_valid(), si.to_local(-before.ray.d), -before.ray.d)
+        return si, dr.select(path.same, one, own)
 
-        # ---------------------- Direct emission ----------------------
-        ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
-        mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
-        Le = path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
+    def _gather(self, scene: Any, path: _State, si: Any, number: Any) -> _Vertex:
+        """What one state's path has come to, and a point of an emitter that it may be connected to."""
+        ctx, bsdf, Le = mi.BSDFContext(), si.bsdf(), _emission(scene, path, si)
 
         # ---------------------- Emitter sampling ----------------------
-        active = path.active & deeper & si.is_valid()
+        active = path.active & si.is_valid()
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, weight = scene.sample_emitter_direction(si, number, True, active_em)
+        ds, weight = scene.sample_emitter_direction(si, number, False, active_em)
         active_em &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
         Ld = path.β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
-        path.L += dr.select(path.active, Le, 0) + dr.select(active_em, Ld, 0)
+        return _Vertex(si, bsdf, Le, dr.select(active_em, Ld, 0), ds.p, active)
 
-        # ---------------------- BSDF sampling ----------------------
-        bs, weight = bsdf.sample(ctx, si, number_lobe, number_bsdf, active)
+    def _connect(
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, now: _Vertex, before: _Vertex
+    ) -> None:
+        """Add what emitters give, where they are to be seen. What adds nothing is not asked for, nor what is known from the other state."""
+        scene, sceneₚ = scenes
+        ray, asked, askedₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
+        hidden = scene.ray_test(ray, asked)
+        known = path.same & asked & dr.all(now.to == before.to) & ~tables["bounds"].meet(ray, ray.maxt)
+        hiddenₚ = sceneₚ.ray_test(before.si.spawn_ray_to(before.to), askedₚ & ~known)
+        path.current.L += now.Le + dr.select(hidden, 0, now.Ld)
+        path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
+
+    def _scatter(self, vertex: _Vertex, numbers: tuple[Any, Any]) -> _Direction:
+        """A direction off a vertex."""
+        si, active = vertex.si, vertex.active
+        bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return _Direction(si, bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
+        return _Direction(si, vertex.bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
 
     def _continue(
         self,
@@ -240,14 +326,24 @@ class MovedPair:
         pi: Any,
         share: Float,
         carried: Bool,
+        path: _PairState,
+        followed: Bool,
     ) -> _Continuation:
-        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was."""
+        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was.
+
+        Args:
+            pi: the current path's next vertex, of the lanes `followed`.
+            share, carried: probability, and which.
+            path: so far.
+        """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
-        own = before.active & ~carried
-        piₚ: Any = sceneₚ.ray_intersect_preliminary(before.ray, coherent=False, active=own)
-        if self.max_depth <= 2:
+        same, own = path.same, before.active & ~carried
+        looked = own & self._may_add(tables, path, before.ray)
+        clear = same & followed & _is_clear(tables, now.ray, pi)
+        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, looked, same & followed)
+        if not self._carries:
             bs = before.bs
-            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta)
+            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
         asked = own & (share > 0)
         mixed = carried | asked
 
@@ -259,9 +355,9 @@ class MovedPair:
         forward = now.bsdf.pdf(ctx, now.si, wo, mixed)
         value, pdf = before.bsdf.eval_pdf(ctx, before.si, woₚ, mixed)
         free = carried & (forward > 0) & (dr.max(value) > 0)
-        free &= ~sceneₚ.ray_test(link.ray(before.si), free)
+        free &= clear | ~sceneₚ.ray_test(link.ray(before.si), free & ~clear)
         seen = asked & (forward > 0)
-        seen &= ~scene.ray_test(link.ray(now.si), seen)
+        seen &= met | ~scene.ray_test(link.ray(now.si), seen & ~met)
         change = link.density_ratio() * (link.area_ratio(tables) if self.areas else 1)
         forward = dr.select(carried | seen, forward * dr.select(link.valid, change, 1), 0)
 
@@ -275,7 +371,19 @@ class MovedPair:
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
+            dr.select(carried, self.shared & ~_moves(tables, pi.shape), met),
         )
+
+    @property
+    def _carries(self) -> bool:
+        """Whether anything is carried along."""
+        return self.max_depth > 2 and self.share > 0
+
+    def _may_add(self, tables: Mapping[str, Any], path: _PairState, ray: Any) -> Bool:
+        """Lanes whose next segment may add something: the last one must meet an emitter."""
+        if tables["lights"] is None:
+            return mi.Bool(True)
+        return (path.depth + 2 < self.max_depth) | tables["lights"].meet(ray, mi.Float(dr.inf))
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
         """Which lanes go on, and their throughput."""
@@ -333,6 +441,69 @@ class _Link:
         """Area of the triangle in the current over that in the previous state."""
         first = dr.gather(mi.UInt32, tables["triangles"], registry_id(self._shape))
         return dr.rcp(dr.gather(mi.Float, tables["area_ratios"], dr.select(first > 0, first + self._triangle, 0)))
+
+
+def _moves(tables: Mapping[str, Any], shape: Any) -> Bool:
+    """Whether a shape of the current scene is one that moves."""
+    return dr.gather(mi.UInt32, tables["triangles"], registry_id(shape)) > 0
+
+
+def _is_clear(tables: Mapping[str, Any], ray: Any, pi: Any) -> Bool:
+    """Whether nothing that moves is near a ray of the current scene, up to what it meets: in the previous scene it meets the same."""
+    return ~_moves(tables, pi.shape) & ~tables["bounds"].meet(ray, pi.t)
+
+
+def _follow(
+    sceneₚ: Any,
+    tables: Mapping[str, Any],
+    rays: tuple[Any, Any],
+    pi: Any,
+    clear: Bool,
+    active: Bool,
+    same: Bool,
+    coherent: bool = False,
+) -> tuple[Any, Bool]:
+    """What the previous state's ray meets. Rays that equal one of the current state's meet what that has met, if nothing moves there.
+
+    Args:
+        rays: of either state.
+        pi: what the current state's ray has met.
+        clear: see `_is_clear`.
+        same: lanes in which the rays begin at one point, and `pi` is known.
+        coherent: whether neighbouring rays are alike.
+
+    Returns:
+        the primitive, and lanes in which both rays meet the same point of a shape that stands still, or nothing.
+    """
+    ray, rayₚ = rays
+    alike = same & dr.all((ray.o == rayₚ.o) & (ray.d == rayₚ.d))
+    known, shape = alike & clear, remap(tables["shape"], pi.shape)
+    piₚ = sceneₚ.ray_intersect_preliminary(rayₚ, coherent=coherent, active=active & ~known)
+    found = mi.PreliminaryIntersection3f(pi)
+    found.shape = shape
+    piₚ = dr.select(known, found, piₚ)
+    one = ~pi.is_valid() & ~piₚ.is_valid()
+    one |= pi.is_valid() & piₚ.is_valid() & (shape == piₚ.shape) & (pi.prim_index == piₚ.prim_index)
+    return piₚ, alike & one & ~_moves(tables, pi.shape)
+
+
+def _emission(scene: Any, path: _State, si: Any) -> Spectrum:
+    """What is emitted at a vertex, times what the path carries and the weight of coming upon it by chance."""
+
+    def emitted(at: tuple[_State, Any]) -> Spectrum:
+        path, si = at
+        last = path.last
+        ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
+        mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
+        return path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
+
+    shines: Any = path.active & (si.emitter(scene, path.active) != None)  # noqa: E711 (lane by lane)
+    return dr.if_stmt(((path, si),), shines, emitted, lambda at: mi.Spectrum(0), label="emission")
+
+
+def _goes_on(scene: Any, pi: Any) -> Bool:
+    """Lanes whose next vertex may still add something: without an environment, those that have one."""
+    return mi.Bool(True) if scene.environment() is not None else pi.is_valid()
 
 
 def _is_diffuse(bsdf: mi.BSDFPtr) -> Bool:
