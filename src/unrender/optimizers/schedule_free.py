@@ -133,9 +133,8 @@ class ScheduleFree:
     mean over many steps tells signal from noise, and the falling rate sees to that.
 
     Parameters that bounds have moved take their iterates along. Where smoothing changes, v̂ becomes as large as the gradients of then.
-    Where it becomes weaker, the rate begins at 0.3 η_0 or less: detail that is left is smaller than what the first steps were for, and
-    noise is no longer shared among neighbours.
-    Where it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
+    Where it becomes weaker, the rate begins at 0.3 η_0 or less: the detail left is small, and neighbours share the noise no longer. Where
+    it becomes stronger again, z begins again at x: its noise in what hardly moves any more would become that of the mean.
 
     Args:
         learning_rate: η_0, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.

@@ -14,21 +14,17 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
-from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
-from unrender.rendering.mitsuba.integrators.path import PathPair
-from unrender.rendering.mitsuba.integrators.prb import PrbKernel
-from unrender.rendering.mitsuba.integrators.volpath import VolumePair, independent
+from unrender.rendering.mitsuba.integrators.volpath import independent
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
 __all__ = [
     "AdjointPairPass",
     "AdjointPass",
-    "CameraPaths",
     "ImagePairPass",
     "ImagePass",
-    "Kernel",
     "LaunchSize",
     "MovedPairPass",
     "Pass",
@@ -36,12 +32,6 @@ __all__ = [
     "TangentPass",
     "VerticesPass",
 ]
-
-Kernel = PathPair | VolumePair | PrbKernel
-"""What traces paths."""
-
-Tables = dict[str, Any]
-"""{name: `mi.UInt32`}."""
 
 Rays = list[tuple[Any, Any]]
 """(`mi.Ray3f`, `mi.Spectrum`): camera rays and their weights, of each state that is traced."""
@@ -146,62 +136,6 @@ class Pass(ABC):
             size: what the kernel is compiled for.
             own: the pass's own arrays.
         """
-
-
-class CameraPaths:
-    """The paths that begin on a sensor's rays. What they carry is weighted by the sensor here, and nowhere else: the kernel knows nothing
-    of a ray's weight, which need not be 1 (an irradiancemeter's is π). No dataclass: Dr.Jit would take it for state of its loops.
-
-    Args:
-        kernel: what traces them.
-        scene, tables, sampler, ray, pair, geometry: of `PathKernel.sample`.
-        weight: the sensor's, per ray and channel.
-    """
-
-    def __init__(
-        self,
-        kernel: Kernel,
-        scene: mi.Scene,
-        tables: Tables,
-        sampler: Any,
-        ray: Any,
-        weight: mi.Spectrum,
-        pair: bool,
-        geometry: Any = None,
-    ):
-        self._kernel, self._scene, self._tables, self._sampler = kernel, scene, tables, sampler
-        self._ray, self._weight, self._pair, self._geometry = ray, weight, pair, geometry
-
-    def radiance(self) -> tuple[Any, Any]:
-        """The weighted radiance per lane of the current and, for a pair, of the previous state, else None."""
-        L, Lₚ = self._sample(dr.ADMode.Primal)
-        return L * self._weight, None if Lₚ is None else Lₚ * self._weight
-
-    def backward(self, *states: tuple[Any, Any]) -> None:
-        """Replay the paths backward.
-
-        Args:
-            states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, of the current
-                and, for a pair, of the previous state.
-        """
-        self._sample(dr.ADMode.Backward, tuple(ReplayState(δ * self._weight, self._replayed(L)) for δ, L in states))
-
-    def forward(self, radiance: Any) -> Any:
-        """The derivative of the weighted radiance along the tangents, per lane; `radiance` is that of the primal pass."""
-        δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),))
-        return δ * self._weight
-
-    def vertices(self) -> Any:
-        """The number of vertices of each lane's path."""
-        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray, self._geometry)
-
-    def _replayed(self, radiance: Any) -> Any:
-        """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay."""
-        return dr.select(self._weight != 0, radiance / self._weight, 0)
-
-    def _sample(self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = ()) -> tuple[Any, Any]:
-        arguments = mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair
-        return self._kernel.sample(*arguments, geometry=self._geometry)
 
 
 @dataclass(frozen=True)

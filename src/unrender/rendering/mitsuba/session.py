@@ -16,6 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
+from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
@@ -28,7 +29,6 @@ from unrender.rendering.mitsuba.passes import (
     AdjointPass,
     ImagePairPass,
     ImagePass,
-    Kernel,
     LaunchSize,
     MovedPairPass,
     Pass,

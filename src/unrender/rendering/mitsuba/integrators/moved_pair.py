@@ -13,7 +13,6 @@ Symbols as in `path.py`; a subscript (ₚ) is the previous state.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -23,117 +22,26 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
+from unrender.rendering.mitsuba.integrators.moved_vertices import (
+    Continuation,
+    Direction,
+    Link,
+    PairState,
+    PathState,
+    Vertex,
+    emission,
+    follow,
+    goes_on,
+    is_clear,
+    is_diffuse,
+    moves,
+)
+from unrender.rendering.mitsuba.integrators.pointer_tables import remap
 
 __all__ = ["CARRIED_SHARE", "MovedPair"]
 
 CARRIED_SHARE = 0.75
 """Of the connections that may be carried along, the share that is: 1 would leave out what the current state's path cannot see."""
-
-
-@dataclass
-class _State:
-    """One state's path. State of a Dr.Jit loop, hence mutable.
-
-    Attributes:
-        L: radiance gathered so far.
-        β: throughput.
-        η: relative index of refraction.
-        ray: on which the path has come to its vertex.
-        pi: the primitive there; of rays that meet nothing, not valid.
-        last: the vertex before.
-        active: lanes whose path goes on.
-    """
-
-    L: Spectrum
-    β: Spectrum
-    η: Float
-    ray: mi.Ray3f
-    pi: mi.PreliminaryIntersection3f
-    last: ScatteringVertex
-    active: Bool
-
-    def scatters(self) -> Bool:
-        """Lanes whose path has come to a surface."""
-        return self.active & self.pi.is_valid()
-
-
-@dataclass
-class _PairState:
-    """Loop state.
-
-    Attributes:
-        depth: segments traced.
-        current, previous: see `_State`.
-        same: lanes whose vertices are one point of a shape that stands still, or of which neither path has met anything.
-    """
-
-    depth: UInt32
-    current: _State
-    previous: _State
-    same: Bool
-
-
-@dataclass(frozen=True)
-class _Vertex:
-    """What one state's path finds at a vertex.
-
-    Attributes:
-        si, bsdf: there.
-        Le: emitted there, times what the path carries.
-        Ld: from the point `to` of an emitter, likewise, if nothing is between.
-        active: lanes from which the path may go on.
-    """
-
-    si: Any
-    bsdf: Any
-    Le: Spectrum
-    Ld: Spectrum
-    to: Any
-    active: Bool
-
-
-@dataclass(frozen=True)
-class _Direction:
-    """Where one state's path may go on from a vertex.
-
-    Attributes:
-        si, bsdf: there.
-        bs, weight: a sample of it.
-        ray: in that direction.
-        delta: lanes that sampled a perfectly specular lobe.
-        active: lanes that have a vertex from which the path may go on.
-    """
-
-    si: Any
-    bsdf: Any
-    bs: mi.BSDFSample3f
-    weight: Spectrum
-    ray: Any
-    delta: Bool
-    active: Bool
-
-
-@dataclass(frozen=True)
-class _Continuation:
-    """Where the previous state's path does go on.
-
-    Attributes:
-        ray, pi: to the next vertex, and the primitive there.
-        weight: of the direction to it, 0 where it is not to be reached.
-        pdf: solid angle density with which the BSDF alone samples that direction.
-        delta: lanes whose direction is perfectly specular.
-        η: relative index of refraction of the step.
-        same: lanes whose next vertex is that of the current state's path, see `_PairState`.
-    """
-
-    ray: mi.Ray3f
-    pi: mi.PreliminaryIntersection3f
-    weight: Spectrum
-    pdf: Float
-    delta: Bool
-    η: Float
-    same: Bool
 
 
 class MovedPair:
@@ -187,23 +95,23 @@ class MovedPair:
         tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"]), "lights": lights}
         every = mi.Bool(True)
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=every)
-        clear = _is_clear(tables, ray, pi)
-        piₚ, same = _follow(sceneₚ, tables, (ray, rayₚ), pi, clear, every, mi.Bool(self.shared), coherent=True)
+        clear = is_clear(tables, ray, pi)
+        piₚ, same = follow(sceneₚ, tables, (ray, rayₚ), pi, clear, every, mi.Bool(self.shared), coherent=True)
         states = []
         for state, of, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
-            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), _goes_on(state, hit)
-            states.append(_State(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
-        path = _PairState(mi.UInt32(0), states[0], states[1], same)
+            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), goes_on(state, hit)
+            states.append(PathState(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
+        path = PairState(mi.UInt32(0), states[0], states[1], same)
         if self.max_depth > 1:
             path = self._trace(scenes, tables, path, sampler, choices)
 
         # Where the longest paths end, and those that meet nothing, there is nothing but what is emitted.
-        def end(path: _PairState) -> tuple[Spectrum, Spectrum]:
+        def end(path: PairState) -> tuple[Spectrum, Spectrum]:
             both = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
-            now, before = (of.L + _emission(scene, of, si) for scene, of, si in both)
+            now, before = (of.L + emission(scene, of, si) for scene, of, si in both)
             return now, before
 
-        def over(path: _PairState) -> tuple[Spectrum, Spectrum]:
+        def over(path: PairState) -> tuple[Spectrum, Spectrum]:
             return path.current.L, path.previous.L
 
         ends: Any = path.current.active | path.previous.active
@@ -211,8 +119,8 @@ class MovedPair:
 
     @dr.syntax
     def _trace(
-        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
-    ) -> _PairState:
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, sampler: Any, choices: Any
+    ) -> PairState:
         while dr.hint(
             (path.current.scatters() | path.previous.scatters()) & (path.depth + 1 < self.max_depth),
             label="moved path pair",
@@ -221,8 +129,8 @@ class MovedPair:
         return path
 
     def _bounce(
-        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, sampler: Any, choices: Any
-    ) -> _PairState:
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, sampler: Any, choices: Any
+    ) -> PairState:
         """The vertices that both paths have come to, and where they go on from there."""
         scene, sceneₚ = scenes
         now, before = path.current, path.previous
@@ -234,7 +142,7 @@ class MovedPair:
         out, outₚ = (self._scatter(of, numbers[1:]) for of in (near, nearₚ))
 
         # ------------------ Which connections are carried ------------------
-        diffuse = _is_diffuse(out.bsdf) & _is_diffuse(outₚ.bsdf)
+        diffuse = is_diffuse(out.bsdf) & is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
         carried = choices.next_1d() < share if self._carries else mi.Bool(False)
@@ -258,22 +166,22 @@ class MovedPair:
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
 
         last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
-        path.current = _State(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & _goes_on(scene, pi))
+        path.current = PathState(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & goes_on(scene, pi))
         last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
-        path.previous = _State(
+        path.previous = PathState(
             before.L,
             beforeβ,
             before.η * way.η,
             way.ray,
             way.pi,
             last,
-            outₚ.active & survivesₚ & _goes_on(sceneₚ, way.pi),
+            outₚ.active & survivesₚ & goes_on(sceneₚ, way.pi),
         )
         path.same = way.same
         path.depth += 1
         return path
 
-    def _meet(self, tables: Mapping[str, Any], path: _PairState) -> tuple[Any, Any]:
+    def _meet(self, tables: Mapping[str, Any], path: PairState) -> tuple[Any, Any]:
         """The vertices that both paths have come to. Where they are one, the previous state's is the current one's, seen from where its
         path comes from."""
         now, before = path.current, path.previous
@@ -286,9 +194,9 @@ class MovedPair:
         one.wi = dr.select(si.is_valid(), si.to_local(-before.ray.d), -before.ray.d)
         return si, dr.select(path.same, one, own)
 
-    def _gather(self, scene: Any, path: _State, si: Any, number: Any) -> _Vertex:
+    def _gather(self, scene: Any, path: PathState, si: Any, number: Any) -> Vertex:
         """What one state's path has come to, and a point of an emitter that it may be connected to."""
-        ctx, bsdf, Le = mi.BSDFContext(), si.bsdf(), _emission(scene, path, si)
+        ctx, bsdf, Le = mi.BSDFContext(), si.bsdf(), emission(scene, path, si)
 
         # ---------------------- Emitter sampling ----------------------
         active = path.active & si.is_valid()
@@ -297,10 +205,10 @@ class MovedPair:
         active_em &= ds.pdf != 0
         value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active_em)
         Ld = path.β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
-        return _Vertex(si, bsdf, Le, dr.select(active_em, Ld, 0), ds.p, active)
+        return Vertex(si, bsdf, Le, dr.select(active_em, Ld, 0), ds.p, active)
 
     def _connect(
-        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: _PairState, now: _Vertex, before: _Vertex
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, now: Vertex, before: Vertex
     ) -> None:
         """Add what emitters give, where they are to be seen. What adds nothing is not asked for, nor what is known from the other state."""
         scene, sceneₚ = scenes
@@ -311,24 +219,24 @@ class MovedPair:
         path.current.L += now.Le + dr.select(hidden, 0, now.Ld)
         path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
 
-    def _scatter(self, vertex: _Vertex, numbers: tuple[Any, Any]) -> _Direction:
+    def _scatter(self, vertex: Vertex, numbers: tuple[Any, Any]) -> Direction:
         """A direction off a vertex."""
         si, active = vertex.si, vertex.active
         bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return _Direction(si, vertex.bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
+        return Direction(si, vertex.bsdf, bs, weight, si.spawn_ray(si.to_world(bs.wo)), delta, active)
 
     def _continue(
         self,
         scenes: tuple[Any, Any],
         tables: Mapping[str, Any],
-        out: tuple[_Direction, _Direction],
+        out: tuple[Direction, Direction],
         pi: Any,
         share: Float,
         carried: Bool,
-        path: _PairState,
+        path: PairState,
         followed: Bool,
-    ) -> _Continuation:
+    ) -> Continuation:
         """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was.
 
         Args:
@@ -339,15 +247,15 @@ class MovedPair:
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
         same, own = path.same, before.active & ~carried
         looked = own & self._may_add(tables, path, before.ray)
-        clear = same & followed & _is_clear(tables, now.ray, pi)
-        piₚ, met = _follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, looked, same & followed)
+        clear = same & followed & is_clear(tables, now.ray, pi)
+        piₚ, met = follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, looked, same & followed)
         if not self._carries:
             bs = before.bs
-            return _Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
+            return Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
         asked = own & (share > 0)
         mixed = carried | asked
 
-        link = _Link(tables, (now, before), (pi, piₚ), carried, mixed)
+        link = Link(tables, (now, before), (pi, piₚ), carried, mixed)
 
         # ------------- Whether either technique could have come there -------------
         wo = dr.select(carried, now.bs.wo, now.si.to_local(link.direction))
@@ -364,14 +272,14 @@ class MovedPair:
         # ------------------------------ Mixture ------------------------------
         weight = value / (share * forward + (1 - share) * pdf)
         weight = dr.select((carried & ~free) | ~dr.isfinite(dr.sum(weight)), 0, weight)
-        return _Continuation(
+        return Continuation(
             dr.select(carried, before.si.spawn_ray(link.direction), before.ray),
             dr.select(carried, link.image, piₚ),
             dr.select(mixed, weight, before.weight),
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
-            dr.select(carried, self.shared & ~_moves(tables, pi.shape), met),
+            dr.select(carried, self.shared & ~moves(tables, pi.shape), met),
         )
 
     @property
@@ -379,7 +287,7 @@ class MovedPair:
         """Whether anything is carried along."""
         return self.max_depth > 2 and self.share > 0
 
-    def _may_add(self, tables: Mapping[str, Any], path: _PairState, ray: Any) -> Bool:
+    def _may_add(self, tables: Mapping[str, Any], path: PairState, ray: Any) -> Bool:
         """Lanes whose next segment may add something: the last one must meet an emitter."""
         if tables["lights"] is None:
             return mi.Bool(True)
@@ -391,125 +299,3 @@ class MovedPair:
         q = dr.minimum(most * dr.square(η), 0.95)
         asked = depth >= self.rr_depth
         return (most != 0) & (~asked | (number < q)), β * dr.select(asked, dr.rcp(q), 1)
-
-
-class _Link:
-    """The vertex that a path has found in one state, its image in the other one, and the connection of that state's path to it.
-
-    Points of meshes follow from barycentric coordinates. Where other shapes were met, which stand still, the ray tells them.
-
-    Attributes:
-        valid: lanes whose ray met something; the others' is connected to infinity.
-        image: the image's primitive and the distance to it.
-        direction: to the image, from the last vertex of its state.
-    """
-
-    def __init__(
-        self,
-        tables: Mapping[str, Any],
-        out: tuple[_Direction, _Direction],
-        hits: tuple[Any, Any],
-        carried: Bool,
-        active: Bool,
-    ):
-        (now, before), (pi, piₚ) = out, hits
-        found = dr.select(carried, pi, piₚ)
-        self._carried, self._triangle, self._from = carried, found.prim_index, dr.select(carried, now.ray, before.ray)
-        back = remap(tables["shape_back"], piₚ.shape)
-        self._shape = dr.select(carried, pi.shape, back)
-        self.valid = active & found.is_valid()
-        self.image = mi.PreliminaryIntersection3f(found)
-        self.image.shape = dr.select(carried, remap(tables["shape"], pi.shape), back)
-        self._si = found.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)
-        self._there: Any = self.image.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)  # pyright: ignore[reportArgumentType]
-        to = self._there.p - dr.select(carried, before.si.p, now.si.p)
-        self._distance: Any = dr.norm(to)
-        self.direction = dr.select(self.valid, to / self._distance, self._from.d)
-        self.image.t = dr.select(self.valid, self._distance, found.t)
-
-    def ray(self, vertex: Any) -> Any:
-        """From the last vertex of the image's state, up to the image."""
-        return dr.select(self.valid, vertex.spawn_ray_to(self._there.p), vertex.spawn_ray(self.direction))
-
-    def density_ratio(self) -> Float:
-        """Solid angle of a small area at the current state's point, seen from its path, over that at the previous state's."""
-        here = dr.abs_dot(self._si.n, self._from.d) / dr.square(self._si.t)
-        there = dr.abs_dot(self._there.n, self.direction) / dr.square(self._distance)
-        return dr.select(self._carried, here / there, there / here)
-
-    def area_ratio(self, tables: Mapping[str, Any]) -> Float:
-        """Area of the triangle in the current over that in the previous state."""
-        first = dr.gather(mi.UInt32, tables["triangles"], registry_id(self._shape))
-        return dr.rcp(dr.gather(mi.Float, tables["area_ratios"], dr.select(first > 0, first + self._triangle, 0)))
-
-
-def _moves(tables: Mapping[str, Any], shape: Any) -> Bool:
-    """Whether a shape of the current scene is one that moves."""
-    return dr.gather(mi.UInt32, tables["triangles"], registry_id(shape)) > 0
-
-
-def _is_clear(tables: Mapping[str, Any], ray: Any, pi: Any) -> Bool:
-    """Whether nothing that moves is near a ray of the current scene, up to what it meets: in the previous scene it meets the same."""
-    return ~_moves(tables, pi.shape) & ~tables["bounds"].meet(ray, pi.t)
-
-
-def _follow(
-    sceneₚ: Any,
-    tables: Mapping[str, Any],
-    rays: tuple[Any, Any],
-    pi: Any,
-    clear: Bool,
-    active: Bool,
-    same: Bool,
-    coherent: bool = False,
-) -> tuple[Any, Bool]:
-    """What the previous state's ray meets. Rays that equal one of the current state's meet what that has met, if nothing moves there.
-
-    Args:
-        rays: of either state.
-        pi: what the current state's ray has met.
-        clear: see `_is_clear`.
-        same: lanes in which the rays begin at one point, and `pi` is known.
-        coherent: whether neighbouring rays are alike.
-
-    Returns:
-        the primitive, and lanes in which both rays meet the same point of a shape that stands still, or nothing.
-    """
-    ray, rayₚ = rays
-    alike = same & dr.all((ray.o == rayₚ.o) & (ray.d == rayₚ.d))
-    known, shape = alike & clear, remap(tables["shape"], pi.shape)
-    piₚ = sceneₚ.ray_intersect_preliminary(rayₚ, coherent=coherent, active=active & ~known)
-    found = mi.PreliminaryIntersection3f(pi)
-    found.shape = shape
-    piₚ = dr.select(known, found, piₚ)
-    one = ~pi.is_valid() & ~piₚ.is_valid()
-    one |= pi.is_valid() & piₚ.is_valid() & (shape == piₚ.shape) & (pi.prim_index == piₚ.prim_index)
-    return piₚ, alike & one & ~_moves(tables, pi.shape)
-
-
-def _emission(scene: Any, path: _State, si: Any) -> Spectrum:
-    """What is emitted at a vertex, times what the path carries and the weight of coming upon it by chance."""
-
-    def emitted(at: tuple[_State, Any]) -> Spectrum:
-        path, si = at
-        last = path.last
-        ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
-        mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, ~last.delta))
-        return path.β * dr.select(last.delta, 1, mis) * ds.emitter.eval(si, path.active)
-
-    shines: Any = path.active & (si.emitter(scene, path.active) != None)  # noqa: E711 (lane by lane)
-    return dr.if_stmt(((path, si),), shines, emitted, lambda at: mi.Spectrum(0), label="emission")
-
-
-def _goes_on(scene: Any, pi: Any) -> Bool:
-    """Lanes whose next vertex may still add something: without an environment, those that have one."""
-    return mi.Bool(True) if scene.environment() is not None else pi.is_valid()
-
-
-def _is_diffuse(bsdf: mi.BSDFPtr) -> Bool:
-    """Whether it has no lobes but diffuse ones."""
-    flags = bsdf.flags()
-    found = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
-    for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Delta1D, mi.BSDFFlags.Glossy):
-        found &= ~mi.has_flag(flags, kind)
-    return found

@@ -1,0 +1,77 @@
+"""Paths that begin on camera rays, weighted by the sensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.path import PathPair
+from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+
+__all__ = ["CameraPaths", "Kernel", "Tables"]
+
+Kernel = PathPair | VolumePair | PrbKernel
+"""What traces paths."""
+
+Tables = dict[str, Any]
+"""{name: `mi.UInt32`}."""
+
+
+class CameraPaths:
+    """The paths that begin on a sensor's rays. What they carry is weighted by the sensor here, and nowhere else: the kernel knows nothing
+    of a ray's weight, which need not be 1 (an irradiancemeter's is π). No dataclass: Dr.Jit would take it for state of its loops.
+
+    Args:
+        kernel: what traces them.
+        scene, tables, sampler, ray, pair, geometry: of `PathKernel.sample`.
+        weight: the sensor's, per ray and channel.
+    """
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        scene: mi.Scene,
+        tables: Tables,
+        sampler: Any,
+        ray: Any,
+        weight: mi.Spectrum,
+        pair: bool,
+        geometry: Any = None,
+    ):
+        self._kernel, self._scene, self._tables, self._sampler = kernel, scene, tables, sampler
+        self._ray, self._weight, self._pair, self._geometry = ray, weight, pair, geometry
+
+    def radiance(self) -> tuple[Any, Any]:
+        """The weighted radiance per lane of the current and, for a pair, of the previous state, else None."""
+        L, Lₚ = self._sample(dr.ADMode.Primal)
+        return L * self._weight, None if Lₚ is None else Lₚ * self._weight
+
+    def backward(self, *states: tuple[Any, Any]) -> None:
+        """Replay the paths backward.
+
+        Args:
+            states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, of the current
+                and, for a pair, of the previous state.
+        """
+        self._sample(dr.ADMode.Backward, tuple(ReplayState(δ * self._weight, self._replayed(L)) for δ, L in states))
+
+    def forward(self, radiance: Any) -> Any:
+        """The derivative of the weighted radiance along the tangents, per lane; `radiance` is that of the primal pass."""
+        δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),))
+        return δ * self._weight
+
+    def vertices(self) -> Any:
+        """The number of vertices of each lane's path."""
+        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray, self._geometry)
+
+    def _replayed(self, radiance: Any) -> Any:
+        """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay."""
+        return dr.select(self._weight != 0, radiance / self._weight, 0)
+
+    def _sample(self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = ()) -> tuple[Any, Any]:
+        arguments = mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair
+        return self._kernel.sample(*arguments, geometry=self._geometry)
