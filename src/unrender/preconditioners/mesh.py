@@ -77,9 +77,8 @@ class MeshTopology:
 
     def gathered(self, x: np.ndarray) -> np.ndarray:
         """Bᵀ x, (P, n) float64: the sums of what the vertices at each place have, x (V, n)."""
-        found = np.zeros((len(self.copies), x.shape[1]))
-        np.add.at(found, self.places, x)
-        return found
+        sums = (np.bincount(self.places, column, len(self.copies)) for column in x.T)
+        return np.stack(list(sums), axis=1)
 
     def split(self, owner: str, x: np.ndarray) -> np.ndarray:
         """An array of all vertices' values, (n V,), as (V, n). Raises `InputError` for another number of vertices."""

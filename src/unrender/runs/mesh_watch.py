@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MeshWatch"]
 
-_EVERY, _TRIANGLES = 25, 200
+_EVERY, _TRIANGLES = 25, 100
 """Steps between two looks for self-intersections: so many, or one for so many triangles, where that is more."""
 
 
