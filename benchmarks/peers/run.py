@@ -16,9 +16,7 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +29,7 @@ from benchmarks.peers import scenes
 from benchmarks.races import search, total_error
 from benchmarks.runner.records import scratch
 from benchmarks.suite.run import visible
+from benchmarks.timed_runs import Kept, blind
 
 _POINTS = 20
 _PICTURE_SPP = 256
@@ -64,28 +63,6 @@ LOOP = {"learning_rate": 0.01, "grad_spp": 32, "smoothness_weight": 1e-3}
 """svbrdf_uncertainty's: the defaults of `optimize_material`."""
 
 Points = list[tuple[float, dict[str, np.ndarray]]]
-
-
-class Kept(ur.Callback):
-    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
-
-    def __init__(self, seconds: float):
-        self.found: Points = []
-        self.steps = 0
-        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
-        self._since: float | None = None
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        now = time.process_time()
-        self._clock += 0.0 if self._since is None else now - self._since
-        self.steps += 1
-        if self._clock >= self._next or self._clock >= self._seconds:
-            self._next = self._clock + self._seconds / _POINTS
-            self.found.append((self._clock, run.full()))
-        if self._clock >= self._seconds:
-            run.stop()
-        self._since = time.process_time()
 
 
 class Judge:
@@ -151,10 +128,10 @@ class Judge:
 
 def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given; errors are no part of the time."""
-    blind = copy(judge.case.problem)
-    blind.truth = {}
-    kept = Kept(seconds)
-    ur.optimize(blind, seconds=100 * seconds, seed=seed, callbacks=[kept])  # a limit of the clock, never reached
+    kept = Kept(seconds, _POINTS)
+    ur.optimize(
+        blind(judge.case.problem), seconds=100 * seconds, seed=seed, callbacks=[kept]
+    )  # a limit of the clock, never reached
     return judge.run(kept.found, kept.steps)
 
 

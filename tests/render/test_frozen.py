@@ -117,19 +117,25 @@ def test_a_recording_of_one_thread_is_not_replayed_by_two(warned: list[str]) -> 
     assert not warned
 
 
-def test_kernels_of_a_textured_area_light_are_recorded(warned: list[str]) -> None:
-    """Such a light makes the distribution of its texels at its first sample, which is too late within a recording."""
-    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-    from unrender.rendering.renderer import SampleRequest
-
-    scene = {
+def above(floor: dict[str, Any]) -> dict[str, Any]:
+    """A camera above a floor."""
+    return {
         "type": "scene",
         "camera": {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f().look_at(origin=[0, 2, 4], target=[0, 0, 0], up=[0, 1, 0]),
             "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
         },
-        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)},
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90), **floor},
+    }
+
+
+def test_kernels_of_a_textured_area_light_are_recorded(warned: list[str]) -> None:
+    """Such a light makes the distribution of its texels at its first sample, which is too late within a recording."""
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+    from unrender.rendering.renderer import SampleRequest
+
+    scene = above({}) | {
         "screen": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([0, 0, -1]),
@@ -158,16 +164,7 @@ def test_later_steps_replay_what_two_have_recorded() -> None:
     from unrender.rendering.renderer import SampleRequest
 
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
-    scene = {
-        "type": "scene",
-        "camera": {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 2, 4], target=[0, 0, 0], up=[0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
-        },
-        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90), "bsdf": grey},
-        "lamp": {"type": "constant"},
-    }
+    scene = above({"bsdf": grey}) | {"lamp": {"type": "constant"}}
     key = "floor.bsdf.reflectance.value"
     session = MitsubaRenderer(scene).prepare([key], "path")
 

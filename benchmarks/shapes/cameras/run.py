@@ -17,7 +17,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import method, mi
-from benchmarks.shapes.timed_runs import Kept, blind
+from benchmarks.timed_runs import Kept, blind
 from unrender.gallery import parts
 
 DEGREES, PERCENT = 2.0, 2.0

@@ -20,8 +20,8 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 from benchmarks.races import TUNING_SEED, search
-from benchmarks.shapes.timed_runs import POINTS, Kept, blind, measured
 from benchmarks.stock_loop import step_seed
+from benchmarks.timed_runs import POINTS, Kept, blind, measured
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "problems": ["sphere-to-bunny"], "resolution": 8, "subdivisions": 1, "views": 2, "rates": [0.01],

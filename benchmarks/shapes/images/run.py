@@ -16,7 +16,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import method
-from benchmarks.shapes.timed_runs import Kept, blind, measured
+from benchmarks.timed_runs import Kept, blind, measured
 from unrender.gallery import mesh_files, meshes, parts
 from unrender.gallery.specification import reference
 from unrender.rendering.mitsuba.scene_loading import load

@@ -18,7 +18,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import Key, PixelSampler
 from benchmarks.races import TUNING_SEED, search
-from benchmarks.shapes.timed_runs import Kept, blind, measured
+from benchmarks.timed_runs import Kept, blind, measured
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "resolution": 8, "subdivisions": 1, "views": 2, "pixels": 16, "rates": [0.01],

@@ -27,7 +27,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import scene_description
 from benchmarks.races import TUNING_SEED
-from benchmarks.shapes.timed_runs import Kept, blind
+from benchmarks.timed_runs import Kept, blind
 
 MERGE = ("problems.*.*.methods",)
 QUICK: dict[str, Any] = {

@@ -17,19 +17,27 @@ _PICTURE_SPP = 64
 
 
 class Kept(ur.Callback):
-    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up."""
+    """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up.
 
-    def __init__(self, seconds: float):
+    Args:
+        seconds: of the processor.
+        points: how many times parameters are kept.
+    """
+
+    def __init__(self, seconds: float, points: int = POINTS):
         self.found: list[tuple[float, dict[str, np.ndarray]]] = []
-        self._seconds, self._next, self._clock = seconds, 0.0, 0.0
+        self.steps = 0
+        self._seconds, self._every, self._next, self._clock = seconds, seconds / points, 0.0, 0.0
         self._since: float | None = None
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
         now = time.process_time()
         # The first step is only known by what the others take.
         self._clock += 0.0 if self._since is None else now - self._since
+        self.steps += 1
         if self._clock >= self._next or self._clock >= self._seconds:
-            self._next = self._clock + self._seconds / POINTS
+            self._next = self._clock + self._every
             self.found.append((self._clock, run.full()))
         if self._clock >= self._seconds:
             run.stop()
