@@ -2,7 +2,8 @@
 
 Each problem gets the same time from both. `auto` has no option given. The loop of `mi.render`, `dr.backward` and `mi.ad.Adam` is tuned on
 a seed of its own for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time;
-its best setting is then run on the other seeds. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
+its best setting is then run on the other seeds. `auto` is also tuned, on the same seed, over as many settings: by when it is at what the
+loop reaches. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
 
 Errors are of the elements that the views see: those that change the images at the truth by at least a twentieth of the median
 (`unrender.sensitivity`). Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
@@ -13,6 +14,7 @@ higher_order.table2, since the loop has no gradients of them.
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +24,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.fixed_point import applies, fixed_point
-from benchmarks.internals import dr, hardly_seen
+from benchmarks.internals import dr, hardly_seen, method
 from benchmarks.races import total_error
 from benchmarks.stock_loop import stock_loop
 from benchmarks.suite import scenes
@@ -33,9 +35,20 @@ GALLERY = (
 )  # fmt: skip
 FOREIGN = tuple(f"{scene}, {loss}" for scene in scenes.SCENES for loss in scenes.LOSSES)
 TUNING_SEED = 1000
+OPTIONS = (
+    "learning_rate=0.03", "learning_rate=0.2", "learning_rate=0.4", "spp=2", "spp=16", "image=plain", "image=rcv",
+)  # fmt: skip
+"""Of `auto`, to tune it by: with none, as many settings as the loop has in the record."""
 QUICK = {
-    "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "spp": (4,), "rates": (0.02,), "gallery_reference_spp": 1, "every": 1,
-}  # fmt: skip
+    "problem": ("mirror-trio",),
+    "seconds": 0.4,
+    "seeds": 1,
+    "option": ("spp=2",),
+    "spp": (4,),
+    "rates": (0.02,),
+    "gallery_reference_spp": 1,
+    "every": 1,
+}
 MERGE = ("problems.*",)
 FIXED_POINT_SPP = 16
 Points = list[tuple[float, float]]
@@ -83,11 +96,13 @@ class Curve(ur.Callback):
 
 
 def ours(
-    problem: ur.Problem, error: Callable[[dict[str, Any]], float], seconds: float, seed: int
+    problem: ur.Problem, error: Callable[[dict[str, Any]], float], seconds: float, seed: int, option: str = ""
 ) -> tuple[Points, dict[str, Any]]:
-    """A run with no option given; its curve, and how many steps and seconds of compilation it took."""
+    """A run with no option given, or one of `auto`'s, as "spp=2"; its curve, and how many steps and seconds of compilation it took."""
     curve = Curve(error, seconds / 100)
-    result = ur.optimize(problem, seconds=seconds, seed=seed, callbacks=[curve])
+    given = method("auto").choose(problem, dict([option.split("=")])) if option else None
+    chosen = (given.estimator, given.optimizer) if given else ()
+    result = ur.optimize(problem, *chosen, seconds=seconds, seed=seed, callbacks=[curve])
     return curve.points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
 
@@ -129,6 +144,19 @@ def tune(
     return {key: best[key] for key in ("spp", "rate", "falling")}, tried
 
 
+def tune_ours(
+    problem: ur.Problem, error: Any, seconds: float, options: Any, loop_curve: np.ndarray
+) -> tuple[str, list[dict[str, Any]]]:
+    """The option of `auto` with which it is first at the loop's best error, or of least error where none gets there; and all tried."""
+    tried = []
+    for option in ("", *options):
+        curve = middle([ours(problem, error, seconds, TUNING_SEED, option)[0]], seconds)
+        when = _reached(curve, float(loop_curve.min()), seconds)
+        tried.append({"option": option, "error": float(curve[-1]), "seconds": when})
+        print(f"  {problem.name}: auto {option or 'as it is'}: {curve[-1]:.4f}, there after {when}", flush=True)
+    return min(tried, key=lambda one: (one["seconds"] or math.inf, one["error"]))["option"], tried
+
+
 def middle(runs: list[Points], seconds: float, count: int = 200) -> np.ndarray:
     """The median over runs of the error at equal steps of the time, (count,), 1 before the first point."""
     grid = seconds * np.arange(1, count + 1) / count
@@ -151,8 +179,7 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
     loop_curve, our_curve = middle(theirs, seconds), middle(found, seconds)
     best = float(loop_curve.min())
     when = (int(np.argmin(loop_curve)) + 1) / len(loop_curve) * seconds
-    reached = np.nonzero(our_curve <= best)[0]
-    first = (int(reached[0]) + 1) / len(our_curve) * seconds if len(reached) else None
+    first = _reached(our_curve, best, seconds)
     return {
         "loop": tenths(loop_curve),
         "auto": tenths(our_curve),
@@ -161,6 +188,17 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
         "seconds_of_auto": first,
         "speed": when / first if first else None,
     }
+
+
+def _reached(curve: np.ndarray, error: float, seconds: float) -> float | None:
+    """The first time at which a curve of `middle` is at an error."""
+    reached = np.nonzero(curve <= error)[0]
+    return (int(reached[0]) + 1) / len(curve) * seconds if len(reached) else None
+
+
+def _kept() -> dict[str, Any]:
+    """The problems of the record."""
+    return json.loads((Path(__file__).parent / "results.json").read_text())["problems"]
 
 
 def run(
@@ -176,6 +214,8 @@ def run(
     reference_spp: int = 4096,
     gallery_reference_spp: int | None = None,
     every: int = 2,
+    option: tuple[str, ...] = OPTIONS,
+    retune: bool = True,
 ) -> Iterator[dict[str, Any]]:
     """Every problem.
 
@@ -192,7 +232,10 @@ def run(
         reference_spp: of their references
         gallery_reference_spp: of the gallery's references, none for its own
         every: steps of the loop between errors
+        option: of `auto`, as "spp=2", to tune it by as well; such runs stand beside those without one
+        retune: the loop; else its settings are those of the record
     """
+    known = {} if retune else _kept()
     made: dict[str, Callable[[], ur.Problem]] = {}
     options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
     for name in problem:
@@ -204,7 +247,10 @@ def run(
     for name, make in made.items():
         opened = make()
         error = error_of(opened)
-        setting, tried = tune(opened, error, seconds, every, spp, rates)
+        if retune:
+            setting, tried = tune(opened, error, seconds, every, spp, rates)
+        else:
+            setting, tried = known[name]["setting"], known[name]["tried"]
         theirs, mine, details = [], [], {}
         for seed in range(seeds):
             theirs.append(loop(opened, error, seconds, seed, every, setting))
@@ -213,6 +259,15 @@ def run(
             print(f"{name} seed {seed}: loop {theirs[-1][-1][1]:.4f}, auto {mine[-1][-1][1]:.4f}", flush=True)
         entry = compare(theirs, mine, seconds)
         entry |= {"setting": setting, "tried": tried, **details}
+        if option:
+            best, ways = tune_ours(opened, error, seconds, option, middle(theirs, seconds))
+            runs = mine if not best else [ours(opened, error, seconds, seed, best)[0] for seed in range(seeds)]
+            compared = compare(theirs, runs, seconds)
+            entry["tuned"] = {
+                "option": best,
+                "tried": ways,
+                **{key: compared[key] for key in ("auto", "seconds_of_auto", "speed")},
+            }
         if applies(opened):
             hands = [fixed_point(opened, FIXED_POINT_SPP, seconds, seed, error) for seed in range(seeds)]
             entry["fixed_point"] = tenths(middle(hands, seconds))

@@ -32,7 +32,7 @@ class Ajar:
 
     resolution: int = fields.resolution(96)
     texture_resolution: int = fields.texture_resolution(32)
-    reference_spp: int = fields.reference_spp(8192)
+    reference_spp: int = fields.reference_spp(2048)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 

@@ -32,7 +32,7 @@ class Chalice:
 
     resolution: int = fields.resolution(96)
     texture_resolution: int = fields.texture_resolution(64)
-    reference_spp: int = fields.reference_spp(2048)
+    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 

@@ -29,7 +29,7 @@ class IndirectRoom:
 
     resolution: int = fields.resolution(128)
     texture_resolution: int = fields.texture_resolution(64)
-    reference_spp: int = fields.reference_spp(4096)
+    reference_spp: int = fields.reference_spp(1536)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 

@@ -26,7 +26,7 @@ from unrender.io import bounded_files, files
 
 __all__ = ["digest", "recall"]
 
-_FORMAT = 1
+_FORMAT = 2
 _NAME = "reference"
 _ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")
 """Parts of a scene's description that differ from one load to the next."""

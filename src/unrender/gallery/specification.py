@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -16,6 +18,7 @@ from unrender.losses import Loss
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
+from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
 
@@ -91,7 +94,8 @@ def build_problem(name: str, specification: Specification) -> Problem:
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
     """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    As many passes as memory requires. Equal arguments give equal images. It is kept in the cache folder (`backend.cache`).
+    Box filter. `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
+    in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:
         return reference_cache.recall(
@@ -101,13 +105,29 @@ def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
 
 def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable[[float], None]) -> np.ndarray:
     integrator = mi.load_dict({"type": "volpath" if media(scene) else "path", "max_depth": max_depth})
-    width, height = scene.sensors()[sensor].film().crop_size()
-    per_pass = max(1, _LANES // int(width * height))
-    total, done = np.zeros((int(height), int(width), 3)), 0
+    camera = scene.sensors()[sensor]
+    width, height = (int(size) for size in camera.film().crop_size())
+    numbers, take = "independent", -(-spp // -(-spp * width * height // _LANES))
+    if not media(scene):
+        # As good as 1.4 to 14 times as many independent samples on the gallery; in media, hardly better.
+        numbers, take = "multijitter", _grid(take)
+    total, done = np.zeros((height, width, 3)), 0
     while done < spp:
-        take = min(per_pass, spp - done)
+        sampler = mi.load_dict({"type": numbers, "sample_count": take})
+        sampler.set_samples_per_wavefront(take)
         seed = _REFERENCE.fold(sensor).fold(done).uint32()
-        total += take * mi.render(scene, sensor=sensor, integrator=integrator, spp=take, seed=mi.UInt32(seed)).numpy()
+        samples = film.camera_samples(camera, sampler, mi.UInt32(seed), take, None, width * height)
+        ray, weight = film.rays(samples)
+        radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
+        radiance *= weight
+        dr.eval(radiance)
+        total += take * film.develop(radiance, take, 1, total.shape).numpy()[0]
         done += take
-        advance(done / spp)
-    return (total / spp).astype(np.float32)
+        advance(min(1.0, done / spp))
+    return (total / done).astype(np.float32)
+
+
+def _grid(count: int) -> int:
+    """The least number of cells, at least `count`, of a grid of n by n or n by n + 1."""
+    side = math.isqrt(count)
+    return next(cells for cells in (side * side, side * (side + 1), (side + 1) ** 2) if cells >= count)

@@ -31,7 +31,7 @@ class Spiral:
 
     resolution: int = fields.resolution(96)
     texture_resolution: int = fields.integer(1, "texels along a side of each unknown map; 1: no maps, plain values")
-    reference_spp: int = fields.reference_spp(4096)
+    reference_spp: int = fields.reference_spp(1536)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 

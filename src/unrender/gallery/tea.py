@@ -26,7 +26,7 @@ class Tea:
     """
 
     resolution: int = fields.resolution(32)
-    reference_spp: int = fields.reference_spp(4096)
+    reference_spp: int = fields.reference_spp(2048)
     max_depth: int = fields.max_depth(12, at_least=4)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 

@@ -22,7 +22,7 @@ class ThreeBodies:
     """
 
     resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(2048)
+    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(6, at_least=2)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 

@@ -29,7 +29,7 @@ class Wall:
 
     resolution: int = fields.resolution(80)
     texture_resolution: int = fields.texture_resolution(20)
-    reference_spp: int = fields.reference_spp(8192)
+    reference_spp: int = fields.reference_spp(3072)
     max_depth: int = fields.max_depth(6, at_least=3)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
