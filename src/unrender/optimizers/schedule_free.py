@@ -233,7 +233,7 @@ class ScheduleFree:
         factor = rates.factor("ScheduleFree", self.schedule, state.step) * min(1.0, (made + 1) / _WARMUP)
         weight = (1.0 + self.averaging) / (made + 1.0 + self.averaging)
 
-        strengths = self._fitted(state, estimate) if made > 0 else state.strengths
+        strengths = self._fitted(state, estimate) if made > 0 else self._begun(state, estimate)
         maps = self._preconditioners(strengths)
         gradient = {key: maps[key].apply(g) if key in maps else g for key, g in estimate.gradient.items()}
         correlation, log_rate = state.correlation, state.log_rate
@@ -261,7 +261,7 @@ class ScheduleFree:
             if key in product:
                 cells = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
                 share = signal_share(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed, cells)
-                direction = direction * arrays.like(share, g)
+                direction = direction * share
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
             tolerance = state.learning_rates[key] * _PROJECTED
             before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
@@ -314,6 +314,13 @@ class ScheduleFree:
         error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
         change = self.growth * (max(0.0, 2.0 * (correlation - error) - 1.0) - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
+
+    def _begun(self, state: ScheduleFreeState, estimate: Estimate) -> dict[str, StrengthFit]:
+        """The strengths after the first gradient."""
+        return {
+            key: fit.begun(cast("Sobolev", self._smooth(key)), estimate.gradient[key])
+            for key, fit in state.strengths.items()
+        }
 
     def _fitted(self, state: ScheduleFreeState, estimate: Estimate) -> dict[str, StrengthFit]:
         """The strengths after another gradient."""
@@ -388,7 +395,7 @@ def _remember(state: ScheduleFreeState, gradient: Tree, strengths: Mapping[str, 
 def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tuple[float, float]]:
     """{key: (cosine of the angle between two gradients, 0 where one of them is 0; root mean square of the parameter)}."""
     sums = {
-        key: [arrays.total(x) for x in (g * previous[key], g * g, previous[key] * previous[key], parameters[key] ** 2)]
+        key: arrays.inner_products([(g, previous[key]), (g, g), (previous[key],) * 2, (parameters[key],) * 2])
         for key, g in gradient.items()
     }
     arrays.evaluate(sums)

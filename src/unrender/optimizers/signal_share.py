@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import Preconditioner
 
 __all__ = ["signal_share"]
@@ -16,8 +19,8 @@ _LEAST_SIGNAL = 0.02
 
 def signal_share(
     smooth: Preconditioner, product: Array, square: Array, unknown: float, confirmed: float, vertices: int
-) -> np.ndarray:
-    """The share of signal per element, in [0.02, 1], float32 of the shape of `product`, as in Wiener's filter.
+) -> Array:
+    """The share of signal per element, in [0.02, 1], of the shape and kind of `product`, as in Wiener's filter.
 
     max(s, 0.02), s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩, with means over the channels of a cell: two gradients share the signal,
     not the noise.
@@ -30,6 +33,8 @@ def signal_share(
         vertices: of the mesh whose values these are, (n V,); 0 of textures and grids.
     """
     shape = arrays.shape(product)
+    if not vertices and isinstance(smooth, Sobolev) and smooth.is_on_device(shape):
+        return _on_device(smooth, product, square, unknown, confirmed)
     cells = (vertices, -1) if vertices else shape
     parts = [arrays.numpy(x).astype(np.float64).reshape(cells) for x in (product, square)]
     means = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
@@ -40,4 +45,32 @@ def signal_share(
     whole, squares = means[..., :1] * confirmed, means[..., 1:]
     share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
     share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
-    return np.broadcast_to(share, parts[0].shape).astype(np.float32).reshape(shape)
+    found = np.broadcast_to(share, parts[0].shape).astype(np.float32).reshape(shape)
+    return arrays.like(found, product)
+
+
+def _on_device(smooth: Sobolev, product: Array, square: Array, unknown: float, confirmed: float) -> Array:
+    """The same of textures and grids so large that they stay where they are; lazy on Dr.Jit."""
+    *cells, channels = arrays.shape(product)
+    kind = arrays.flat(product)
+    element = arrays.arange(kind, math.prod(cells) * channels)
+    cell = element // channels
+    whole, squares = (
+        arrays.gather(arrays.flat(smooth.apply_twice(_summed(x, (*cells, 1)))), cell) for x in (product, square)
+    )
+    whole = whole * arrays.scalar(confirmed, kind)
+    known = squares > 0
+    share = arrays.where(known, whole / arrays.where(known, squares, 1.0), 1.0)
+    part = arrays.scalar(unknown, kind)
+    share = arrays.clip((1.0 - part) * arrays.clip(share, 0.0, 1.0) + part, _LEAST_SIGNAL, 1.0)
+    return arrays.shaped(share, (*cells, channels), product)
+
+
+def _summed(x: Array, shape: tuple[int, ...]) -> Array:
+    """The sum over channels, of the shape (*cells, 1)."""
+    channels, flat = arrays.shape(x)[-1], arrays.flat(x)
+    first = arrays.arange(flat, math.prod(shape)) * channels
+    found = arrays.gather(flat, first)
+    for channel in range(1, channels):
+        found = found + arrays.gather(flat, first + channel)
+    return arrays.shaped(found, shape, x)

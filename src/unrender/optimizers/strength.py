@@ -68,6 +68,7 @@ class StrengthFit:
         steps: gradients seen after the first.
         seen: of the last look, (1 + n,): S g · S f for the n candidates, and the mean of `steps` then; empty before the first.
         confirmed: the share of S g · S g' that is S g · S f, at most, in [0.02, 1]: by how much gradients agree for what is no noise.
+        last: the summary of the last gradient (`Sobolev.summary`), where there is one; else empty.
     """
 
     share: float = 1.0
@@ -80,6 +81,12 @@ class StrengthFit:
     steps: int = 0
     seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
     confirmed: float = 1.0
+    last: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    def begun(self, preconditioner: Sobolev, gradient: Array) -> StrengthFit:
+        """With a first gradient, as it is."""
+        summary = preconditioner.summary(gradient)
+        return self if summary is None else replace(self, last=summary)
 
     def after(
         self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array | None = None
@@ -92,27 +99,38 @@ class StrengthFit:
             gradient: that of this step, as it is.
             fresh: that of this step's samples alone; None where it was not estimated. Left out where it is not finite.
         """
+        summary = preconditioner.summary(gradient)
+        if summary is not None and not len(self.last):
+            return replace(self, gain=1.0, level=0.0, last=summary)
         found = replace(self, gain=1.0, level=0.0, steps=self.steps + 1)
         if found.count < STEPS:
-            return found._with_pair(preconditioner, previous, gradient)
-        if fresh is not None:
-            found = found._with_fresh(preconditioner, previous, gradient, fresh)
-        return found._judged() if found.unjudged >= _ROWS else found
+            found = found._with_pair(preconditioner, _Pair(previous, gradient, self.last, summary))
+        else:
+            if fresh is not None:
+                news = None if summary is None else preconditioner.summary(fresh)
+                found = found._with_fresh(
+                    preconditioner,
+                    _Pair(previous, gradient, self.last, summary),
+                    _Pair(previous, fresh, self.last, news),
+                )
+            found = found._judged() if found.unjudged >= _ROWS else found
+        return found if summary is None else replace(found, last=summary)
 
-    def _with_pair(self, preconditioner: Sobolev, previous: Array, gradient: Array) -> StrengthFit:
+    def _with_pair(self, preconditioner: Sobolev, pair: _Pair) -> StrengthFit:
         """The first fit, with another pair."""
         found = self
         if self.count == 0:
-            found = replace(self, sums=np.zeros((_candidates(preconditioner.strength_of(arrays.shape(gradient))), 2)))
+            strength = preconditioner.strength_of(arrays.shape(pair.gradient))
+            found = replace(self, sums=np.zeros((_candidates(strength), 2)))
         smooth = preconditioner.scaled(self.share)
-        sums = found.sums + smooth.descents(previous, gradient, found._shares / self.share).T
+        sums = found.sums + pair.descents(smooth, found._shares / self.share).T
         return replace(found, share=_share(sums), count=self.count + 1, sums=sums)
 
-    def _with_fresh(self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array) -> StrengthFit:
+    def _with_fresh(self, preconditioner: Sobolev, pair: _Pair, fresh: _Pair) -> StrengthFit:
         """With the products of another fresh gradient."""
         smooth, shares = preconditioner.scaled(self.share), np.append(1.0, self._shares / self.share)
-        products, squares = smooth.descents(previous, fresh, shares)
-        agreement, _ = smooth.descents(previous, gradient, shares)
+        products, squares = fresh.descents(smooth, shares)
+        agreement, _ = pair.descents(smooth, shares)
         row = np.stack([products, squares, agreement])
         if not np.isfinite(row).all() or (squares <= 0).any():
             return self
@@ -157,6 +175,28 @@ class StrengthFit:
     def _shares(self) -> np.ndarray:
         """Of the candidates, (n,)."""
         return _FACTOR ** -np.arange(len(self.sums), dtype=float)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two gradients.
+
+    Attributes:
+        previous: the earlier, preconditioned.
+        gradient: the later, as it is.
+        first, second: the summaries of both, as they are, where the second is not None.
+    """
+
+    previous: Array
+    gradient: Array
+    first: np.ndarray
+    second: np.ndarray | None
+
+    def descents(self, smooth: Sobolev, shares: np.ndarray) -> np.ndarray:
+        """See `Sobolev.descents`."""
+        if self.second is None:
+            return smooth.descents(self.previous, self.gradient, shares)
+        return smooth.descents_of_summaries(arrays.shape(self.gradient), self.first, self.second, shares)
 
 
 def _candidates(strength: float) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
-from unrender.preconditioners import grid
+from unrender.preconditioners import grid, grid_pyramid
 from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
 __all__ = ["Sobolev"]
@@ -36,6 +36,9 @@ class Sobolev:
     neighbours along edges; there S is near that root, to some percent (`MeshSpectrum`). The result is computed on the host in float32 and
     has the argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU. S is symmetric, its eigenvalues
     lie in [(1 + 4 d λ)^(-1/2), 1].
+
+    Of more than 131072 texels or cells with borders on all sides, S is near that root, too, to some percent and a fifth to a third where
+    detail is of a few texels, by a pyramid on the device (`GridPyramid`), of which the host sees the coarsest level alone.
 
     Args:
         strength: λ, >= 0; 0 does nothing. None for (`correlation` N)², N the geometric mean of the grid's sides, of meshes √V.
@@ -71,8 +74,17 @@ class Sobolev:
             return arrays.like(spectrum.root(self._strength_on(spectrum.topology), values).reshape(-1), x)
         shape = arrays.shape(x)
         self.check("parameter", shape)
+        if (pyramid := self._pyramid(shape)) is not None:
+            return pyramid.apply(x, self.strength_of(shape), 0.5)
         solver = grid.square_root_solver(self.strength_of(shape), shape[:-1], self._wraps(shape))
         return arrays.like(solver.solve(arrays.numpy(x)), x)
+
+    def apply_twice(self, x: Array) -> Array:
+        """S² x."""
+        pyramid = None if self._spectrum is not None else self._pyramid(arrays.shape(x))
+        if pyramid is not None:
+            return pyramid.apply(x, self.strength_of(arrays.shape(x)), 1.0)
+        return self.apply(self.apply(x))
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
         """λ for a texture or grid of this shape; of its mesh, where it has one."""
@@ -113,6 +125,30 @@ class Sobolev:
         sums = [np.real(first * np.conj(second)).sum(axis=-1), np.square(np.abs(first)).sum(axis=-1)]
         gains = [1.0 / (1.0 + share * strength * eigenvalues[..., 0]) for share in shares]
         return np.array([[np.vdot(gain, part) for gain in gains] for part in sums])
+
+    def summary(self, gradient: Array) -> np.ndarray | None:
+        """What `descents_of_summaries` needs of a gradient g, (m,) float32; None where `descents` serves, of few texels and of meshes."""
+        pyramid = None if self._spectrum is not None else self._pyramid(arrays.shape(gradient))
+        return None if pyramid is None else pyramid.summary(gradient)
+
+    def descents_of_summaries(
+        self, shape: tuple[int, ...], first: np.ndarray, second: np.ndarray, shares: np.ndarray
+    ) -> np.ndarray:
+        """As `descents`, of the summaries of g and g', estimates of that shape: by all that is coarse, and some of the texels."""
+        pyramid = self._pyramid(shape)
+        assert pyramid is not None
+        strengths = self.strength_of(shape) * np.asarray(shares)
+        return np.stack([pyramid.products(first, other, strengths) for other in (second, first)])
+
+    def is_on_device(self, shape: tuple[int, ...]) -> bool:
+        """Whether an array of this shape stays on the device, as large textures and grids do."""
+        return self._spectrum is None and self._pyramid(shape) is not None
+
+    def _pyramid(self, shape: tuple[int, ...]) -> grid_pyramid.GridPyramid | None:
+        """That stands in for transforms of a large grid; None where it does not."""
+        if math.prod(shape[:-1]) <= grid_pyramid.LARGEST_EXACT or any(self._wraps(shape)):
+            return None
+        return grid_pyramid.pyramid(shape[:-1])
 
     def _bound(self, spectrum: MeshSpectrum | None) -> Sobolev:
         object.__setattr__(self, "_spectrum", spectrum)
