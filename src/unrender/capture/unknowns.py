@@ -23,8 +23,8 @@ DEFAULT = ("colour", "roughness", "metallic", "light")
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _SMOOTHEST = 0.25
-"""Least roughness: lobes that are narrower than a texel of the light look alike, and derivatives by normals and roughness, which grow as its
-inverse square, are then noise."""
+"""Least roughness: lobes that are narrower than a texel of the light look alike, and derivatives by normals and roughness, which grow as
+its inverse square, are then noise."""
 _METALLIC = 0.1
 """Above 0, which is a bound."""
 _FLAT = (0.5, 0.5, 1.0)
