@@ -22,6 +22,9 @@ NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposur
 DEFAULT = ("colour", "roughness", "metallic", "light")
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
+_SMOOTHEST = 0.25
+"""Least roughness: lobes that are narrower than a texel of the light look alike, and derivatives by normals and roughness, which grow as
+its inverse square, are then noise."""
 _METALLIC = 0.1
 """Above 0, which is a bound."""
 _FLAT = (0.5, 0.5, 1.0)
@@ -69,7 +72,7 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
         "colour": unit,
-        "roughness": {"bounds": [0.02, 1.0]},
+        "roughness": {"bounds": [_SMOOTHEST, 1.0]},
         "metallic": unit,
         "normal": unit,
         "light": {"bounds": [0.0, math.inf]},
