@@ -22,9 +22,8 @@ NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposur
 DEFAULT = ("colour", "roughness", "metallic", "light")
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
-_SMOOTHEST = 0.25
-"""Least roughness: lobes that are narrower than a texel of the light look alike, and derivatives by normals and roughness, which grow as
-its inverse square, are then noise."""
+_SMOOTHEST, _SMOOTHEST_WITH_NORMALS = 0.02, 0.25
+"""Least roughness. Where a lobe is narrower than a texel of the light, derivatives by normals, which grow as its inverse square, are noise."""
 _METALLIC = 0.1
 """Above 0, which is a bound."""
 _FLAT = (0.5, 0.5, 1.0)
@@ -72,7 +71,7 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
         "colour": unit,
-        "roughness": {"bounds": [_SMOOTHEST, 1.0]},
+        "roughness": {"bounds": [_SMOOTHEST_WITH_NORMALS if "normal" in unknowns else _SMOOTHEST, 1.0]},
         "metallic": unit,
         "normal": unit,
         "light": {"bounds": [0.0, math.inf]},
