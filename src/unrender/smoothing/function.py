@@ -164,7 +164,7 @@ def estimate_hvp(
     step /= length
 
     def difference(z: np.ndarray) -> np.ndarray:
-        ahead, behind = (function.odd(z, 0.0, function.theta + side * step * direction) for side in (1, -1))
+        ahead, behind = function.odd_at(z, [function.theta + side * step * direction for side in (1, -1)])
         return (ahead - behind) / (2 * step)
 
     return _first_order(function, options.aggregate, difference)
