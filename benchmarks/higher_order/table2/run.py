@@ -26,7 +26,7 @@ from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
 from benchmarks.internals import dr
 from benchmarks.runner.records import command
 
-TUNING = 2
+TUNING = 3
 """Starts that a method is tuned on, numbered from 1000; TEXTURE, whose runs are all alike, takes one."""
 _NEVER = 10.0
 """A goal that is not met counts as this many times the budget when methods are tuned."""
