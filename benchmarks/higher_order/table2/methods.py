@@ -111,12 +111,17 @@ def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     return ur.LossValues(spp=task.spp), optimizer
 
 
+def _lbfgs(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    return _smoothed(task, c, _samples(n, c)), ur.optimizers.LBFGS(**_newton(n, c))
+
+
 _NEWTON_GRID = {"half_life": (6.0,), "steps": (30.0,), "radius": (0.5,)}
 _HALF_OR_ALL = {"samples": (0.5, 1.0)}
 _KEPT_GRID = {"adaptive": (0.0, 1.0), "steps": (10.0,)}
 METHODS = {
     "FR22": Method(_fr22, {"half_life": (10.0, 25.0), "rate": (0.15, 0.5), **_HALF_OR_ALL}),
     "CMA-ES": Method(_search, {"deviation": (0.5, 1.0), "population": (8, 16)}),
+    "L-BFGS": Method(_lbfgs, {"half_life": (10.0, 25.0), "steps": (30.0,), "radius": (0.5, 1.5), **_HALF_OR_ALL}),
     "OurG": Method(_gradient, {"half_life": (25.0,), "rate": (0.15, 0.3)}),
     "OurH": Method(_hessian, _NEWTON_GRID),
     "OurHVP": Method(_products(False), _NEWTON_GRID),
@@ -126,11 +131,11 @@ METHODS = {
 _RATES = {"rate": (0.03, 0.1, 0.3)}
 _WIDE = {"half_life": (1e6,), "steps": (1e6,), "radius": (0.5,)}
 _FAR = {"half_life": (6.0, 60.0), "steps": (30.0,), "radius": (0.8, 4.0)}
-_CROWD = {"half_life": (30.0,), "steps": (80.0,), "radius": (0.25,), "samples": (0.5,)}
+_CROWD = {"half_life": (30.0,), "radius": (0.25, 0.5), **_HALF_OR_ALL}
 _FAR_KEPT = {"half_life": (6.0, 60.0), "steps": (30.0,), "radius": (0.8, 4.0), "memory": (0.5, 1.0)}
 OTHER_GRIDS: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {
-    ("BOX10", "OurHVPA"): {**_CROWD, "iterations": (1.0,)},
-    ("BOX10", "OurJoint"): _CROWD,
+    ("BOX10", "OurHVPA"): {**_CROWD, "steps": (30.0, 80.0), "iterations": (1.0,)},
+    ("BOX10", "OurJoint"): {**_CROWD, "steps": (20.0, 80.0), "adaptive": (0.0,), "memory": (0.3,)},
     ("BUNNY", "Mitsuba"): _RATES,
     **{("QUAD", method): _FAR for method in ("OurH", "OurHVP")},
     ("QUAD", "OurHVPA"): {**_FAR, "iterations": (1.0, 2.0)},
