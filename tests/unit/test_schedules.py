@@ -5,7 +5,7 @@ import math
 import pytest
 
 from unrender.core.errors import InputError
-from unrender.schedules.functions import Constant, Cosine, Exponential, InverseRoot, Steps, Warmup
+from unrender.schedules.functions import Constant, Cosine, Exponential, Inverse, InverseRoot, Steps, Warmup
 
 
 @pytest.mark.parametrize(
@@ -15,6 +15,7 @@ from unrender.schedules.functions import Constant, Cosine, Exponential, InverseR
         (Constant(0.3), {0: 0.3, 1000: 0.3}),
         (Exponential(100), {0: 1.0, 50: math.sqrt(0.5), 100: 0.5, 300: 0.125}),
         (Exponential(100, floor=0.2), {0: 1.0, 100: 0.5, 300: 0.2}),
+        (Inverse(15), {0: 1.0, 15: 0.5, 45: 0.25, 1485: 0.01}),
         (InverseRoot(15), {0: 1.0, 15: math.sqrt(0.5), 45: 0.5, 225: 0.25}),
         (Cosine(100), {0: 1.0, 25: 0.5 + math.sqrt(0.125), 50: 0.5, 100: 0.0, 101: 0.0, 10**9: 0.0}),
         (Cosine(100, floor=0.2), {0: 1.0, 50: 0.6, 100: 0.2, 200: 0.2}),
@@ -34,6 +35,7 @@ def test_closed_form(schedule, factors):
         (lambda: Constant(-0.1), "Constant: factor must be a finite number >= 0, got -0.1"),
         (lambda: Exponential(0), "Exponential: half_life must be a finite number > 0, got 0"),
         (lambda: Exponential(math.nan), "Exponential: half_life must be a finite number > 0, got nan"),
+        (lambda: Inverse(0), "Inverse: time must be a finite number > 0, got 0"),
         (lambda: InverseRoot(0), "InverseRoot: time must be a finite number > 0, got 0"),
         (lambda: Exponential(10, -1), "Exponential: floor must be a finite number >= 0, got -1"),
         (lambda: Cosine(0), "Cosine: steps must be a whole number of at least 1, got 0"),

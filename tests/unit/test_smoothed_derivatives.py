@@ -35,6 +35,8 @@ def problem(n: int = 3, **more: Any) -> ur.Problem:
         ({"sigma": 0.1, "order": "hvp", "product": True}, 'product=True goes with order="gradient"'),
         ({"sigma": 0.1, "spp": 0}, "spp must be a whole number of at least 1, got 0"),
         ({"sigma": 0.1, "epsilon": 0}, "epsilon must be a finite number > 0, got 0"),
+        ({"sigma": 0.1, "order": "hvp", "hessian_rate": 1.5}, "hessian_rate must be at most 1, got 1.5"),
+        ({"sigma": 0.1, "hessian_rate": 0.5}, 'hessian_rate goes with order="hvp", got'),
     ],
 )
 def test_arguments_that_make_no_sense(arguments: dict[str, Any], message: str) -> None:
@@ -83,6 +85,9 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
     assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, joint=False)
     assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
+    for joint in (True, False):
+        kept = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", joint=joint, hessian_rate=0.5)
+        assert samples(kept, optimizers.NewtonCG(iterations=3)) == 1 + 16
     whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, joint=False)
     assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16
     assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
@@ -187,3 +192,31 @@ def test_products_never_make_a_matrix(joint: bool) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 200 * 8 * 6000
+
+
+@pytest.mark.parametrize("joint", [True, False], ids=["joint", "differences"])
+def test_a_hessian_that_is_kept_is_that_of_the_loss_and_so_is_the_gradient(joint: bool) -> None:
+    """A quadratic, whose smoothed derivatives are its own: means over steps, within 5 standard errors of blocks' means."""
+    matrix, at, sigma, blocks = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, -0.3], [0.0, -0.3, 0.5]]), np.ones(3), 0.1, 12
+    estimator = ur.SmoothedDerivatives(sigma, samples=16, order="hvp", joint=joint, hessian_rate=0.3)
+    hessian, found = None, []
+    for step in range(600):
+        gradient, _, hessian = estimator._kept(
+            lambda x: 0.5 * np.einsum("bi,ij,bj->b", x, matrix, x), at, np.full(3, sigma), step, hessian, 0.3
+        )
+        found.append(np.concatenate([gradient, hessian.ravel() / sigma**2]))
+    parts = np.array(found)[len(found) // blocks :].reshape(blocks - 1, -1, 12).mean(axis=1)
+    error = parts.std(axis=0, ddof=1) / np.sqrt(blocks - 1)
+    expected = np.concatenate([matrix @ at, matrix.ravel()])
+    assert (np.abs(parts.mean(axis=0) - expected) < 5 * error).all()
+    assert not (np.abs(parts.mean(axis=0) - 1.3 * expected) < 5 * error).all()
+    asked, x = problem(), {"x": np.full(3, 0.4)}
+    one, state = estimator.estimate(asked, x, estimator.init(asked, x), Key(0))
+    assert state.hessian is not None
+    assert one.hvp is not None
+    np.testing.assert_allclose(one.hvp({"x": np.array([1.0, 0, 0])})["x"], state.hessian[:, 0] / sigma**2, rtol=1e-6)
+
+
+def test_a_hessian_of_too_many_parameters_is_not_kept() -> None:
+    with pytest.raises(ur.InputError, match="hessian_rate keeps a matrix of 5000 × 5000 elements, too many"):
+        ur.estimate(problem(5000), ur.SmoothedDerivatives(0.1, order="hvp", hessian_rate=0.5))

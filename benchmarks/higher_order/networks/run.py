@@ -53,9 +53,10 @@ class Data:
         count: of images.
         size: of the rendered answers, pixels along a side.
         seed: of the poses.
+        centred: whether the network is given its images less their mean, over their standard deviation.
     """
 
-    def __init__(self, task: str, count: int, size: int, seed: int):
+    def __init__(self, task: str, count: int, size: int, seed: int, centred: bool = False):
         self.keys = list(ANSWERS[task])
         self.widths = [np.size(ANSWERS[task][key]) for key in self.keys]
         self.ranges = np.concatenate([np.atleast_1d(ANSWERS[task][key]) for key in self.keys])
@@ -64,6 +65,9 @@ class Data:
         self.session = self._prepared(size)
         self.references = self._render(self.session, self.truth, 64, 1)
         images = self._render(self._prepared(RESOLUTION), self.truth, 64, 2)
+        if centred:
+            images = images - images.mean(axis=0)
+            images /= images.std()
         self.images = torch.tensor(images, dtype=torch.float32)
         self.evaluations = 0
         self.step = 0
@@ -98,10 +102,18 @@ class Data:
 
 
 def train(
-    task: str, method: str, rate: float, seconds: float, seed: int, count: int, size: int, samples: int = 8
+    task: str,
+    method: str,
+    rate: float,
+    seconds: float,
+    seed: int,
+    count: int,
+    size: int,
+    centred: bool,
+    samples: int = 8,
 ) -> dict[str, Any]:
     """One run: errors over time, relative to the first."""
-    data = Data(task, count, size, 5)
+    data = Data(task, count, size, 5, centred)
     torch.manual_seed(seed)
     network = PoseNetwork(len(data.ranges))
     weights = list(network.parameters())
@@ -149,7 +161,12 @@ def train(
 
 
 def run(
-    task: tuple[str, ...] = tuple(ANSWERS), runs: int = 5, seconds: float = 40.0, images: int = 16, size: int = 32
+    task: tuple[str, ...] = tuple(ANSWERS),
+    runs: int = 5,
+    seconds: float = 40.0,
+    images: int = 16,
+    size: int = 32,
+    centred: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """A part per task.
 
@@ -157,15 +174,16 @@ def run(
         seconds: processor time of a run
         images: that the network learns from
         size: of the rendered answers, pixels along a side
+        centred: give the network its images less their mean
     """
     torch.set_num_threads(1)
     for name in task:
         weights = parameter_count(PoseNetwork(sum(np.size(width) for width in ANSWERS[name].values())))
         methods: dict[str, Any] = {}
         for method, rates in GRID.items():
-            tried = {r: train(name, method, r, seconds / 4, 1000, images, size)["final"] for r in rates}
+            tried = {r: train(name, method, r, seconds / 4, 1000, images, size, centred)["final"] for r in rates}
             best = min(tried, key=lambda rate, tried=tried: tried[rate])
-            found = [train(name, method, best, seconds, seed, images, size) for seed in range(runs)]
+            found = [train(name, method, best, seconds, seed, images, size, centred) for seed in range(runs)]
             methods[method] = {"rate": best, "tried": tried, "runs": found}
             print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
         yield {"tasks": {name: {"weights": weights, "methods": methods}}}

@@ -73,6 +73,8 @@ def _hessian(task: Task, n: int, c: Config) -> tuple[Any, Any]:
 def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
     def make(task: Task, n: int, c: Config) -> tuple[Any, Any]:
         samples = _samples(n, c) if aggregate else max(_samples(n, c) // n, 4)
+        if "memory" in c:
+            return _kept(task, c, samples), _newton_cg(n, c)
         estimator = _smoothed(task, c, samples, order="hvp", aggregate=aggregate, adaptive_annealing=True)
         return estimator, ur.optimizers.NewtonCG(
             iterations=1 if n > _MANY else int(c.get("iterations", min(n, 3))), **_newton(n, c)
@@ -81,7 +83,23 @@ def _products(aggregate: bool) -> Callable[..., tuple[Any, Any]]:
     return make
 
 
+def _kept(task: Task, c: Config, samples: int, joint: bool = False) -> ur.SmoothedDerivatives:
+    """Products of a Hessian that is kept between steps; with `adaptive`, σ shrinks by convergence in place of steps."""
+    adaptive = bool(c.get("adaptive", 0.0))
+    half_life = c.get("half_life", 3.0 if adaptive else 20.0)
+    more = {"joint": joint, "hessian_rate": c["memory"], "adaptive_annealing": adaptive}
+    return _smoothed(task, {**c, "half_life": half_life}, samples, order="hvp", **more)
+
+
+def _newton_cg(n: int, c: Config) -> Any:
+    """On such a Hessian, with steps that shrink as noise wants it."""
+    options = {**_newton(n, c), "schedule": ur.schedules.Inverse(c["steps"])}
+    return ur.optimizers.NewtonCG(iterations=min(n, 5), **options)
+
+
 def _joint(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    if "memory" in c:
+        return _kept(task, c, _samples(n, c), joint=True), _newton_cg(n, c)
     estimator = _smoothed(task, c, _samples(n, c), order="hvp", joint=True, adaptive_annealing=True)
     many = n > _MANY
     return estimator, ur.optimizers.NewtonCG(iterations=1 if many else min(n, 5), line=many, **_newton(n, c))
@@ -93,30 +111,36 @@ def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     return ur.LossValues(spp=task.spp), optimizer
 
 
+def _lbfgs(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    return _smoothed(task, c, _samples(n, c)), ur.optimizers.LBFGS(**_newton(n, c))
+
+
 _NEWTON_GRID = {"half_life": (6.0,), "steps": (30.0,), "radius": (0.5,)}
 _HALF_OR_ALL = {"samples": (0.5, 1.0)}
+_KEPT_GRID = {"adaptive": (0.0, 1.0), "steps": (10.0,)}
 METHODS = {
     "FR22": Method(_fr22, {"half_life": (10.0, 25.0), "rate": (0.15, 0.5), **_HALF_OR_ALL}),
-    "CMA-ES": Method(_search, {"deviation": (0.5, 1.0), "population": (16,)}),
+    "CMA-ES": Method(_search, {"deviation": (0.5, 1.0), "population": (8, 16)}),
+    "L-BFGS": Method(_lbfgs, {"half_life": (10.0, 25.0), "steps": (30.0,), "radius": (0.5, 1.5), **_HALF_OR_ALL}),
     "OurG": Method(_gradient, {"half_life": (25.0,), "rate": (0.15, 0.3)}),
     "OurH": Method(_hessian, _NEWTON_GRID),
     "OurHVP": Method(_products(False), _NEWTON_GRID),
-    "OurHVPA": Method(_products(True), {**_NEWTON_GRID, **_HALF_OR_ALL}),
-    "OurJoint": Method(_joint, {**_NEWTON_GRID, "radius": (0.5, 0.8), **_HALF_OR_ALL}),
+    "OurHVPA": Method(_products(True), {**_KEPT_GRID, "radius": (1.5,), "memory": (0.25, 0.5), **_HALF_OR_ALL}),
+    "OurJoint": Method(_joint, {**_KEPT_GRID, "radius": (1.0,), "memory": (0.3, 1.0), **_HALF_OR_ALL}),
 }
 _RATES = {"rate": (0.03, 0.1, 0.3)}
 _WIDE = {"half_life": (1e6,), "steps": (1e6,), "radius": (0.5,)}
 _FAR = {"half_life": (6.0, 60.0), "steps": (30.0,), "radius": (0.8, 4.0)}
-_CROWD = {"half_life": (30.0,), "steps": (80.0,), "radius": (0.25,), "samples": (0.5,)}
-_SLOWER = {"half_life": (15.0,), "steps": (30.0,), "radius": (0.5,)}
+_CROWD = {"half_life": (30.0,), "radius": (0.25, 0.5), **_HALF_OR_ALL}
+_FAR_KEPT = {"half_life": (6.0, 60.0), "steps": (30.0,), "radius": (0.8, 4.0), "memory": (0.5, 1.0)}
 OTHER_GRIDS: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {
-    **{("MUG", method): _SLOWER for method in ("OurHVPA", "OurJoint")},
-    ("BOX10", "OurHVPA"): {**_CROWD, "iterations": (1.0,)},
-    ("BOX10", "OurJoint"): _CROWD,
+    ("BOX10", "OurHVPA"): {**_CROWD, "steps": (30.0, 80.0), "iterations": (1.0,)},
+    ("BOX10", "OurJoint"): {**_CROWD, "steps": (20.0, 80.0), "adaptive": (0.0,), "memory": (0.3,)},
     ("BUNNY", "Mitsuba"): _RATES,
-    ("BUNNY", "OurHVPA"): {"half_life": (12.0,), "steps": (60.0,), "radius": (0.5,), "samples": (0.5,)},
-    **{("QUAD", method): _FAR for method in ("OurH", "OurHVP", "OurHVPA", "OurJoint")},
-    ("QUAD", "FR22"): {"half_life": (25.0, 60.0), "rate": (0.5, 1.0, 2.0)},
+    **{("QUAD", method): _FAR for method in ("OurH", "OurHVP")},
+    ("QUAD", "OurHVPA"): {**_FAR, "iterations": (1.0, 2.0)},
+    ("QUAD", "OurJoint"): _FAR_KEPT,
+    ("QUAD", "FR22"): {"half_life": (25.0, 60.0), "rate": (0.5, 0.7, 1.0, 2.0)},
     ("QUAD", "OurG"): {"half_life": (25.0, 60.0), "rate": (0.5, 1.0, 2.0)},
     ("TEXTURE", "Mitsuba"): {"rate": (0.03, 0.1)},
     ("TEXTURE", "FR22"): {"half_life": (60.0,), "rate": (0.2, 0.4)},

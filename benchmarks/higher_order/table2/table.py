@@ -41,7 +41,7 @@ def table(record: Record) -> str:
 def _apart(tasks: dict[str, Any]) -> str:
     """A row per rival and method: the mean of their ratios on each task, and of all, with the geometric mean."""
     rows = []
-    for method, rival in itertools.product(("OurHVPA", "OurJoint"), ("FR22", "CMA-ES", "Mitsuba")):
+    for method, rival in itertools.product(("OurHVPA", "OurJoint"), ("FR22", "CMA-ES", "L-BFGS", "Mitsuba")):
         ratios = {name: _both(task["methods"], rival, method) for name, task in tasks.items()}
         every = [ratio for found in ratios.values() for ratio in found]
         cells = [f"{statistics.fmean(found):.2f}" if found else "—" for found in ratios.values()]

@@ -30,10 +30,21 @@ from unrender.estimators.loss_values import BlackBox
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
-from unrender.smoothing.function import estimate_gradient, estimate_hessian, estimate_hvp
+from unrender.smoothing.function import (
+    estimate_gradient,
+    estimate_gradient_and_product,
+    estimate_hessian,
+    estimate_hvp,
+)
 from unrender.smoothing.options import SamplingOptions
 
 __all__ = ["SmoothedDerivatives", "SmoothedState"]
+
+
+_MOST_KEPT = 4096
+"""Parameters up to which a Hessian is kept between steps."""
+_DIRECTIONS = 1
+"""The stream of random numbers of the directions of products; 0 is that of the draws."""
 
 
 @dataclass(frozen=True)
@@ -42,19 +53,20 @@ class SmoothedState:
 
     Attributes:
         age: the argument of the schedule of σ: the steps made or, with `adaptive_annealing`, the sum of their convergence measures.
+        hessian: with `hessian_rate`, the Hessian kept between steps, in units of σ, (n, n); None before the first step.
     """
 
     age: float = 0.0
+    hessian: np.ndarray | None = None
 
     def upsampled(self, upsampler: Upsampler) -> SmoothedState:
-        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        """See `Upsamplable`: the Hessian begins anew."""
         del upsampler
-        return self
+        return replace(self, hessian=None)
 
     def restarted(self, fresh: SmoothedState) -> SmoothedState:
         """See `Restartable`: the schedule of σ goes on."""
-        del fresh
-        return self
+        return replace(self, hessian=fresh.hessian)
 
 
 @register
@@ -93,6 +105,13 @@ class SmoothedDerivatives:
             on a slope or a plateau, of whatever length. So σ shrinks after convergence at the present σ; half-lives are shorter, e.g.
             `Exponential(6)`. For few parameters: with many, the curvature in all other directions outweighs the slope in one, and the
             schedule advances at every step.
+        hessian_rate: ω in (0, 1], for "hvp": products are of a Hessian that is kept between steps in units of σ, (n, n), so that all
+            products of a step are free. None, the default: of this step's renders alone. Joint, the kept matrix B moves by ω toward
+            this step's Hessian. Otherwise each step estimates one product h along a random direction v, by the difference of two
+            gradients whose mean is the step's gradient, with `samples` renders for both in one launch, and moves B by ω toward the
+            nearest symmetric matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random directions).
+            The first B is vᵀh times the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature is a bias of
+            products, not of the gradient.
     """
 
     sigma: float | Mapping[str, float]
@@ -109,6 +128,7 @@ class SmoothedDerivatives:
     schedule: Schedule | None = None
     adaptive_annealing: bool = False
     debiased: bool = False
+    hessian_rate: float | None = None
 
     def __post_init__(self):
         if self.order not in ("gradient", "hessian", "hvp"):
@@ -120,6 +140,13 @@ class SmoothedDerivatives:
         checks.integer("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
         checks.integer("SmoothedDerivatives", "spp", self.spp, at_least=2 if self.debiased else 1)
         checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
+        if self.hessian_rate is not None:
+            if checks.number("SmoothedDerivatives", "hessian_rate", self.hessian_rate, above=0.0) > 1.0:
+                raise InputError(f"SmoothedDerivatives: hessian_rate must be at most 1, got {self.hessian_rate!r}")
+            if self.order != "hvp":
+                raise InputError(f'SmoothedDerivatives: hessian_rate goes with order="hvp", got {self.order!r}')
+            if not (self.joint or (self.aggregate and self.antithetic)):
+                raise InputError("SmoothedDerivatives: hessian_rate needs aggregate and antithetic draws")
 
     @property
     def provides(self) -> Capabilities:
@@ -141,6 +168,12 @@ class SmoothedDerivatives:
             )
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._sigma_per_parameter(parameters)
+        size = vectors.ravel(parameters).size
+        if self.hessian_rate is not None and size > _MOST_KEPT:
+            raise InputError(
+                f"SmoothedDerivatives: hessian_rate keeps a matrix of {size} × {size} elements, too many: "
+                f"leave it out above {_MOST_KEPT} parameters"
+            )
         return SmoothedState()
 
     def estimate(
@@ -158,8 +191,14 @@ class SmoothedDerivatives:
             return perturbed[-1]
 
         point = vectors.ravel(parameters), vectors.repeat_per_element(sigma, parameters)
-        derive = self._joint if self.joint and self.order != "gradient" else self._separate
-        gradient, error, curvature = derive(record_losses, *point, key.fold(1).uint32(), parameters)
+        seed, hessian = key.fold(1).uint32(), state.hessian
+        if self.hessian_rate is not None:
+            gradient, error, hessian = self._kept(record_losses, *point, seed, hessian, self.hessian_rate)
+            kept, width = hessian, point[1]
+            curvature = self._curvature(lambda: kept, lambda v: (kept @ (v / width)) / width, parameters)
+        else:
+            derive = self._joint if self.joint and self.order != "gradient" else self._separate
+            gradient, error, curvature = derive(record_losses, *point, seed, parameters)
         losses = np.concatenate(perturbed)
         capabilities = (
             Variance(vectors.unravel(error**2, parameters)),
@@ -169,7 +208,7 @@ class SmoothedDerivatives:
         )
         found = Estimate(box.center(), vectors.unravel(gradient, parameters), capabilities, box.info)
         age = state.age + (_convergence(losses, found.loss) if self.adaptive_annealing else 1.0)
-        return found, replace(state, age=age)
+        return found, SmoothedState(age, hessian)
 
     def _joint(
         self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
@@ -182,7 +221,41 @@ class SmoothedDerivatives:
         self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
     ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
         """As `_joint`, each derivative from renders of its own."""
-        options = SamplingOptions(
+        options = self._options(seed)
+        gradient, error = estimate_gradient(f, theta, sigma, options)
+
+        def product(v: np.ndarray) -> np.ndarray:
+            return estimate_hvp(f, theta, v, sigma, replace(options, samples=2 * self.samples))[0]
+
+        curvature = self._curvature(lambda: estimate_hessian(f, theta, sigma, options)[0], product, like)
+        return gradient, error, curvature
+
+    def _kept(
+        self,
+        f: smoothed.Function,
+        theta: np.ndarray,
+        sigma: np.ndarray,
+        seed: int,
+        kept: np.ndarray | None,
+        rate: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The gradient (n,), its standard error (n,), and the Hessian kept between steps after this one, in units of σ (n, n)."""
+        if self.joint:
+            found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy)
+            hessian = found.hessian()[0] * np.outer(sigma, sigma)
+            return *found.gradient(), hessian if kept is None else kept + rate * (hessian - kept)
+        v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
+        v /= np.linalg.norm(v)
+        gradient, error, product = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
+        product = sigma * product
+        if kept is None:
+            kept, rate = float(v @ product) * np.eye(theta.size), 1.0
+        missing = product - kept @ v
+        update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
+        return gradient, error, kept + rate * update
+
+    def _options(self, seed: int) -> SamplingOptions:
+        return SamplingOptions(
             self.samples,
             seed,
             self.aggregate,
@@ -192,13 +265,6 @@ class SmoothedDerivatives:
             self.product,
             self.epsilon,
         )
-        gradient, error = estimate_gradient(f, theta, sigma, options)
-
-        def product(v: np.ndarray) -> np.ndarray:
-            return estimate_hvp(f, theta, v, sigma, replace(options, samples=2 * self.samples))[0]
-
-        curvature = self._curvature(lambda: estimate_hessian(f, theta, sigma, options)[0], product, like)
-        return gradient, error, curvature
 
     def _curvature(
         self, hessian: Callable[[], np.ndarray], product: Callable[[np.ndarray], np.ndarray], like: Tree

@@ -1,5 +1,5 @@
 """Factors of a learning rate, or of a smoothing width, as functions of the step."""
 
-from unrender.schedules.functions import Constant, Cosine, Exponential, InverseRoot, Schedule, Steps, Warmup
+from unrender.schedules.functions import Constant, Cosine, Exponential, Inverse, InverseRoot, Schedule, Steps, Warmup
 
-__all__ = ["Constant", "Cosine", "Exponential", "InverseRoot", "Schedule", "Steps", "Warmup"]
+__all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]

@@ -14,7 +14,7 @@ from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
-__all__ = ["Constant", "Cosine", "Exponential", "InverseRoot", "Schedule", "Steps", "Warmup"]
+__all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]
 
 
 class Schedule(Protocol):
@@ -80,6 +80,24 @@ class InverseRoot:
 
     def __call__(self, step: float) -> float:
         return 1.0 / math.sqrt(1.0 + step / self.time)
+
+
+@register(position=7)
+@dataclass(frozen=True)
+class Inverse:
+    """1 / (1 + step / time): the rate of Newton's steps with noise, which averages all of it (Robbins and Monro 1951).
+
+    Args:
+        time: steps after which the rate is half of the first, > 0.
+    """
+
+    time: float
+
+    def __post_init__(self):
+        checks.number("Inverse", "time", self.time, above=0.0)
+
+    def __call__(self, step: float) -> float:
+        return 1.0 / (1.0 + step / self.time)
 
 
 @register(position=4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,13 +79,16 @@ class SmoothedFunction:
             parts.append(sampler(points[:, 0], u, special.ndtri(u)))
         return np.concatenate(parts)
 
-    def odd(self, z: np.ndarray, offset: float, theta: np.ndarray | None = None) -> np.ndarray:
+    def odd(self, z: np.ndarray, offset: float) -> np.ndarray:
         """The factor of an odd kernel, (B,): f(θ − σ z), with antithetic draws half its difference to f(θ + σ z)."""
-        center = self.theta if theta is None else theta
-        if not self.antithetic:
-            return self.evaluate(center - self.sigma * z) - offset
-        behind, ahead = self.pairs(z, center)
-        return 0.5 * (behind - ahead)
+        return self.odd_at(z, [self.theta])[0] - (0.0 if self.antithetic else offset)
+
+    def odd_at(self, z: np.ndarray, centers: Sequence[np.ndarray]) -> np.ndarray:
+        """The same around each of C points (n,) in place of θ, (C, B), by one call of f."""
+        signs = (-1, 1) if self.antithetic else (-1,)
+        points = [center + sign * self.sigma * z for center in centers for sign in signs]
+        values = self.evaluate(np.concatenate(points)).reshape(len(centers), len(signs), len(z))
+        return 0.5 * (values[:, 0] - values[:, 1]) if self.antithetic else values[:, 0]
 
     def even(self, z: np.ndarray, offset: float) -> np.ndarray:
         """The factor of an even kernel, (B,): f(θ − σ z), with antithetic draws its mean with f(θ + σ z)."""
@@ -94,10 +97,9 @@ class SmoothedFunction:
         behind, ahead = self.pairs(z)
         return 0.5 * (behind + ahead) - offset
 
-    def pairs(self, z: np.ndarray, theta: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def pairs(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """f(θ − σ z) and f(θ + σ z), (B,) each, by one call of f."""
-        center = self.theta if theta is None else theta
-        both = self.evaluate(np.concatenate([center - self.sigma * z, center + self.sigma * z]))
+        both = self.evaluate(np.concatenate([self.theta - self.sigma * z, self.theta + self.sigma * z]))
         return both[: len(z)], both[len(z) :]
 
     def leave_one_out_sum(self, values: np.ndarray) -> np.ndarray:
