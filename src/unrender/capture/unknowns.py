@@ -23,7 +23,8 @@ DEFAULT = ("colour", "roughness", "metallic", "light")
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _SMOOTHEST, _SMOOTHEST_WITH_NORMALS = 0.02, 0.25
-"""Least roughness. Where a lobe is narrower than a texel of the light, derivatives by normals, which grow as its inverse square, are noise."""
+"""Least roughness. Where a lobe is narrower than a texel of the light, derivatives by normals, which grow as its inverse square, are
+noise."""
 _METALLIC = 0.1
 """Above 0, which is a bound."""
 _FLAT = (0.5, 0.5, 1.0)
