@@ -2,8 +2,8 @@
 
 Each problem gets the same time from both. `auto` has no option given. The loop of `mi.render`, `dr.backward` and `mi.ad.Adam` is tuned on
 a seed of its own for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time;
-its best setting is then run on the other seeds. `auto` is also tuned, on the same seed, over as many settings: by when it is at what the
-loop reaches. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
+its best setting is then run on the other seeds. `auto` has no option; where `--option` gives some, it
+is tuned over these beside: on the same seed, by when it is at what the loop reaches. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
 
 Errors are of the elements that the views see: those that change the images at the truth by at least a twentieth of the median
 (`unrender.sensitivity`). Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
@@ -35,10 +35,6 @@ GALLERY = (
 )  # fmt: skip
 FOREIGN = tuple(f"{scene}, {loss}" for scene in scenes.SCENES for loss in scenes.LOSSES)
 TUNING_SEED = 1000
-OPTIONS = (
-    "learning_rate=0.03", "learning_rate=0.2", "learning_rate=0.4", "spp=2", "spp=16", "image=plain", "image=rcv",
-)  # fmt: skip
-"""Of `auto`, to tune it by: with none, as many settings as the loop has in the record."""
 QUICK = {
     "problem": ("mirror-trio",),
     "seconds": 0.4,
@@ -214,7 +210,7 @@ def run(
     reference_spp: int = 4096,
     gallery_reference_spp: int | None = None,
     every: int = 2,
-    option: tuple[str, ...] = OPTIONS,
+    option: tuple[str, ...] = (),
     retune: bool = True,
 ) -> Iterator[dict[str, Any]]:
     """Every problem.
@@ -232,7 +228,7 @@ def run(
         reference_spp: of their references
         gallery_reference_spp: of the gallery's references, none for its own
         every: steps of the loop between errors
-        option: of `auto`, as "spp=2", to tune it by as well; such runs stand beside those without one
+        option: of `auto`, as "spp=2 learning_rate=0.3", each a setting to tune it by as well; none for not to tune it
         retune: the loop; else its settings are those of the record
     """
     known = {} if retune else _kept()
