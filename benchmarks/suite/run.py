@@ -1,9 +1,9 @@
 """What someone gets who sets nothing, against Mitsuba's own loop as a good user tunes it, over problems of the gallery and of others.
 
-Each problem gets the same time from both. `auto` has no option given. The loop of `mi.render`, `dr.backward` and `mi.ad.Adam` is tuned on
-a seed of its own for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time;
-its best setting is then run on the other seeds. `auto` has no option; where `--option` gives some, it
-is tuned over these beside: on the same seed, by when it is at what the loop reaches. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
+Each problem gets the same time from both. `auto` has no option given; where `--option` gives some, it is tuned over these beside, on a seed
+of its own, by when it is at what the loop reaches. The loop of `mi.render`, `dr.backward` and `mi.ad.Adam` is tuned on a seed of its own
+for the whole time, over samples per pixel, learning rate, and whether the rate falls as half a cosine over the time; its best setting is
+then run on the other seeds. A parameter's own rate, where a gallery problem gives one, is the loop's for it.
 
 Errors are of the elements that the views see: those that change the images at the truth by at least a twentieth of the median
 (`unrender.sensitivity`). Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
