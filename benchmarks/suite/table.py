@@ -56,10 +56,11 @@ def table(record: Record) -> str:
     mean = _mean([entry["speed"] for entry in entries], entries, settings["seconds"])
     ours = [entry for entry in entries if "tuned" in entry]
     of_tuned = _mean([entry["tuned"]["speed"] for entry in ours], ours, settings["seconds"]) if ours else None
+    seeds = sorted({len(entry["final"]["auto"]) for entry in entries})
     tuned = len(settings["spp"]) * len(settings["rates"]) * 2
     return "\n\n".join(
         [
-            f"{settings['seconds']:g} s, {settings['seeds']} seeds, medians; errors where seen, relative to the "
+            f"{settings['seconds']:g} s, {' or '.join(map(str, seeds))} seeds, medians; errors where seen, relative to the "
             f"start. The loop is the best of {tuned} settings, `auto` has none.",
             markdown.table(head, rows),
             f"Geometric mean over the {len(problems)} problems: **{mean:.2f}** times as fast, where `auto` never gets "
