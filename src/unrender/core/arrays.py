@@ -6,7 +6,6 @@ against closed forms and runs unchanged on the device.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,7 +26,6 @@ __all__ = [
     "flat",
     "gather",
     "gather_rows",
-    "inner_products",
     "integer",
     "is_drjit",
     "is_finite",
@@ -375,28 +373,3 @@ def shaped(x: Array, shape: tuple[int, ...], like: Array) -> Array:
     if not is_drjit(like):
         return x.reshape(shape)
     return type(like)(x, shape) if dr.is_tensor_v(like) else x
-
-
-_LONG, _PARTS = 1 << 20, 16
-"""Elements from which sums of products are of 16 parts first, all pairs at once, lest each product is stored."""
-
-
-def inner_products(pairs: Sequence[tuple[Array, Array]]) -> list[Array]:
-    """Σ x y over all elements of each pair (x, y) of equal shapes and kinds, left lazy on Dr.Jit."""
-    if not pairs or not is_drjit(pairs[0][0]) or math.prod(pairs[0][0].shape) < _LONG:
-        return [total(x * y) for x, y in pairs]
-    parts = []
-    for x, y in pairs:
-        evaluate(x, y)
-        one, other, kind = flat(x), flat(y), dr.uint32_array_t(dr.array_t(x))
-        count = dr.width(one)
-        size = -(-count // _PARTS)
-        index = dr.arange(kind, size)
-        found = dr.zeros(type(one), size)
-        for part in range(_PARTS):
-            within = index < count - part * size if (part + 1) * size > count else True
-            left, right = (dr.gather(type(one), z, index + part * size, within) for z in (one, other))
-            found = found + left * right
-        parts.append(found)
-    evaluate(parts)
-    return [dr.sum(part) for part in parts]

@@ -16,6 +16,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.optimizers import rates
+from unrender.optimizers.agreement import measured, root_mean_square
 from unrender.optimizers.signal_share import signal_share
 from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
@@ -221,7 +222,8 @@ class ScheduleFree:
         near = {key: zeros[key] for key in smoothed} if self.wiener else {}
         fits = dict.fromkeys(smoothed if isinstance(smooth, Sobolev) else (), StrengthFit())
         sizes = {
-            key: max(_size(x, arrays.number(arrays.total(x * x))) or 1.0, own[key]) for key, x in parameters.items()
+            key: max(root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, own[key])
+            for key, x in parameters.items()
         }
         return ScheduleFreeState(0, own, iterate, iterate, zeros, zeros, near, near, ones, none, fits, sizes)
 
@@ -299,7 +301,7 @@ class ScheduleFree:
         above its first, or 0.3 of that where it becomes weaker.
         """
         correlation, log_rate = {}, {}
-        for key, (cosine, size) in _measured(gradient, state.gradient, parameters).items():
+        for key, (cosine, size) in measured(gradient, state.gradient, parameters).items():
             rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
             fit, shape = strengths.get(key, _NOT_FITTED), arrays.shape(gradient[key])
             change = self._change(min(rho, rho * fit.confirmed), shape, state.step - state.begun)
@@ -375,11 +377,6 @@ def _mean_square(beta_2: float, made: int) -> tuple[float, float]:
     return min(1.0 - beta_2, 1.0 / count), 1.0 - left
 
 
-def _size(x: Array, square: float) -> float:
-    """The root mean square of an array whose squares sum up to `square`; 0 of no elements."""
-    return math.sqrt(square / max(1, math.prod(arrays.shape(x))))
-
-
 def _remember(state: ScheduleFreeState, gradient: Tree, strengths: Mapping[str, StrengthFit]) -> tuple[Tree, Tree]:
     """`product` and `square` of the next state: what was remembered is of the size that it has with the strengths of this step."""
     product, square = {}, {}
@@ -390,18 +387,3 @@ def _remember(state: ScheduleFreeState, gradient: Tree, strengths: Mapping[str, 
         product[key] = memory * past + g * h
         square[key] = memory * state.square[key] + 0.5 * (g * g + h * h)
     return product, square
-
-
-def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tuple[float, float]]:
-    """{key: (cosine of the angle between two gradients, 0 where one of them is 0; root mean square of the parameter)}."""
-    sums = {
-        key: arrays.inner_products([(g, previous[key]), (g, g), (previous[key],) * 2, (parameters[key],) * 2])
-        for key, g in gradient.items()
-    }
-    arrays.evaluate(sums)
-    found = {}
-    for key, parts in sums.items():
-        product, one, other, square = (arrays.number(part) for part in parts)
-        lengths = math.sqrt(one) * math.sqrt(other)
-        found[key] = (product / lengths if lengths > 0 else 0.0, _size(parameters[key], square))
-    return found
