@@ -97,7 +97,7 @@ def ours(
     """A run with no option given, or one of `auto`'s, as "spp=2"; its curve, and how many steps and seconds of compilation it took."""
     curve = Curve(error, seconds / 100)
     given = method("auto").choose(problem, dict([option.split("=")])) if option else None
-    estimator, optimizer = (given.estimator, given.optimizer) if given else (None, None)
+    estimator, optimizer = (given.estimator, given.optimizer) if given else ("auto", None)
     result = ur.optimize(problem, estimator, optimizer, seconds=seconds, seed=seed, callbacks=[curve])
     return curve.points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
