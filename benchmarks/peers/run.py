@@ -129,9 +129,8 @@ class Judge:
 def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given; errors are no part of the time."""
     kept = Kept(seconds, _POINTS)
-    ur.optimize(
-        blind(judge.case.problem), seconds=100 * seconds, seed=seed, callbacks=[kept]
-    )  # a limit of the clock, never reached
+    limit = 100 * seconds  # of the clock, never reached
+    ur.optimize(blind(judge.case.problem), seconds=limit, seed=seed, callbacks=[kept])
     return judge.run(kept.found, kept.steps)
 
 

@@ -14,7 +14,6 @@ higher_order.table2, since the loop has no gradients of them.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +25,7 @@ import unrender as ur
 from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import dr, hardly_seen, method
 from benchmarks.races import total_error
+from benchmarks.runner import records
 from benchmarks.stock_loop import stock_loop
 from benchmarks.suite import scenes
 
@@ -192,11 +192,6 @@ def _reached(curve: np.ndarray, error: float, seconds: float) -> float | None:
     return (int(reached[0]) + 1) / len(curve) * seconds if len(reached) else None
 
 
-def _kept() -> dict[str, Any]:
-    """The problems of the record."""
-    return json.loads((Path(__file__).parent / "results.json").read_text())["problems"]
-
-
 def run(
     problem: tuple[str, ...] = GALLERY,
     foreign: tuple[str, ...] = (),
@@ -231,7 +226,8 @@ def run(
         option: of `auto`, as "spp=2 learning_rate=0.3", each a setting to tune it by as well; none for not to tune it
         retune: the loop; else its settings are those of the record
     """
-    known = {} if retune else _kept()
+    record = None if retune else records.read(Path(__file__).parent)
+    known = record["problems"] if record else {}
     made: dict[str, Callable[[], ur.Problem]] = {}
     options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
     for name in problem:

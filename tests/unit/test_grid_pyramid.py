@@ -13,12 +13,16 @@ from unrender.preconditioners import Sobolev, grid, grid_pyramid
 from unrender.preconditioners.grid_pyramid import GridPyramid
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+def shrink(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grids of more than 256 cells count as large."""
     monkeypatch.setattr(grid_pyramid, "LARGEST_EXACT", 256)
     monkeypatch.setattr(grid_pyramid, "_COARSEST", 256)
     monkeypatch.setattr(grid_pyramid, "pyramid", GridPyramid)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    shrink(monkeypatch)
 
 
 def normal(seed: int, shape: tuple[int, ...]) -> np.ndarray:
@@ -71,9 +75,7 @@ def test_the_share_of_signal_is_that_of_transforms(monkeypatch: pytest.MonkeyPat
     signal = np.broadcast_to(np.linspace(0, 1, 48, dtype=np.float32)[:, None] > 0.5, shape)
     product, square = signal + 0.3 * normal(0, shape), 1.0 + 0.1 * normal(1, shape) ** 2
     exact = signal_share(Sobolev(16.0), product, square, 0.1, 0.8, 0)
-    monkeypatch.setattr(grid_pyramid, "LARGEST_EXACT", 256)
-    monkeypatch.setattr(grid_pyramid, "_COARSEST", 256)
-    monkeypatch.setattr(grid_pyramid, "pyramid", GridPyramid)
+    shrink(monkeypatch)
     found = signal_share(Sobolev(16.0), product, square, 0.1, 0.8, 0)
     assert not np.array_equal(found, exact)
     np.testing.assert_allclose(found, exact, atol=0.06)
@@ -97,9 +99,7 @@ def test_a_pattern_of_noise_and_detail_is_recovered_as_with_transforms(monkeypat
         return float(np.sqrt(np.mean((x["x"] - truth) ** 2)))
 
     exact = error()
-    monkeypatch.setattr(grid_pyramid, "LARGEST_EXACT", 256)
-    monkeypatch.setattr(grid_pyramid, "_COARSEST", 256)
-    monkeypatch.setattr(grid_pyramid, "pyramid", GridPyramid)
+    shrink(monkeypatch)
     assert error() == pytest.approx(exact, rel=0.1)
 
 

@@ -104,17 +104,18 @@ def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
 
 
 def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable[[float], None]) -> np.ndarray:
-    integrator = mi.load_dict({"type": "volpath" if media(scene) else "path", "max_depth": max_depth})
+    volumes = bool(media(scene))
+    integrator = mi.load_dict({"type": "volpath" if volumes else "path", "max_depth": max_depth})
     camera = scene.sensors()[sensor]
     width, height = (int(size) for size in camera.film().crop_size())
     numbers, take = "independent", -(-spp // -(-spp * width * height // _LANES))
-    if not media(scene):
+    if not volumes:
         # As good as 1.4 to 14 times as many independent samples on the gallery; in media, hardly better.
         numbers, take = "multijitter", _grid(take)
+    sampler = mi.load_dict({"type": numbers, "sample_count": take})
+    sampler.set_samples_per_wavefront(take)
     total, done = np.zeros((height, width, 3)), 0
     while done < spp:
-        sampler = mi.load_dict({"type": numbers, "sample_count": take})
-        sampler.set_samples_per_wavefront(take)
         seed = _REFERENCE.fold(sensor).fold(done).uint32()
         samples = film.camera_samples(camera, sampler, mi.UInt32(seed), take, None, width * height)
         ray, weight = film.rays(samples)

@@ -103,16 +103,13 @@ class StrengthFit:
         if summary is not None and not len(self.last):
             return replace(self, gain=1.0, level=0.0, last=summary)
         found = replace(self, gain=1.0, level=0.0, steps=self.steps + 1)
+        pair = _Pair(previous, gradient, self.last, summary)
         if found.count < STEPS:
-            found = found._with_pair(preconditioner, _Pair(previous, gradient, self.last, summary))
+            found = found._with_pair(preconditioner, pair)
         else:
             if fresh is not None:
-                news = None if summary is None else preconditioner.summary(fresh)
-                found = found._with_fresh(
-                    preconditioner,
-                    _Pair(previous, gradient, self.last, summary),
-                    _Pair(previous, fresh, self.last, news),
-                )
+                newer = _Pair(previous, fresh, self.last, preconditioner.summary(fresh))
+                found = found._with_fresh(preconditioner, pair, newer)
             found = found._judged() if found.unjudged >= _ROWS else found
         return found if summary is None else replace(found, last=summary)
 

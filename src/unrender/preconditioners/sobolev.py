@@ -81,9 +81,9 @@ class Sobolev:
 
     def apply_twice(self, x: Array) -> Array:
         """S² x."""
-        pyramid = None if self._spectrum is not None else self._pyramid(arrays.shape(x))
-        if pyramid is not None:
-            return pyramid.apply(x, self.strength_of(arrays.shape(x)), 1.0)
+        shape = arrays.shape(x)
+        if (pyramid := self._pyramid(shape)) is not None:
+            return pyramid.apply(x, self.strength_of(shape), 1.0)
         return self.apply(self.apply(x))
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
@@ -128,7 +128,7 @@ class Sobolev:
 
     def summary(self, gradient: Array) -> np.ndarray | None:
         """What `descents_of_summaries` needs of a gradient g, (m,) float32; None where `descents` serves, of few texels and of meshes."""
-        pyramid = None if self._spectrum is not None else self._pyramid(arrays.shape(gradient))
+        pyramid = self._pyramid(arrays.shape(gradient))
         return None if pyramid is None else pyramid.summary(gradient)
 
     def descents_of_summaries(
@@ -142,10 +142,12 @@ class Sobolev:
 
     def is_on_device(self, shape: tuple[int, ...]) -> bool:
         """Whether an array of this shape stays on the device, as large textures and grids do."""
-        return self._spectrum is None and self._pyramid(shape) is not None
+        return self._pyramid(shape) is not None
 
     def _pyramid(self, shape: tuple[int, ...]) -> grid_pyramid.GridPyramid | None:
-        """That stands in for transforms of a large grid; None where it does not."""
+        """That stands in for transforms of a large grid; None where it does not, as on meshes."""
+        if self._spectrum is not None:
+            return None
         if math.prod(shape[:-1]) <= grid_pyramid.LARGEST_EXACT or any(self._wraps(shape)):
             return None
         return grid_pyramid.pyramid(shape[:-1])
