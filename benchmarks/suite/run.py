@@ -143,9 +143,15 @@ def tune(
 def tune_ours(
     problem: ur.Problem, error: Any, seconds: float, options: Any, loop_curve: np.ndarray
 ) -> tuple[str, list[dict[str, Any]]]:
-    """The option of `auto` with which it is first at the loop's best error, or of least error where none gets there; and all tried."""
-    tried = []
+    """The option of `auto` with which it is first at the loop's best error, or of least error where none gets there; and all tried.
+
+    What `auto` chooses by itself is not tried again.
+    """
+    tried, own = [], method("auto").choose(problem)
     for option in ("", *options):
+        chosen = method("auto").choose(problem, dict([option.split("=")])) if option else None
+        if chosen and (chosen.estimator, chosen.optimizer) == (own.estimator, own.optimizer):
+            continue
         curve = middle([ours(problem, error, seconds, TUNING_SEED, option)[0]], seconds)
         when = _reached(curve, float(loop_curve.min()), seconds)
         tried.append({"option": option, "error": float(curve[-1]), "seconds": when})

@@ -120,6 +120,14 @@ def test_detail_that_falls_in_smoothed_steps_too_is_left_to_them(monkeypatch: py
     assert watched(0.3, 0.03, late=0.5)[1].share < 0.1, "without that condition"
 
 
+def test_little_that_is_left_is_not_worth_the_noise_of_single_texels(monkeypatch: pytest.MonkeyPatch):
+    """Detail that waits, of a tenth and of a thirtieth of the first gradients."""
+    assert watched(0.3, 0.03, scales=(0.4, 0.4, 0.4))[-1].share < 0.1
+    assert [fit.share for fit in watched(0.3, 0.03, scales=(0.1, 0.1, 0.1))] == [1.0] * 3
+    monkeypatch.setattr(strength, "_LEAST_LEFT", 0.0)
+    assert watched(0.3, 0.03, scales=(0.1, 0.1, 0.1))[-1].share < 0.1, "without that condition"
+
+
 def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPatch):
     assert [fit.share for fit in watched(0.0, 1.0)] == [1.0] * 3
     assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"

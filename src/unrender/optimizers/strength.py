@@ -21,15 +21,17 @@ _LEAST_DESCENT = 0.4
 """Of the best candidate's."""
 _ROWS = 8
 """Fresh gradients from one judgement to the next; it is by those of the last two."""
-_LEAST_FRESH_DESCENT, _ERRORS = 0.7, 3.3
+_LEAST_FRESH_DESCENT, _ERRORS = 0.7, 2.8
 """Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
-_CONFIRMED, _KEPT = 0.5, 0.6
+_CONFIRMED, _KEPT = 0.45, 0.6
 """Shares of what successive gradients agree on that fresh samples have to show for less smoothing, and must not be below by a standard
 error once it is less."""
 _CLEAR = 0.15
 """Share of |S g|² that fresh samples have to show for less smoothing."""
 _SLOWEST = 0.75
 """The power of 1 / step that detail's gradient falls by at most where it waits for less smoothing."""
+_LEAST_LEFT = 0.05
+"""Share of its first gradients that detail's gradient must still have for less smoothing."""
 _LEAST_CONFIRMED = 0.02
 """The share by which such an agreement counts at least."""
 
@@ -45,14 +47,15 @@ class StrengthFit:
 
     Later, gradients of an estimator that remembers samples agree on the noise remembered, too. Where an estimate has the gradient f of
     fresh samples (`FreshGradient`), S g · S f is what is no noise. Smoothing is reduced, to the strongest that descends at least 0.7 times
-    as much as the best, if by that the descent grows by more than 3.3 standard errors, and S g · S f is at least half of S g · S g', and
+    as much as the best, if by that the descent grows by more than 2.8 standard errors, and S g · S f is at least 0.45 of S g · S g', and
     0.15 of |S g|²: the rest is noise, which nothing would average any more.
 
     Steps by smoothed gradients recover detail, too, only later: reducing their smoothing pays where the detail waits for it. So the root of
     S g · S f with the new strength must fall more slowly than step^(-3/4) from one look at fresh gradients to the next, the first
-    gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. What is then
-    gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive ones agree on, by a
-    standard error, the strength is that of the first fit again.
+    gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. And it must be at
+    least a twentieth of what it was at first: where less is left, there is little to gain, and single texels would follow the noise of
+    the reference. What is gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive
+    ones agree on, by a standard error, the strength is that of the first fit again.
 
     What is no noise of what successive gradients agree on, is `confirmed`.
 
@@ -154,6 +157,7 @@ class StrengthFit:
             and _confirmed(rows, 1 + best)[0] >= _CONFIRMED
             and product >= _CLEAR * square
             and looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
+            and looked[best] * self.count >= _LEAST_LEFT**2 * self.sums[best, 0]
         ):
             return found._changed(float(self._shares[best]), square, squares[:, 0].mean())
         return replace(found, confirmed=_most_confirmed(rows))
