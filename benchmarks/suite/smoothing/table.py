@@ -42,10 +42,11 @@ def table(record: Record) -> str:
                 ", ".join(f"{ratio:.2f}" for ratio in boards),
             ]
         )
+    seeds = sorted({len(found) for curves in problems.values() for found in curves.values()})
     return "\n\n".join(
         [
             f"Error where seen, relative to the start, after half and all of {settings['steps']} steps of as many samples; "
-            f"{settings['seeds']} seed{'s' * (settings['seeds'] > 1)}.",
+            f"medians of {' or '.join(map(str, seeds))} seeds.",
             markdown.table(["problem", *kinds], rows),
             "Errors at the end over those of the same method without it: geometric mean and range over the textures, and each "
             "checkerboard.",
