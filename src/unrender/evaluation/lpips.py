@@ -20,7 +20,7 @@ def available() -> bool:
     """Whether the package is installed and AlexNet's weights lie where torchvision keeps them."""
     if any(find_spec(name) is None for name in ("torch", "torchvision", "lpips")):
         return False
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     return any((Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
 
@@ -29,7 +29,7 @@ def distance(image: np.ndarray, reference: np.ndarray) -> float | None:
     """Of two pictures (H, W, 3) as displayed, in [0, 1], by AlexNet. Smaller is better. None where it cannot be computed."""
     if min(image.shape[:2]) < _LEAST or not available():
         return None
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     one, two = (
         torch.from_numpy(np.ascontiguousarray(2 * x.transpose(2, 0, 1)[None] - 1, np.float32))
