@@ -43,4 +43,4 @@ def distance(image: np.ndarray, reference: np.ndarray) -> float | None:
 def _network() -> Any:
     import lpips  # pyright: ignore[reportMissingImports]
 
-    return lpips.LPIPS(net="alex", verbose=False)
+    return lpips.LPIPS(net="alex", verbose=False)  # pyright: ignore[reportAttributeAccessIssue]
