@@ -25,7 +25,7 @@ BIN := .venv/bin
 SECONDS := 30
 # LLVM compiles a kernel on one core, so a process for each. The tests of a file stay in one process, since they share kernels.
 WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
-PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile
+PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=2
 TYPES = $(BIN)/pyright --pythonpath $(BIN)/python
 # Types take a minute of one core: they are checked beside the tests, and told after them.
 define WITH_LINT
