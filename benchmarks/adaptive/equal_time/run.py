@@ -9,8 +9,8 @@ at ten checkpoints, medians over seeds, at equal samples and at equal time. Sinc
 runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
 
 `--steps 5000` races by steps, with rates that fall along half a cosine; `time` is then that in which each method first
-reaches the least error that all reach, over that of uniform mini-batches. Large pictures: `--resolution 1024`; many
-views: `--views 16`.
+reaches the least error that all reach, over that of uniform mini-batches; these races have entries of their own. Large
+pictures: `--resolution 1024`; many views: `--views 16`.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def run(
         count: pixels a step
         steps: of every run, in place of its seconds, with falling rates
         views: how many, where the problem takes them
-        only: methods to run; the others' figures stay
+        only: methods to run and to time; the others' figures stay
         part: measured; the other's figures stay
         rounds: of turns of the cost
     """
@@ -154,11 +154,11 @@ def run(
             **({"views": views} if views else {}),
         }
         made, pixel_count, found = ur.gallery.problem(name, **options), count or usual, {}
-        everyone = entrants(task, pixel_count, steps)
+        chosen = [e for e in entrants(task, pixel_count, steps) if not only or e.name in only]
+        label = f"{task}, {steps} steps" if steps else task
         if "race" in part:
-            chosen = [e for e in everyone if not only or e.name in only]
             conditions = {"options": options, "count": pixel_count, "seconds": seconds, "seeds": seeds}
             budget: dict[str, Any] = {"steps": steps} if steps else {"seconds": seconds}
             conditions |= budget
-            found["entries"] = {task: {**conditions, "methods": race(made, chosen, seeds, **budget)}}
-        yield {**found, "seconds_per_path": {task: costs(made, everyone, RATES[0], rounds)}}
+            found["entries"] = {label: {**conditions, "methods": race(made, chosen, seeds, **budget)}}
+        yield {**found, "seconds_per_path": {label: costs(made, chosen, RATES[0], rounds)}}
