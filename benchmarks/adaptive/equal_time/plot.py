@@ -8,12 +8,19 @@ from benchmarks.pixel_schemes import COLOURS
 from benchmarks.race_plots import draw
 from benchmarks.runner.records import Record
 
+COLUMNS = 4
+"""Axes side by side."""
+
 
 def plot(record: Record) -> Figure:
     """Error over time, one axis per task."""
     entries = record["entries"]
-    figure, axes = plt.subplots(1, len(entries), figsize=(5 * len(entries), 4), squeeze=False, layout="constrained")
-    for axis, (name, entry) in zip(axes[0], entries.items(), strict=True):
+    columns = min(len(entries), COLUMNS)
+    rows = -(-len(entries) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(5 * columns, 4 * rows), squeeze=False, layout="constrained")
+    for axis in axes.flat[len(entries) :]:
+        axis.set_axis_off()
+    for axis, (name, entry) in zip(axes.flat, entries.items(), strict=False):
         for method, runs in timed(entry["methods"], record["seconds_per_path"][name]).items():
             draw(axis, {"runs": runs}, 0, COLOURS[method], f"{method}: {entry['errors'][method][-1]:.3f}")
         axis.set(title=name, xlabel="seconds", ylabel="parameter error / initial", yscale="log")

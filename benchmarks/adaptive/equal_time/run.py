@@ -1,4 +1,4 @@
-"""Pixel mini-batches at equal time (Adaptive Figs 4, 5 and 8): `sun-glossy`, `plain-and-textured`, `two-planets`.
+"""Pixel mini-batches at equal time (Adaptive Figs 4, 5 and 8): `sun-glossy`, `plain-and-textured`, `two-planets`, `mirror-trio`.
 
 Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many
 pixels for all, Adam, the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have
@@ -30,6 +30,7 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2", **FINE}, 2048),
     "plain-and-textured": ("plain-and-textured", FINE, 2048),
     "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 2048),
+    "mirror-trio": ("mirror-trio", {"resolution": 192}, 2048),
     "two-planets, memories": ("two-planets", {}, 2048),
 }
 """Problem, its options, pixels a step."""
