@@ -64,7 +64,9 @@ _TOLERANCE = 2.0
 _LINEAR_MEMORY, _MEMORY = 0.95, 0.97
 """`max_weight` of control variates, for losses whose derivatives are linear and for others, which noise of the image biases."""
 _MOST_NUMBERS, _MOST_MARGINS = 4, 10
-"""Elements of a number or colour that moves as its logarithm; and the distance from its bound that it has at least, in margins."""
+"""Elements of a number or colour; and the distance from its bound of one that moves as its logarithm, at least, in margins."""
+_NUMBER_SHARE = 0.3
+"""Of a tenth of its range, for a number or colour. Too high a rate falls late: what a memory of images repeats looks like agreement."""
 _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
 _CAMERA_SHARE = 0.1
@@ -339,9 +341,14 @@ def _logarithms(problem: Problem) -> dict[str, str]:
         and problem.bounds[key][1] is None
         and key not in problem.learning_rates
         and key not in problem.parameterisations
-        and (value.ndim == _TEXTURE or (value.ndim <= 1 and value.size <= _MOST_NUMBERS))
+        and (value.ndim == _TEXTURE or _is_number(value))
         and (value > low + _MOST_MARGINS * MARGIN).all()
     }
+
+
+def _is_number(value: np.ndarray) -> bool:
+    """Whether it is a single number or a colour."""
+    return value.ndim <= 1 and value.size <= _MOST_NUMBERS
 
 
 def _strength(problem: Problem) -> float:
@@ -359,7 +366,7 @@ def _radius(positions: np.ndarray) -> float:
 def _rates(problem: Problem, share: float) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
     values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
-    residuals and would together go too far. With a parameterisation, that of u which is such a step in the middle or at that size."""
+    residuals and would together go too far; less for numbers with two ends. With a parameterisation, that of u for such a step."""
     found: dict[str, float] = {}
     initial = problem.initial_values()
     materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
@@ -374,6 +381,8 @@ def _rates(problem: Problem, share: float) -> Mapping[str, float]:
             size = _MESH_SHARE * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
             size *= _ALBEDO_SHARE
+        elif _is_number(value) and low is not None and high is not None:
+            size *= _NUMBER_SHARE
         if _NORMALS in key:
             size *= _NORMALS_SHARE
         if key in materials:
