@@ -23,6 +23,7 @@ from unrender.estimators.filtered import FilteredGradientState
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
+from unrender.methods import method
 from unrender.problem.upsampling import SQUARES
 from unrender.runs import loop, multiresolution
 
@@ -379,6 +380,44 @@ def solve(strength: float, size: tuple[int, ...], x: np.ndarray) -> np.ndarray:
         )
     matrix = (scipy.sparse.identity(cells) + strength * laplacian).tocsc()
     return np.asarray(scipy.sparse.linalg.spsolve(matrix, x.ravel())).reshape(x.shape)
+
+
+def test_an_optimizer_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
+    """As those of `Parameter`, with states carried; a parameter's own come first."""
+    estimator = ur.PathGradient(image=rcv(), spp=2)
+    brings = ur.optimizers.ScheduleFree(0.05, coarse_to_fine={KEY: (3, 6)})
+    whole = ur.optimize(problem(None), estimator, brings, steps=8, seed=1)
+    given = problem(ur.CoarseToFine((3, 6), states="carry"))
+    own = ur.optimize(given, estimator, ur.optimizers.ScheduleFree(0.05), steps=8, seed=1)
+    np.testing.assert_array_equal(whole.parameters[KEY], own.parameters[KEY])
+    assert [step["resolution"][KEY] for step in whole.history if "resolution" in step] == [(4, 3), (8, 6), (16, 12)]
+    first = ur.optimize(problem((5,)), estimator, brings, steps=6, seed=1)
+    assert [step["resolution"][KEY] for step in first.history if "resolution" in step] == [(8, 6), (16, 12)]
+
+    ur.optimize(problem(None), estimator, brings, steps=4, seed=1, run_directory=tmp_path / "run", checkpoint_every=1)
+    resumed = ur.resume(tmp_path / "run", problem(None), steps=8)
+    np.testing.assert_array_equal(resumed.parameters[KEY], whole.parameters[KEY])
+
+    small = ur.optimizers.ScheduleFree(0.05, coarse_to_fine={KEY: (3, 6, 9, 12, 15)})
+    with pytest.raises(InputError, match="too small to be coarser 5 times by 2"):
+        ur.optimize(problem(None), estimator, small, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("cells", "steps"), [((16, 16, 16), (8, 20)), ((12, 20, 9), (14,)), ((7, 20, 20), ()), ((16, 16), ())]
+)
+def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: tuple[int, ...]) -> None:
+    truth = np.full((*cells, 1), 0.3)
+    renderer = FieldRenderer(truth)
+    unknown = ur.Parameter(KEY, initial=0.5, bounds=(0, 1))
+    made = ur.Problem(renderer, [unknown], [ur.View(renderer.at(truth.shape).exact({KEY: truth}))])
+    choice = method("auto").choose(made)
+    assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
+    assert choice.optimizer.coarse_to_fine == ({KEY: steps} if steps else {})
+    assert any("coarse to fine" in reason for reason in choice.reasons) == bool(steps)
+    whole = method("auto").choose(made, {"coarse": False}).optimizer
+    assert isinstance(whole, ur.optimizers.ScheduleFree)
+    assert whole.coarse_to_fine == {}
 
 
 @pytest.mark.parametrize("strength", [0.5, 20.0])

@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
 from unrender.methods import auto as module
-from unrender.methods import method
+from unrender.methods import first_rates, method
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
@@ -85,7 +85,7 @@ def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
     found = {fog.format("albedo"): 0.6, fog.format("sigma_t"): 2.0, haze.format("albedo"): 0.6}
     known.initial_values = lambda: {key: np.full((2, 2, 2, 1), value) for key, value in found.items()}
     known.bounds = {key: (0.0, None if "sigma_t" in key else 1.0) for key in found}
-    assert list(module._rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
+    assert list(first_rates.first_rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
 
 
 def test_positive_numbers_move_as_logarithms() -> None:

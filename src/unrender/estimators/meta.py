@@ -125,6 +125,8 @@ class MetaEstimator:
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
         clip: hold α below 1 / (2 − α_{i-1}) (Eq. 17).
+        max_weight: upper bound of α, in (0, 1]; 1 in the paper. Below, noise is forgotten after some 1 / (1 − max_weight) steps. With 1 it
+            lasts as long as the run, and the optimizer cannot average what stays the same from step to step.
         centred: variances about the mean in place of mean squares. For comparison (Fig. 5).
         decouple: divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
         statistics: "shared" estimates variances from the samples that it sums; "independent" from as many more, at twice the cost.
@@ -139,6 +141,7 @@ class MetaEstimator:
     beta_proportional: float = meta.BETA_PROPORTIONAL
     beta_difference: float = meta.BETA_DIFFERENCE
     clip: bool = True
+    max_weight: float = 1.0
     centred: bool = False
     decouple: bool = True
     statistics: Literal["shared", "independent"] = "shared"
@@ -160,6 +163,8 @@ class MetaEstimator:
                 object.__setattr__(self, name, default)
         for name in ("beta_proportional", "beta_difference"):
             checks.number("MetaEstimator", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
+        if not checks.number("MetaEstimator", "max_weight", self.max_weight, above=0.0) <= 1:
+            raise InputError(f"MetaEstimator: max_weight must be in (0, 1], got {self.max_weight!r}")
         for name, choices in (("space", ("auto", "path", "primary")), ("statistics", ("shared", "independent"))):
             if getattr(self, name) not in choices:
                 raise InputError(
@@ -220,6 +225,7 @@ class MetaEstimator:
                 beta_proportional=self.beta_proportional,
                 beta_difference=self.beta_difference,
                 clip=self.clip,
+                max_weight=self.max_weight,
                 centred=self.centred,
                 decouple=self.decouple,
                 observed=None if observed is None else (observed[0][name], observed[1][name]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,6 +23,7 @@ from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Choice, Options, method, parameterised
+from unrender.methods.first_rates import first_rates, logarithms
 from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.averaged_newton import AveragedNewton
@@ -32,7 +32,6 @@ from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
 from unrender.preconditioners import LargeSteps, Sobolev, grid
-from unrender.problem.bounds import MARGIN
 from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
 from unrender.schedules import Exponential, InverseRoot
@@ -43,8 +42,6 @@ _RATE = 0.1
 """Learning rate, as a share of a parameter's range or size."""
 _PATHS, _FEWEST, _MOST = 1 << 15, 2, 16
 """Of a step: so many paths in all views, as far as that is between 2 and 16 samples per pixel."""
-_MESH_SHARE = 4.0
-"""First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
 _VERTICES_PER_STRENGTH, _STRENGTHS = 192, (1.0, 64.0)
 """λ of the large steps of vertices is their number over 192, within limits: steps are smooth over the same share of any mesh, since √λ is a
 number of edges. 13 or so for some 2500; 19 in Nicolet et al. 2021."""
@@ -52,23 +49,10 @@ _MESH_TIME = 15.0
 """Steps after which the rate of vertices is 1/√2 of the first: a shape's first steps are the longest that it bears."""
 _MANY_VIEWS, _MOST_VIEWS = 4, 8
 """Of meshes: from how many views on a step takes half of them, and how many at most."""
-_ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
-"""An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
-product, and the extinction, whose range is open, has further to go."""
-_NORMALS, _NORMALS_SHARE = ".normalmap.", 0.1
-"""A normal map moves by this part of a tenth of its range, or its surface by ten degrees a step, and highlights jump."""
-_TEXELS = ".data"
-"""End of the key of a texture's texels."""
 _TOLERANCE = 2.0
 """κ of `PathGradient`."""
 _LINEAR_MEMORY, _MEMORY = 0.95, 0.97
 """`max_weight` of control variates, for losses whose derivatives are linear and for others, which noise of the image biases."""
-_MOST_NUMBERS, _MOST_MARGINS = 4, 10
-"""Elements of a number or colour; and the distance from its bound of one that moves as its logarithm, at least, in margins."""
-_NUMBER_SHARE = 0.3
-"""Of a tenth of its range, for a number or colour. Too high a rate falls late: what a memory of images repeats looks like agreement."""
-_TEXTURE = 3
-"""Dimensions of a texture, (H, W, C)."""
 _CAMERA_SHARE = 0.1
 """First steps of sensors' poses by path gradients, in units of the world and radians, over `learning_rate`."""
 _IMAGE_PATHS, _FEWEST_IMAGE, _MOST_IMAGE = 1 << 21, 8, 256
@@ -81,6 +65,10 @@ _SIGMA, _STEP = 0.2, 0.5
 """Width of the smoothing of what is perturbed, and its first rate as a share of that."""
 _PERTURBED, _PERTURBED_SPP, _ANNEALING = 16, 2, (25.0, 0.1)
 """Perturbed renders per view and step, their samples per pixel, and half-life and floor of their width."""
+_GRID = 4
+"""Dimensions of a grid, (Z, Y, X, C)."""
+_COARSE: tuple[tuple[int, tuple[int, ...]], ...] = ((16, (8, 20)), (8, (14,)))
+"""Of grids with so many cells along their shortest side: the steps before which their resolution doubles."""
 _MOST_PIXELS = 1 << 19
 """Of all views, that a step renders whole."""
 _DRAWN, _DRAWN_PATHS = 1 << 15, 1 << 17
@@ -105,8 +93,8 @@ class AutoMethod(Options):
     loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
     the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
     steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside
-    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps. Every choice
-    can be set.
+    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps. Grids of
+    volumes are coarse in the first steps. Every choice can be set.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -133,6 +121,7 @@ class AutoMethod(Options):
     smooth: bool = Field(
         True, description="whether textures, grids and values at vertices move along Sobolev gradients"
     )
+    coarse: bool = Field(True, description="whether grids of volumes are coarse in the first steps")
     learning_rate: PositiveFloat = Field(
         _RATE,
         le=1,
@@ -179,7 +168,7 @@ class AutoMethod(Options):
         meshes = tuple(problem.faces)
         image = self._image(problem, _shows_half(problem, sampler), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
-        moved = _logarithms(problem) if self.parameterise else {}
+        moved = logarithms(problem) if self.parameterise else {}
         moved = {key: name for key, name in moved.items() if key not in given}
         problem = problem.reparameterised(moved)
         moved = {
@@ -187,23 +176,29 @@ class AutoMethod(Options):
             for k, p in problem.parameterisations.items()
             if k in problem.coordinates.transforms
         }
-        rates = {**_rates(problem, self.learning_rate), **given}
+        coarse = {} if meshes or not self.coarse else _coarse(problem, smoothed)
+        rates = {**first_rates(problem, self.learning_rate), **given}
         optimizer: Optimizer = ScheduleFree(
             {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
             preconditioner=Sobolev() if smoothed else None,
             preconditioned=smoothed,
             wiener=not isinstance(sampler, pixels.Uniform),
             parameterisations=moved,
+            coarse_to_fine=coarse,
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
         tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
+        coarse_steps = {
+            key: f"twice the resolution from step {' and '.join(map(str, steps))} on" for key, steps in coarse.items()
+        }
         first = grouped({key: f"{rate:.3g}" for key, rate in {**rates, **problem.learning_rates}.items()})
         reasons = (
             f"{kind}, {spp} samples per pixel: {image.reason}",
             drawn,
             f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
             f"Sobolev gradients of {listed(smoothed)}" if smoothed else "",
+            f"coarse to fine: {grouped(coarse_steps)}" if coarse else "",
             *parameterised(problem),
             f"large steps of {listed(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}" if meshes else "",
             f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
@@ -289,6 +284,17 @@ class AutoMethod(Options):
         )
 
 
+def _coarse(problem: Problem, smoothed: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """{key: steps before which the resolution doubles} of grids: a few cells find where there is something with less noise than many. Not
+    of textures, where smoothed gradients do the same; nor where views are dealt to workers, which know one resolution."""
+    known, found = problem.renderer.parameters(), {}
+    for key, shape in problem.shapes().items():
+        ways = [steps for cells, steps in _COARSE if len(shape) == _GRID and min(shape[:-1]) >= cells]
+        if ways and key in smoothed and known[key].resizable and problem.gatherer is None:
+            found[key] = ways[0]
+    return found
+
+
 def _shows_half(problem: Problem, sampler: PixelSampler) -> bool:
     """Whether a step renders all views, or half of them: what was remembered of a view seldom seen is of another mesh."""
     half = isinstance(sampler, pixels.Views) and 2 * sampler.count >= len(problem.views)
@@ -331,69 +337,7 @@ def _refusal(problem: Problem) -> str:
     return ""
 
 
-def _logarithms(problem: Problem) -> dict[str, str]:
-    """{key: "log"} of single numbers, colours and textures that are positive, without an upper bound: radiances, environment maps,
-    extinctions. Not where a learning rate is given, which is in the parameter's units; nor of grids, parts of which may have to be 0."""
-    return {
-        key: "log"
-        for key, value in problem.initial_values().items()
-        if (low := problem.bounds[key][0]) is not None
-        and problem.bounds[key][1] is None
-        and key not in problem.learning_rates
-        and key not in problem.parameterisations
-        and (value.ndim == _TEXTURE or _is_number(value))
-        and (value > low + _MOST_MARGINS * MARGIN).all()
-    }
-
-
-def _is_number(value: np.ndarray) -> bool:
-    """Whether it is a single number or a colour."""
-    return value.ndim <= 1 and value.size <= _MOST_NUMBERS
-
-
 def _strength(problem: Problem) -> float:
     """λ of the large steps of the smallest mesh."""
     fewest = min(problem.initial_values()[key].size // 3 for key in problem.faces)
     return float(np.clip(fewest / _VERTICES_PER_STRENGTH, *_STRENGTHS))
-
-
-def _radius(positions: np.ndarray) -> float:
-    """The root mean square distance of vertices (3 V,) from their mean, 1 where it is 0."""
-    vertices = positions.reshape(-1, 3).astype(np.float64)
-    return float(np.sqrt(np.mean(np.sum(np.square(vertices - vertices.mean(axis=0)), axis=1)))) or 1.0
-
-
-def _rates(problem: Problem, share: float) -> Mapping[str, float]:
-    """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
-    values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
-    residuals and would together go too far; less for numbers with two ends. With a parameterisation, that of u for such a step."""
-    found: dict[str, float] = {}
-    initial = problem.initial_values()
-    materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
-    textures = Counter(materials.values())
-    for key, value in initial.items():
-        low, high = problem.bounds[key]
-        if low is not None and high is not None:
-            size = high - low
-        else:
-            size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
-        if key in problem.faces:
-            size = _MESH_SHARE * _radius(value)
-        if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
-            size *= _ALBEDO_SHARE
-        elif _is_number(value) and low is not None and high is not None:
-            size *= _NUMBER_SHARE
-        if _NORMALS in key:
-            size *= _NORMALS_SHARE
-        if key in materials:
-            size /= math.sqrt(textures[materials[key]])
-        if key in problem.coordinates.transforms:
-            middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
-            size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))
-        found[key] = share * size
-    return found
-
-
-def _owner(key: str) -> str:
-    """Of the texture that a parameter is the data of: its material."""
-    return key.rsplit(".", 2)[0]

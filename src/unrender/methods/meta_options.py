@@ -33,6 +33,12 @@ class MetaCommonOptions(Options):
     beta_difference: FiniteFloat = Field(
         meta.BETA_DIFFERENCE, ge=0, lt=1, description="decay of the mean square of their differences, per step length"
     )
+    max_weight: FiniteFloat = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="upper bound of the weight of the past: 0.9 forgets noise of the gradient after some 10 steps",
+    )
 
     def built_optimizer(self) -> Optimizer:
         """The optimizer with these options."""
@@ -41,4 +47,4 @@ class MetaCommonOptions(Options):
 
     def shared(self) -> dict[str, Any]:
         """The arguments that both forms of `MetaEstimator` take."""
-        return {name: getattr(self, name) for name in ("space", "beta_proportional", "beta_difference")}
+        return {name: getattr(self, name) for name in ("space", "beta_proportional", "beta_difference", "max_weight")}

@@ -11,7 +11,7 @@ from unrender.estimators.base import Estimate
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Choosing", "OnMeshes", "Optimizer", "Preconditioning", "Reparameterising"]
+__all__ = ["Choosing", "OnMeshes", "Optimizer", "Preconditioning", "Refining", "Reparameterising"]
 
 
 class Optimizer(Protocol):
@@ -41,6 +41,16 @@ class Reparameterising(Protocol):
     @property
     def parameterisations(self) -> Mapping[str, Any]:
         """{key: parameterisation, or its name}; keys that the problem does not have, or that have their own, are left out."""
+        ...
+
+
+@runtime_checkable
+class Refining(Protocol):
+    """An optimizer with which parameters that have no resolutions of their own are coarse at first."""
+
+    @property
+    def coarse_to_fine(self) -> Mapping[str, tuple[int, ...]]:
+        """{key: steps before which the resolution doubles}; keys that have their own are left out. States are carried."""
         ...
 
 

@@ -22,6 +22,7 @@ from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
+from unrender.problem.coarse_to_fine import checked_steps
 from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.schedules.functions import Schedule
 
@@ -153,6 +154,7 @@ class ScheduleFree:
         wiener: whether the steps of these parameters are shortened by the share of signal.
         parameterisations: {key: name}, such as "log", of the parameters that move by another variable, whose size tells nothing of how
             far they have come; given to those that have none of their own. See `unrender.parameterisations`.
+        coarse_to_fine: {key: steps before which the resolution doubles}, of those that have no `CoarseToFine` of their own.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -167,6 +169,7 @@ class ScheduleFree:
     preconditioned: tuple[str, ...] = ()
     wiener: bool = True
     parameterisations: Mapping[str, str] = field(default_factory=dict)
+    coarse_to_fine: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -186,6 +189,9 @@ class ScheduleFree:
         named = self.parameterisations
         if not isinstance(named, Mapping) or not all(isinstance(x, str) for pair in named.items() for x in pair):
             raise InputError(f"ScheduleFree: parameterisations must be {{key: name}}, got {named!r:.80}")
+
+        steps = {key: checked_steps("ScheduleFree", given) for key, given in self.coarse_to_fine.items()}
+        object.__setattr__(self, "coarse_to_fine", steps)
 
     @property
     def requires(self) -> Capabilities:

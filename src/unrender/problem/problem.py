@@ -22,6 +22,7 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import notebook
+from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.gatherer import Gatherer
@@ -174,12 +175,8 @@ class Problem:
     def _read_views(self) -> tuple[tuple[View, ...], list[str]]:
         """The views with their pictures, and notices: in memory, or in a file where they are many."""
         sizes, found, notices = self.renderer.resolutions(), [], []
-        known = [
-            math.prod(sizes[v.sensor])
-            for v in self.given_views
-            if isinstance(v.sensor, int) and 0 <= v.sensor < len(sizes)
-        ]
-        store = PictureStore() if 12 * sum(known) > ON_DEVICE else None
+        known = [v.sensor for v in self.given_views if isinstance(v.sensor, int) and 0 <= v.sensor < len(sizes)]
+        store = PictureStore() if 12 * sum(math.prod(sizes[sensor]) for sensor in known) > ON_DEVICE else None
         for number, given in enumerate(self.given_views):
             view, notes = check_view(number, given, sizes)
             found.append(view if store is None else stored(view, store))
@@ -203,7 +200,7 @@ class Problem:
 
     @property
     def as_given(self) -> Problem:
-        """The problem before an optimizer's parameterisations were added (`reparameterised`)."""
+        """The problem before an optimizer's parameterisations, preconditioners or resolutions were added."""
         return self._as_given or self
 
     def reparameterised(self, given: Mapping[str, Any]) -> Problem:
@@ -211,18 +208,22 @@ class Problem:
 
         Raises `InputError` where bounds do not suit.
         """
-        missing = {p.key: given[p.key] for p in self.parameters if p.key in given and p.parameterisation is None}
-        if not missing:
-            return self
-        found = copy.copy(self)
-        found._as_given = self.as_given
-        made = {k: check_parameterisation(g, self.bounds[k], self._initial[k]) for k, g in missing.items()}
-        found.parameters = tuple(
-            replace(p, parameterisation=made[p.key][0]) if p.key in made else p for p in self.parameters
-        )
-        found.parameterisations = self.parameterisations | {key: one for key, (one, _) in made.items()}
-        transforms = {key: transform for key, (_, transform) in made.items() if transform is not None}
+        missing = self._missing("parameterisation", given)
+        checked = {k: check_parameterisation(g, self.bounds[k], self._initial[k]) for k, g in missing.items()}
+        made = {key: one for key, (one, _) in checked.items()}
+        found = self._completed("parameterisation", made)
+        found.parameterisations = self.parameterisations | made
+        transforms = {key: transform for key, (_, transform) in checked.items() if transform is not None}
         found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
+        return found
+
+    def refining(self, given: Mapping[str, CoarseToFine]) -> Problem:
+        """The same problem, parameters with no resolutions of their own coarse at first. Raises `InputError` for what does not suit."""
+        missing = self._missing("coarse_to_fine", given)
+        for key, way in missing.items():
+            way.check(self._initial[key].shape)
+        found = self._completed("coarse_to_fine", missing)
+        found.coarse_to_fine = self.coarse_to_fine | missing
         return found
 
     def topology(self, key: str) -> MeshTopology | None:
@@ -230,21 +231,23 @@ class Problem:
         return mesh_topology(self.renderer.parameters()[key])
 
     def preconditioned(self, given: Mapping[str, Preconditioner]) -> Problem:
-        """The same problem with these preconditioners for the parameters that have none of their own. Raises `InputError` for one that does
-        not suit."""
-        missing = {p.key: given[p.key] for p in self.parameters if p.key in given and p.preconditioner is None}
-        if not missing:
-            return self
+        """The same problem with these preconditioners for parameters that have none. Raises `InputError` for one that does not suit."""
+        missing, known = self._missing("preconditioner", given), self.renderer.parameters()
+        found = self._completed("preconditioner", missing)
+        checked = {k: check_preconditioner(k, p, known[k]) for k, p in missing.items()}
+        found.preconditioners = self.preconditioners | checked
+        found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
+        return found
+
+    def _missing(self, field: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        """What is given for parameters without a `field` of their own."""
+        return {p.key: given[p.key] for p in self.parameters if p.key in given and getattr(p, field) is None}
+
+    def _completed(self, field: str, given: Mapping[str, Any]) -> Problem:
+        """A copy whose parameters have these as `field`; the problem as it was given stays known."""
         found = copy.copy(self)
         found._as_given = self.as_given
-        known = self.renderer.parameters()
-        found.preconditioners = self.preconditioners | {
-            k: check_preconditioner(k, p, known[k]) for k, p in missing.items()
-        }
-        found.parameters = tuple(
-            replace(p, preconditioner=missing[p.key]) if p.key in missing else p for p in self.parameters
-        )
-        found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
+        found.parameters = tuple(replace(p, **{field: given[p.key]}) if p.key in given else p for p in self.parameters)
         return found
 
     def remeshed(self, meshes: Mapping[str, ReplacedMesh]) -> Problem:

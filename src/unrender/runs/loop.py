@@ -15,8 +15,9 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.coordinates import by_coordinates, regularized
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Preconditioning, Reparameterising
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Preconditioning, Refining, Reparameterising
 from unrender.problem.bounds import project
+from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
 from unrender.runs.mesh_guard import guarded
@@ -96,6 +97,9 @@ def prepare(
         problem = problem.reparameterised(optimizer.parameterisations)
     if isinstance(optimizer, Preconditioning):
         problem = problem.preconditioned(optimizer.preconditioners)
+    if isinstance(optimizer, Refining):
+        ways = {key: CoarseToFine(tuple(steps), states="carry") for key, steps in optimizer.coarse_to_fine.items()}
+        problem = problem.refining(ways)
     if isinstance(optimizer, OnMeshes):
         optimizer = optimizer.on_meshes(problem.topology)
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})

@@ -102,6 +102,7 @@ def update(
     beta_proportional: float = BETA_PROPORTIONAL,
     beta_difference: float = BETA_DIFFERENCE,
     clip: bool = True,
+    max_weight: float = 1.0,
     centred: bool = False,
     decouple: bool = True,
     observed: tuple[Array, Array] | None = None,
@@ -116,6 +117,7 @@ def update(
         beta_proportional: β_F of Eq. 9, in [0, 1).
         beta_difference: β_Δ of Eq. 13, in [0, 1).
         clip: hold α below Eq. 17.
+        max_weight: upper bound of α, in (0, 1]; 1 in the paper. Below, an error is forgotten after some 1 / (1 − max_weight) steps.
         centred: take variances about the mean in place of mean squares. For comparison (Fig. 5): unreliable.
         decouple: divide differences by the step before averaging (Eq. 13). For comparison.
         observed: (F, ΔF) to estimate the variances from in place of those that are summed; independent ones leave M unbiased.
@@ -127,7 +129,7 @@ def update(
     state, var_f, var_d, var_m, started = _observe(
         state, *seen, step_norm, beta_proportional, beta_difference, centred, decouple
     )
-    alpha = _bounded_alpha(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip)
+    alpha = _bounded_alpha(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip, max_weight)
     gradient = advance(state.gradient, proportional, proportional - difference, alpha)
     return _next(state, gradient, meta_variance(alpha, var_f, var_m, var_d), alpha, var_f)
 
@@ -141,6 +143,7 @@ def update_coupled(
     beta_proportional: float = BETA_PROPORTIONAL,
     beta_difference: float = BETA_DIFFERENCE,
     clip: bool = True,
+    max_weight: float = 1.0,
     centred: bool = False,
     decouple: bool = True,
     observed: tuple[Array, Array] | None = None,
@@ -159,7 +162,7 @@ def update_coupled(
         state, F, F - H, step_norm, beta_proportional, beta_difference, centred, decouple
     )
     cov = arrays.maximum(var_f - 0.5 * var_d, 0.0)
-    alpha = _bounded_alpha(state, control_weight(cov, var_f, var_m), var_f, started, clip)
+    alpha = _bounded_alpha(state, control_weight(cov, var_f, var_m), var_f, started, clip, max_weight)
     gradient = advance(state.gradient, current, previous, alpha)
     return _next(state, gradient, control_variate_variance(alpha, var_f, var_f, cov, var_m), alpha, var_f)
 
@@ -235,11 +238,11 @@ def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     )  # below is rounding error of equal samples in single precision
 
 
-def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool) -> Array:
-    """α of this step: 0 at the first; bounded by Eq. 17 where all samples were zero, and everywhere with `clip`."""
+def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool, max_weight: float) -> Array:
+    """α of this step: 0 at the first; bounded by Eq. 17 where all samples were zero, and everywhere with `clip`; at most `max_weight`."""
     bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
     alpha = arrays.where(var_f > 0.0, alpha, bound)
-    return (arrays.minimum(alpha, bound) if clip else alpha) * started
+    return arrays.minimum(arrays.minimum(alpha, bound) if clip else alpha, max_weight) * started
 
 
 def _next(
