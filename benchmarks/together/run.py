@@ -4,7 +4,7 @@ The ingredients: a memory of images (recursive control variates), a memory of gr
 the gradient's variance is, and, where there is a pose, perturbed renders for that alone (`HybridGradient`); without, it has path
 gradients like the textures. The third is mini-batches of pixels (`Adaptive()`) or, with a memory of images, which learns from whole
 views, numbers of samples (`AdaptiveCounts`, three a pixel on average, its least). Sixteen combinations where there is a pose, eight
-elsewhere. Otherwise two samples a pixel; primary space where there is a pose, else path space. Adam, or MetaAdam with a memory of
+elsewhere. Memories forget after some 20 steps (images) and 5 (gradients). Otherwise two samples a pixel; primary space where there is a pose, else path space. Adam, or MetaAdam with a memory of
 gradients; the learning rate of each combination is tuned on a seed of its own at the whole budget; that of a pose is a tenth of
 the smoothing's width. The budget is of processor time, of all threads of the process, which other work on the machine changes
 little, twice as much where there is a pose. The error is each parameter's RMSE relative to where it began, averaged over parameters,
@@ -51,6 +51,8 @@ POSE_RATE, POSE_TIME = 0.1, 2.0
 """Learning rate of a pose as a share of its sigma; the budget where there is one, over that of the others."""
 RATES, META_RATES = (0.01, 0.02), (0.002, 0.004)
 SPP, COUNTED_SPP, SAMPLES = 2, 3, 8
+IMAGE_MEMORY, GRADIENT_MEMORY = 0.95, 0.8
+"""Greatest weights of the past: some 20 and 5 steps."""
 MERGE = ("problems.*.methods",)
 QUICK = {
     "problem": ("mug, label", "caustic"),
@@ -103,13 +105,13 @@ def estimator(problem: ur.Problem, combination: tuple[bool, ...], sigma: float) 
     poses = pose_keys(problem)
     image = ur.images.Plain()
     if images:
-        image = ur.images.RecursiveControlVariate("primary" if poses else "path")
+        image = ur.images.RecursiveControlVariate("primary" if poses else "path", max_weight=IMAGE_MEMORY)
     sampler, spp = ur.pixels.All(), SPP
     if pixels:
         sampler, spp = (ur.pixels.AdaptiveCounts(), COUNTED_SPP) if images else (ur.pixels.Adaptive(), SPP)
     path: Any = ur.PathGradient(image, sampler, spp)
     if gradients:
-        path = ur.MetaEstimator(coupled=True, spp=spp, image=image, pixels=sampler)
+        path = ur.MetaEstimator(coupled=True, spp=spp, image=image, pixels=sampler, max_weight=GRADIENT_MEMORY)
     if not perturbed:
         return path
     annealed = ur.schedules.Exponential(25, 0.1)

@@ -429,6 +429,8 @@ def test_meta_refuses_what_makes_no_sense() -> None:
         {"difference_spp": 1.5},
         {"spp": True},
         {"beta_difference": 1.0},
+        {"max_weight": 0.0},
+        {"max_weight": 1.5},
         {"space": "pixel"},
     ]
     for bad in refused:

@@ -67,6 +67,23 @@ def test_without_change_it_is_the_average(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_a_bounded_weight_forgets_exponentially(form: str) -> None:
+    """Of samples as above: the weight of the past ends at its bound, M is their exponentially weighted mean, and its variance that of one."""
+    rng, most = np.random.default_rng(1), 0.8
+    F = rng.choice([-1.0, 1.0], (80, 7))
+    state, mean = meta.init(F[0]), F[0]
+    for i in range(len(F)):
+        second = np.zeros(7) if form == "independent" else F[i]
+        gradient, variance, alpha, state = FORMS[form](state, F[i], second, 0.1, max_weight=most)
+        weight = min(i / (i + 1), most)
+        mean = weight * mean + (1 - weight) * F[i]
+        np.testing.assert_allclose(alpha, weight, rtol=1e-12)
+        np.testing.assert_allclose(gradient, mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(variance, (1 - most) / (1 + most), rtol=1e-6)
+    assert np.abs(gradient - F.mean(0)).max() > 0.1
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_an_element_that_was_only_zero_counts_its_zeros(form: str) -> None:
     """As a texel that no path met in nine steps: its first sample is one tenth of a mean, its variance that of ten."""
     state = meta.init(np.zeros(1))
