@@ -5,10 +5,10 @@ the gradient's variance is, and, where there is a pose, perturbed renders for th
 gradients like the textures. The third is mini-batches of pixels (`Adaptive()`) or, with a memory of images, which learns from whole
 views, numbers of samples (`AdaptiveCounts`, three a pixel on average, its least). Sixteen combinations where there is a pose, eight
 elsewhere. Memories forget after some 20 steps (images) and 5 (gradients). Otherwise two samples a pixel; primary space where there is a
-pose, else path space. Adam, or MetaAdam with a memory of gradients; the learning rate of each combination is tuned on a seed of its own at the whole budget; that of a pose is a tenth of
-the smoothing's width. The budget is of processor time, of all threads of the process, which other work on the machine changes
-little, twice as much where there is a pose. The error is each parameter's RMSE relative to where it began, averaged over parameters,
-at the end of the budget: median over seeds.
+pose, else path space. Adam, or MetaAdam with a memory of gradients; the learning rate of each combination is tuned on a seed of its own
+at the whole budget; that of a pose is a tenth of the smoothing's width. The budget is of processor time, of all threads of the process,
+which other work on the machine changes little, twice as much where there is a pose. The error is each parameter's RMSE relative to where
+it began, averaged over parameters, at the end of the budget: median over seeds.
 
 Poses: the angle of `mug` with an unknown label; the place of the pot in `ajar`, beside its three textures, in light that comes
 round a corner; with assets, the place of the published tray beside its base colour.
