@@ -35,7 +35,10 @@ def cells(count: int, resolution: int) -> dict[str, Any]:
     """A row of compartments, each with a lamp of its own on its ceiling, of powers from 1 to 100; the camera sees into two of them. The
     floors of these two are the unknown."""
     random = np.random.default_rng(1)
-    scene: dict[str, Any] = {"type": "scene", "camera": parts.camera((1.0, 0.6, 4.2), (1.0, 0.4, 0.0), 34.0, resolution)}
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "camera": parts.camera((1.0, 0.6, 4.2), (1.0, 0.4, 0.0), 34.0, resolution),
+    }
     for cell in range(count):
         x = float(cell)
         scene[f"wall{cell}"] = parts.rectangle((x, 0.5, 0.5), (0, 0, 1), (0, 0.6, 0), parts.twosided(WHITE))
@@ -126,9 +129,7 @@ def problem(name: str, resolution: int = 48, reference_spp: int = 2048) -> ur.Pr
     starts = [
         ur.Parameter(key, np.full(truth[key].shape, 0.5) if key.endswith("data") else 0.7 * truth[key]) for key in keys
     ]
-    return ur.Problem(
-        lambda: scene(resolution), starts, [ur.View(reference)], max_depth=5, truth=truth, name=name
-    )
+    return ur.Problem(lambda: scene(resolution), starts, [ur.View(reference)], max_depth=5, truth=truth, name=name)
 
 
 def powers(problem: ur.Problem) -> np.ndarray:

@@ -17,7 +17,7 @@ from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.uniform_share import SHARES, ShareEvidence
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import SQUARES, Upsampler
-from unrender.rendering.renderer import EmitterMoments, EmitterSession, RenderSession
+from unrender.rendering.renderer import EmitterMoments, RenderSession, drawing_emitters
 
 __all__ = [
     "EmitterRequest",
@@ -112,10 +112,8 @@ def init(owner: str, problem: Problem, session: RenderSession) -> EmitterState |
     """
     if problem.gatherer is not None:
         raise InputError(f'{owner}: emitters="adaptive" cannot be dealt to workers; leave emitters="scene"')
-    if not isinstance(session, EmitterSession):
-        raise InputError(f'{owner}: emitters="adaptive" needs a renderer that draws emitters; leave emitters="scene"')
     try:
-        start = session.emitters()
+        start = drawing_emitters(session).emitters()
     except InputError as error:
         raise InputError(f'{owner}: emitters="adaptive": {error}; leave emitters="scene"') from error
     return EmitterState(start, 0, np.zeros(len(start))) if (start > 0).sum() > 1 else None
@@ -151,7 +149,6 @@ def connections(
         weights: of the adjoint, the loss derivative at the image of the other groups, (groups, ...).
         spp: S.
     """
-    assert isinstance(session, EmitterSession)
     images = found.fresh_others()
     groups = int(arrays.shape(images)[0])
     moments = session.tangent_moment(parameters, found.paths, tangents)
@@ -160,7 +157,7 @@ def connections(
     slope = _variance(weights) / arrays.maximum(variance, floor)
     of_pixels = slope * arrays.mean_over_first(moments) * (groups / (spp * (groups - 1.0)))
     noise = arrays.sqrt(weights * 0.0 + arrays.add_first_axis(of_pixels))
-    return session.emitter_moments(parameters, found.paths, tangents, weights, noise)
+    return drawing_emitters(session).emitter_moments(parameters, found.paths, tangents, weights, noise)
 
 
 def _variance(images: Array) -> Array:

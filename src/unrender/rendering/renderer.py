@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "StockRenderer",
     "counted_vertices",
     "differentiated",
+    "drawing_emitters",
 ]
 
 Space = Literal["path", "primary"]
@@ -231,6 +233,13 @@ class EmitterSession(Protocol):
         over connections and elements.
         """
         ...
+
+
+def drawing_emitters(session: RenderSession) -> EmitterSession:
+    """The session, where it is an `EmitterSession`. Raises `InputError` where it is none."""
+    if not isinstance(session, EmitterSession):
+        raise InputError("what renders these parameters draws emitters in its own way alone")
+    return session
 
 
 def counted_vertices(session: RenderSession, parameters: Tree, request: SampleRequest) -> Array:

@@ -6,6 +6,8 @@ probabilities that change are tables, and the scene's own weights stay as they a
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -57,4 +59,6 @@ def connection_moments(scene: mi.Scene, values: mi.Float, emitters: mi.UInt32) -
 
 
 def _ids(scene: mi.Scene) -> np.ndarray:
-    return dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy().astype(np.int64)  # pyright: ignore[reportAttributeAccessIssue]
+    pointers: Any = scene.emitters_dr()
+    found: Any = dr.reinterpret_array(mi.UInt32, pointers)
+    return found.numpy().astype(np.int64)

@@ -272,9 +272,9 @@ class ConnectionsPass(Pass):
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """`own`: the radiance that the primal pass returned, and images' worth of weights, of the derivatives and of the radiance."""
-        radiance, *weights = own
-        of_lanes = (film.film_adjoint(each, size.spp, size.pixels) for each in weights)
-        return paths.connections(radiance, *of_lanes, self.bounces)
+        radiance, *given = own
+        weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in given)
+        return paths.connections(radiance, weights, noise, self.bounces)
 
 
 @dataclass(frozen=True)

@@ -281,7 +281,8 @@ class PathPair:
         Le, Ld, value = parts
         with dr.resume_grad():
             # Le is of no account; but Dr.Jit wants all that is attached within an iteration to be traversed in it.
-            _, δLd, δlogf = dr.forward_to(Le, Ld, relative(value))
+            tangents: Any = dr.forward_to(Le, Ld, relative(value))
+            _, δLd, δlogf = tangents
         Ld = dr.detach(Ld)
         record.write(path.depth, connection.emitter, Ld, δLd + Ld * path.δlogβ, connection.active)
         path.δlogβ += δlogf
