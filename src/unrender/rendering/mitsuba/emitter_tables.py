@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import EmitterMoments
 
@@ -41,7 +42,12 @@ def emitter_tables(scene: mi.Scene, probabilities: np.ndarray) -> dict[str, mi.U
     cdf[last + 1 :] = 1.0
     pmf = np.zeros(int(ids.max(initial=0)) + 1, np.float32)
     pmf[ids] = np.diff(cdf)  # of what is drawn, to the last bit
-    return {"emitter_cdf": mi.Float(cdf), "emitter_ids": mi.UInt32(ids), "emitter_pmf": mi.Float(pmf)}
+    numbers = arrays.owned(ids.astype(np.uint32), mi.UInt32)
+    return {
+        "emitter_cdf": arrays.owned(cdf, mi.Float),
+        "emitter_ids": numbers,
+        "emitter_pmf": arrays.owned(pmf, mi.Float),
+    }
 
 
 def connection_moments(scene: mi.Scene, values: mi.Float, emitters: mi.UInt32) -> EmitterMoments:

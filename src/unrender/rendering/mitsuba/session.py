@@ -18,7 +18,7 @@ from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
-from unrender.rendering.mitsuba.emitter_tables import connection_moments, emitter_tables, own_probabilities
+from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
@@ -372,7 +372,7 @@ class MitsubaSession:
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
         if request.emitters is not None and len(self.emitters()) > 1:
-            tables = {**tables, **emitter_tables(pair.loaded(task.previous).scene, request.emitters)}
+            tables = {**tables, **pair.emitter_tables(task.previous, request.emitters)}
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
