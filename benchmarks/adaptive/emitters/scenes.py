@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import mi
+from benchmarks.internals import mi, stock_scene
 from unrender.gallery import parts
 
 GREY, WHITE, BLACK = parts.diffuse(0.5), parts.diffuse(0.7), parts.diffuse(0.0)
-LIGHTS = ("chalice", "mirror-trio", "glossy-room", "caustic")
-"""Of the gallery, with several emitters."""
+GALLERY = ("mirror-trio", "chalice", "glossy-room", "caustic")
+"""Problems with several emitters."""
 
 
 def _texture(side: int, value: np.ndarray | float) -> dict[str, Any]:
@@ -135,8 +135,6 @@ def problem(name: str, resolution: int = 48, reference_spp: int = 2048) -> ur.Pr
 def powers(problem: ur.Problem) -> np.ndarray:
     """The power of each emitter of the scene, in its order, sum 1, (E,): π A L of areas, 4 π I of points, 4 π² r² L of what surrounds a
     scene with the radius r, for means L and I over directions and colours."""
-    from benchmarks.internals import stock_scene
-
     scene, _ = stock_scene(problem)
     radius = float(np.linalg.norm(np.array(scene.bbox().max) - np.array(scene.bbox().min))) / 2
     found = []
