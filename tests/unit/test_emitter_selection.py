@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import unrender as ur
 from unrender.core.errors import InputError
-from unrender.estimators.emitter_selection import EmitterState, learned
+from unrender.estimators.emitter_selection import EmitterState, connections, learned
+from unrender.images.base import ImageEstimate
 from unrender.methods.base import method
 from unrender.pixels.uniform_share import MOST, SHARES
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.rendering.renderer import EmitterMoments
+from unrender.rendering.renderer import EmitterMoments, RenderSession
 
 MOMENTS = np.array([4.0, 1.0, 0.25, 0.0])
 
@@ -110,3 +112,39 @@ def test_methods_with_path_gradients_take_it() -> None:
         assert estimator.emitters == "adaptive"
         with pytest.raises(InputError, match="scene or adaptive"):
             method(name).start({"emitters": "power"})
+
+
+class Recorder:
+    """A session that keeps what it is asked, and knows the second moments of its pixels."""
+
+    def __init__(self, moments: np.ndarray):
+        self.moments = moments
+        self.asked: tuple[np.ndarray, np.ndarray] | None = None
+
+    def tangent_moment(self, parameters: Any, paths: Any, tangents: Any) -> np.ndarray:
+        return self.moments
+
+    def emitters(self) -> np.ndarray:
+        return np.full(2, 0.5)
+
+    def emitter_moments(self, parameters: Any, paths: Any, tangents: Any, weights: Any, noise: Any) -> EmitterMoments:
+        self.asked = weights, noise
+        return EmitterMoments(np.ones(2), np.ones(2))
+
+
+def test_noise_counts_by_the_derivatives_of_the_other_groups() -> None:
+    """n² = h² B / n, for h = ∂(loss derivative)/∂I: of L2 the same in every pixel whose variance is above the floor."""
+    rng = np.random.default_rng(0)
+    images, moments = rng.uniform(0.5, 1.5, (4, 3, 5, 3)), rng.uniform(0, 1, (4, 3, 5, 3))
+    found, session = ImageEstimate(images, None), Recorder(moments)
+    weights = 0.7 * (found.others() - 0.2)
+    connections(cast("RenderSession", session), {}, {"x": 1.0}, found, weights, 8)
+    assert session.asked is not None
+    assert session.asked[0] is weights
+    others = (moments.sum(axis=0) - moments) / 3
+    clear = np.var(found.others(), axis=0) > 0.1 * np.var(found.others(), axis=0).mean()
+    assert clear.mean() > 0.8
+    expected = np.sqrt(0.7**2 * others / 6)
+    np.testing.assert_allclose(session.asked[1][:, clear], expected[:, clear], rtol=1e-6)
+    own = np.sqrt(0.7**2 * moments / 6)
+    assert np.abs(session.asked[1][:, clear] / own[:, clear] - 1).max() > 0.1, "a planted error went unseen"

@@ -22,7 +22,7 @@ from benchmarks.adaptive.emitters import scenes
 from benchmarks.adaptive.over_uniform.run import Kept, spread
 from benchmarks.internals import Key, Tree, dr, element_scales, gradient_of
 
-STEPS = (1, 5, 20, 60)
+STEPS = (1, 20, 60)
 """At which the variance is measured: those done before."""
 MERGE = ("problems.*",)
 QUICK = {
@@ -114,7 +114,7 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
 
 def run(
     problem: tuple[str, ...] = (*scenes.OWN, *scenes.GALLERY),
-    runs: int = 160,
+    runs: int = 96,
     spp: int = 4,
     resolution: int = 48,
     reference_spp: int = 2048,

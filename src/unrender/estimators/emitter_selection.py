@@ -12,7 +12,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate
+from unrender.images.base import ImageEstimate, leave_one_out
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.uniform_share import SHARES, ShareEvidence
 from unrender.problem.problem import Problem
@@ -139,7 +139,8 @@ def connections(
         y = (∂L/∂I_j Σ_k v_k ∂f/∂θ_k)² / S² + h_j² B_j f² / (S² n),
 
     for S samples of the pixel, of which n make the image of the other groups: what f² changes in the product of both factors' second
-    moments. h_j² is the variance over groups of the loss derivative over that of the image, so that a control variate counts.
+    moments. B_j is of the other groups, as the loss derivative is: with the connection's own, bright paths would count by their fourth
+    power. h_j² is the variance over groups of the loss derivative over that of the image, so that a control variate counts.
 
     Args:
         session: of the frame's paths.
@@ -155,8 +156,7 @@ def connections(
     variance = _variance(images)
     floor = arrays.mean(variance) * _LEAST_VARIANCE + 1e-30
     slope = _variance(weights) / arrays.maximum(variance, floor)
-    of_pixels = slope * arrays.mean_over_first(moments) * (groups / (spp * (groups - 1.0)))
-    noise = arrays.sqrt(weights * 0.0 + arrays.add_first_axis(of_pixels))
+    noise = arrays.sqrt(leave_one_out(moments) * slope * (groups / (spp * (groups - 1.0))))
     return drawing_emitters(session).emitter_moments(parameters, found.paths, tangents, weights, noise)
 
 
