@@ -58,7 +58,7 @@ def adaptive(**options: Any) -> ur.PathGradient:
     return ur.PathGradient(**{"spp": 4, "emitters": "adaptive", **options})
 
 
-def estimates(asked: ur.Problem, estimator: ur.PathGradient, count: int, first: int = 0) -> tuple[np.ndarray, Any]:
+def estimates(asked: ur.Problem, estimator: Any, count: int, first: int = 0) -> tuple[np.ndarray, Any]:
     """(count, n) gradients at the start, and the state after them."""
     at = asked.initial()
     state, found = estimator.init(asked, at), []
@@ -116,6 +116,7 @@ def test_gradients_are_unbiased(name: str) -> None:
     assert (np.abs(1.3 * mine.mean(axis=0) - plain.mean(axis=0)) / error).max() > limit, "a planted error went unseen"
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_one_emitter_leaves_nothing_to_choose() -> None:
     asked = problem(1)
     mine, state = estimates(asked, adaptive(), 2)
@@ -150,6 +151,7 @@ def test_the_scene_s_sampling_weights_are_where_it_starts() -> None:
     assert state.emitters.probabilities[2] == 0
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("name", quick(list(CASES), "control variate, pixels"))
 def test_a_state_that_was_packed_goes_on_as_it_was(name: str) -> None:
     asked, at = problem(3), problem(3).initial()
@@ -238,3 +240,11 @@ def test_unknown_exposures_keep_it() -> None:
     )
     _, state = estimates(exposed, adaptive(), 6)
     assert state.emitters.probabilities[0] > 0.3
+
+
+def test_beside_perturbed_renders_it_looks_at_the_parameters_of_paths() -> None:
+    lamp = "lamp0.emitter.radiance.value"
+    smoothed = ur.SmoothedDerivatives(0.3, samples=4)
+    asked = problem(4, keys=(FLOOR, lamp))
+    _, state = estimates(asked, ur.HybridGradient(adaptive(), smoothed, keys=(lamp,)), 6)
+    assert state.path.emitters.probabilities[0] > 0.3
