@@ -62,7 +62,9 @@ class EmitterState:
 
     The probabilities of the E emitters are p = λ u + (1 - λ) q with q ∝ √M, for u, the scene's own, and the second moment M of what
     connections to each emitter add. Of connections that are drawn by p, the second moment of the gradient is Σ_e M_e / p_e plus what no
-    probability changes, and that q minimises it. Since p >= λ u, it is at most 1 / λ times that under u.
+    probability changes, and that q minimises it. Since p >= λ u, each of the two factors of a gradient, the loss derivative and the
+    pixel's, has at most 1 / λ times the second moment that it has under u. Where paths sampled by the BSDF find an emitter, too, MIS
+    weights change with p, which M leaves out: then q is near the best, and the bound holds approximately.
 
     Attributes:
         start: u, (E,).
