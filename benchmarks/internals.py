@@ -19,6 +19,7 @@ from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimator
+from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import gather
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
@@ -242,9 +243,18 @@ def second_moments(
     return found
 
 
-def gradient_of(problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2) -> list[np.ndarray]:
-    """The gradient from a pixel mini-batch, in the coordinates of the descent."""
-    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch)
+def gradient_of(
+    problem: ur.Problem,
+    parameters: Tree,
+    batch: Any,
+    key: Key,
+    spp: int = 2,
+    emitters: np.ndarray | None = None,
+) -> list[np.ndarray]:
+    """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
+    for the scene's own."""
+    request = None if emitters is None else EmitterRequest(emitters, {})
+    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request)
     coordinates = problem.coordinates
     moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
     return [arrays.numpy(value) for value in moved.values()]

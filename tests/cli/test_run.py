@@ -98,6 +98,20 @@ def test_run_of_the_gallery_s_problem_without_a_renderer(unrender, problem: Path
     assert "rate error 1 before, 0.0" in " ".join(answer.out.split())
 
 
+def test_run_takes_emitters_by_the_gradient_s_variance(unrender, problem: Path, mitsuba_variant: str):
+    scene = problem.parent / "wall.xml"
+    two = '<emitter type="constant"/><emitter type="point"><point name="position" value="0, 0, 1"/></emitter>'
+    scene.write_text(scene.read_text().replace('<emitter type="constant"/>', two))
+    words = ["run", "problem.toml", "--method", "plain", "--steps", 3, "--out", "result", "--variant", mitsuba_variant]
+    answer = unrender(*words, *QUICK, "-s", "emitters=adaptive")
+    assert answer.status == 0, answer.error
+    record = json.loads((problem.parent / "result" / "run.json").read_text())
+    assert record["settings"]["options"]["emitters"] == "adaptive"
+    wrong = unrender(*words, "-s", "emitters=power")
+    assert wrong.status == 2
+    assert "option emitters: expected scene or adaptive, got 'power'" in wrong.error
+
+
 def test_run_names_a_new_folder_each_time(unrender, problem: Path, mitsuba_variant: str):
     for _ in range(2):
         words = ["run", "problem.toml", "--method", "plain", "--set", "steps=1", "--variant", mitsuba_variant, *QUICK]

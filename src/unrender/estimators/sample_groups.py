@@ -3,6 +3,8 @@ two on one set of paths."""
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -14,7 +16,9 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.estimators import emitter_selection
 from unrender.estimators.damping import damping, smoothed_variance
+from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
@@ -22,7 +26,7 @@ from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView, whole_views
 from unrender.problem.problem import Problem
 from unrender.problem.sample_counts import SampleCounts
-from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
 
 __all__ = [
     "PIXELS",
@@ -61,6 +65,7 @@ class GradientSample:
         info: for people, {name: {view: array}}: of the image estimator for whole views, and of the pixels' probabilities.
         image: the image estimator's next state.
         draws: what the samples of a pixel mini-batch tell of its pixels; None where it was not asked for.
+        connections: what its connections to emitters tell; None where it was not asked for.
     """
 
     gradient: Tree
@@ -72,6 +77,7 @@ class GradientSample:
     info: dict[str, dict[int, Any]]
     image: Any
     draws: DrawStatistics | None = None
+    connections: EmitterMoments | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,7 @@ class GatherRequest:
         batch: the pixels; None for whole views.
         tolerance: see `PathGradient`.
         fresh: whether the gradient of this step's samples alone is wanted, too.
+        emitters: the probabilities of emitters; None for the scene's own.
     """
 
     parameters: Tree
@@ -99,6 +106,7 @@ class GatherRequest:
     batch: MiniBatch | None = None
     tolerance: float = 0.0
     fresh: bool = False
+    emitters: EmitterRequest | None = None
 
     @property
     def tangents(self) -> Tree:
@@ -157,6 +165,7 @@ def gather(
     batch: MiniBatch | None = None,
     tolerance: float = 0.0,
     fresh: bool = False,
+    emitters: EmitterRequest | None = None,
 ) -> GradientSample:
     """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
 
@@ -167,12 +176,16 @@ def gather(
 
     Where the problem's views are dealt to workers, they do it (`Problem.gatherer`).
     """
-    request = GatherRequest(parameters, image, state, spp, key, adjoint_spp, pair_request, batch, tolerance, fresh)
+    request = GatherRequest(
+        parameters, image, state, spp, key, adjoint_spp, pair_request, batch, tolerance, fresh, emitters
+    )
     if problem.gatherer is not None:
         return problem.gatherer.gather(request)
     sample = batch.sample if batch else None
     shares = batch.shares if batch else None
-    frames = [PixelBatch(problem, sample)] if sample is not None else whole_views(problem, shares, spp)
+    likely = None if emitters is None else emitters.probabilities
+    whole = sample is None
+    frames = whole_views(problem, shares, spp, likely) if whole else [PixelBatch(problem, sample, likely)]
     parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
@@ -181,6 +194,7 @@ def gather(
             images[frame.view] = part.image
             for name, value in part.info.items():
                 info.setdefault(name, {})[frame.view] = value
+    told = [part.connections for part in parts if part.connections is not None]
     return GradientSample(
         gradient=_sum([part.gradient for part in parts]),
         previous=_sum([part.previous for part in parts]),
@@ -191,6 +205,7 @@ def gather(
         info=info,
         image=_image_state(problem, request, sample, parts),
         draws=_joined([part.draws for part in parts if part.draws is not None]),
+        connections=functools.reduce(operator.add, told) if told else None,
     )
 
 
@@ -235,6 +250,7 @@ class FrameGradient:
     info: Mapping[str, Any]
     kept: Any
     draws: DrawStatistics | None = None
+    connections: EmitterMoments | None = None
 
 
 def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Key) -> FrameGradient:
@@ -275,7 +291,10 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
         draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, request.tangents))
     elif request.tangents and counts is not None:
         draws = _view_statistics(counts, weights, session.tangent_moment(parameters, paths, request.tangents))
-    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws)
+    told = None
+    if request.emitters is not None and request.emitters.tangents:
+        told = emitter_selection.connections(session, parameters, request.emitters.tangents, found, weights, spp)
+    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws, told)
 
 
 def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:

@@ -15,7 +15,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import Space
 
-__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "variance_of_mean"]
+__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "leave_one_out", "variance_of_mean"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ImageEstimate:
         return self._left_out(self.previous)
 
     def _left_out(self, images: Array) -> Array:
-        return self._filtered(_leave_one_out(images)) if self.counts is None else self.counts.others(images)
+        return self._filtered(leave_one_out(images)) if self.counts is None else self.counts.others(images)
 
     def _filtered(self, images: Array) -> Array:
         if self.filter is None:
@@ -82,7 +82,8 @@ def variance_of_mean(images: Array, counts: SampleCounts | None = None) -> Array
     return arrays.maximum(square - mean * mean, 0.0) / (groups - 1)
 
 
-def _leave_one_out(images: Array) -> Array:
+def leave_one_out(images: Array) -> Array:
+    """Of images (groups, ...), for each group the mean of all others; the same where there is one group."""
     groups = images.shape[0]
     return images if groups == 1 else (arrays.mean_over_first(images) * groups - images) / (groups - 1)
 

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
 
 from unrender.estimators.base import Estimator
+from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient
 from unrender.images.base import ImageEstimator
 from unrender.images.denoised import Denoised
@@ -16,7 +17,9 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 
-__all__ = ["AdamOptions", "PathOptions"]
+__all__ = ["EMITTERS_HELP", "AdamOptions", "PathOptions"]
+
+EMITTERS_HELP = "which of several lights a connection takes: by the scene's weights, or by the gradient's variance"
 
 
 class AdamOptions(Options):
@@ -42,9 +45,11 @@ class PathOptions(AdamOptions):
     counts: Literal["equal", "adaptive"] = Field(
         "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
     )
+    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
     denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
-        return PathGradient(Denoised(image) if self.denoise else image, sampler, self.spp, self.adjoint_spp)
+        seen = Denoised(image) if self.denoise else image
+        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, emitters=self.emitters)

@@ -9,10 +9,11 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from unrender import pixels
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
+from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import AdamOptions
+from unrender.methods.adam_options import EMITTERS_HELP, AdamOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 
@@ -39,12 +40,13 @@ class AdaptiveMethod(AdamOptions):
     image: Literal["plain", "rcv"] = Field(
         "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
     )
+    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
-        return PathGradient(image, self._sampler(), self.spp), self.optimizer()
+        return PathGradient(image, self._sampler(), self.spp, emitters=self.emitters), self.optimizer()
 
     def _sampler(self) -> PixelSampler:
         guided: dict[str, Any] = {"refresh": self.refresh}

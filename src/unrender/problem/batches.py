@@ -60,12 +60,13 @@ class WholeView:
     """All pixels of one view: images (H, W, 3).
 
     With `counts` each pixel has a number of samples of its own. These are images of one group then, (1, N, 3), and so are the
-    derivatives, each divided by its pixel's number of samples.
+    derivatives, each divided by its pixel's number of samples. `emitters`: see `SampleRequest`.
     """
 
     problem: Problem
     view: int
     counts: SampleCounts | None = None
+    emitters: np.ndarray | None = None
 
     @property
     def pixels(self) -> int:
@@ -77,8 +78,8 @@ class WholeView:
         """See `Frame.request`."""
         sensor = self.problem.views[self.view].sensor
         if self.counts is not None:
-            return SampleRequest(sensor, 1, seed, 1, self.counts.pixels)
-        return SampleRequest(sensor, spp, seed, groups)
+            return SampleRequest(sensor, 1, seed, 1, self.counts.pixels, emitters=self.emitters)
+        return SampleRequest(sensor, spp, seed, groups, emitters=self.emitters)
 
     def loss_value(self, image: Array) -> Array:
         """The view's part of the loss, exactly."""
@@ -99,10 +100,11 @@ class WholeView:
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """A mini-batch of pixels of all views: images (N, 3)."""
+    """A mini-batch of pixels of all views: images (N, 3). `emitters`: see `SampleRequest`."""
 
     problem: Problem
     sample: PixelSample
+    emitters: np.ndarray | None = None
 
     @property
     def pixels(self) -> int:
@@ -132,10 +134,11 @@ class PixelBatch:
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
         """See `Frame.request`."""
         sensors = [view.sensor for view in self.problem.views]
-        if len(set(sensors)) == 1:
-            return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels, positions=self.sample.positions)
-        table = arrays.gather(self.problem.references.sensors, self.sample.views)
-        return SampleRequest(sensors[0], spp, seed, groups, self.sample.pixels, table, self.sample.positions)
+        table = None
+        if len(set(sensors)) > 1:
+            table = arrays.gather(self.problem.references.sensors, self.sample.views)
+        pixels, positions = self.sample.pixels, self.sample.positions
+        return SampleRequest(sensors[0], spp, seed, groups, pixels, table, positions, self.emitters)
 
     def loss_value(self, image: Array) -> Array:
         """See `Frame.loss_value`."""
@@ -148,9 +151,10 @@ class PixelBatch:
         return self.problem.loss.derivative(image, reference) * (factor * self.sample.weights)
 
 
-def whole_views(problem: Problem, shares: SampleShares | None = None, spp: int = 1) -> list[Frame]:
+def whole_views(
+    problem: Problem, shares: SampleShares | None = None, spp: int = 1, emitters: np.ndarray | None = None
+) -> list[Frame]:
     """One frame per view; with `shares`, each pixel has a number of samples of its own, `spp` on average."""
-    if shares is None:
-        return [WholeView(problem, view) for view in range(len(problem.views))]
-    array = problem.renderer.array
-    return [WholeView(problem, view, shares.counts(view, spp, array)) for view in range(len(problem.views))]
+    views, array = range(len(problem.views)), problem.renderer.array
+    counts = [None if shares is None else shares.counts(view, spp, array) for view in views]
+    return [WholeView(problem, view, counts[view], emitters) for view in views]

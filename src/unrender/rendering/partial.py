@@ -13,6 +13,7 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
+    EmitterMoments,
     ParameterInfo,
     Renderer,
     Rendering,
@@ -21,6 +22,7 @@ from unrender.rendering.renderer import (
     Space,
     counted_vertices,
     differentiated,
+    drawing_emitters,
 )
 
 __all__ = ["HeldParameters", "PartialDerivatives"]
@@ -107,6 +109,17 @@ class _PartialSession:
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `CountingSession.vertices`: ones where the inner session does not count."""
         return counted_vertices(self._inner, parameters, request)
+
+    def emitters(self) -> np.ndarray:
+        """See `EmitterSession.emitters`."""
+        return drawing_emitters(self._inner).emitters()
+
+    def emitter_moments(
+        self, parameters: Tree, paths: Any, tangents: Tree, weights: Array, noise: Array
+    ) -> EmitterMoments:
+        """See `EmitterSession.emitter_moments`."""
+        zeroed = {k: arrays.zeros_like(x) if k in self._constant else x for k, x in tangents.items()}
+        return drawing_emitters(self._inner).emitter_moments(parameters, paths, zeroed, weights, noise)
 
     def _completed(self, gradient: Tree, parameters: Tree) -> Tree:
         return {key: arrays.zeros_like(x) if key in self._constant else gradient[key] for key, x in parameters.items()}

@@ -14,6 +14,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
+    EmitterMoments,
     ParameterInfo,
     Renderer,
     Rendering,
@@ -22,6 +23,7 @@ from unrender.rendering.renderer import (
     Space,
     counted_vertices,
     differentiated,
+    drawing_emitters,
 )
 
 __all__ = ["FactorPaths", "FactorSession", "PictureFactors", "WithParameter"]
@@ -187,6 +189,21 @@ class FactorSession:
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `CountingSession.vertices`: ones where the inner session does not count."""
         return counted_vertices(self._inner, self._scene(parameters), request)
+
+    def emitters(self) -> np.ndarray:
+        """See `EmitterSession.emitters`."""
+        return drawing_emitters(self._inner).emitters()
+
+    def emitter_moments(
+        self, parameters: Tree, paths: FactorPaths, tangents: Tree, weights: Array, noise: Array
+    ) -> EmitterMoments:
+        """See `EmitterSession.emitter_moments`, for the derivatives by the scene's parameters alone."""
+        inner, scene = drawing_emitters(self._inner), self._scene(parameters)
+        if not scene:
+            zeros = inner.emitters() * 0.0
+            return EmitterMoments(zeros, zeros)
+        factors = self._factors(parameters, paths.places, weights)
+        return inner.emitter_moments(scene, paths.inner, self._scene(tangents), weights * factors, noise * factors)
 
     def _factors(self, parameters: Tree, places: Array, like: Array) -> Array:
         return self._renderer.factors(parameters[self._renderer.key], places, like)

@@ -14,10 +14,13 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 
 __all__ = [
     "CountingSession",
+    "EmitterMoments",
+    "EmitterSession",
     "LossWeights",
     "ParameterInfo",
     "Remeshable",
@@ -31,6 +34,7 @@ __all__ = [
     "StockRenderer",
     "counted_vertices",
     "differentiated",
+    "drawing_emitters",
 ]
 
 Space = Literal["path", "primary"]
@@ -96,6 +100,7 @@ class SampleRequest:
         sensors: of each chosen pixel, in place of `sensor`; None where all are of that one.
         positions: of each chosen pixel among those that the seed is for, by which its random numbers are drawn: a part of a mini-batch
             is rendered as the whole would be. None where these are all.
+        emitters: the probability with which a connection takes each emitter, (E,), sum 1, see `EmitterSession`; None for the scene's own.
     """
 
     sensor: int
@@ -105,6 +110,7 @@ class SampleRequest:
     pixels: Array | None = None
     sensors: Array | None = None
     positions: Array | None = None
+    emitters: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -188,6 +194,52 @@ class CountingSession(Protocol):
         """The mean number of vertices of a pixel's paths, the camera's not counted, from samples of the request: of the shape of one of its
         images, all channels alike. A path that meets nothing has none."""
         ...
+
+
+@dataclass(frozen=True)
+class EmitterMoments:
+    """What the connections of some paths to E emitters tell: sums over connections of a value y each, by the emitter that was drawn.
+
+    Attributes:
+        sums: Σ y, float64 (E,).
+        squares: Σ y², float64 (E,).
+    """
+
+    sums: np.ndarray
+    squares: np.ndarray
+
+    def __add__(self, other: EmitterMoments) -> EmitterMoments:
+        return EmitterMoments(self.sums + other.sums, self.squares + other.squares)
+
+
+@runtime_checkable
+class EmitterSession(Protocol):
+    """A session whose connections can take emitters with probabilities that a `SampleRequest` gives. Images and gradients are as unbiased
+    as with the scene's own, as long as none is zero of an emitter that the scene would take."""
+
+    def emitters(self) -> np.ndarray:
+        """The scene's own probabilities of its E emitters, (E,), sum 1. Raises `InputError` where it has several and cannot take others."""
+        ...
+
+    def emitter_moments(
+        self, parameters: Tree, paths: Any, tangents: Tree, weights: Array, noise: Array
+    ) -> EmitterMoments:
+        """On the paths of a rendering whose request had `emitters`, of each connection that adds f to a sample of a pixel (S samples)
+
+            y = (Σ_c w_c Σ_k v_k ∂f_c/∂θ_k)² / S² + Σ_c (n_c f_c)² / S²        over the channels c,
+
+        for the tangents v, the weights w of `adjoint` and others, n, both of the shape of the rendering's images. Over independent
+        tangents of ±1, E[Σ y] of the first part is the second moment of what single connections add to `adjoint`'s gradient, summed
+        over connections and elements.
+        """
+        ...
+
+
+def drawing_emitters(session: RenderSession) -> EmitterSession:
+    """The session, where it is an `EmitterSession`. Raises `InputError` where it is none."""
+    if not isinstance(session, EmitterSession):
+        raise InputError("what renders these parameters draws emitters in its own way alone")
+    return session
 
 
 def counted_vertices(session: RenderSession, parameters: Tree, request: SampleRequest) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, ReplayState
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
@@ -63,6 +63,14 @@ class CameraPaths:
         """The derivative of the weighted radiance along the tangents, per lane; `radiance` is that of the primal pass."""
         δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),))
         return δ * self._weight
+
+    def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> tuple[Any, Any]:
+        """What each lane's connections to emitters tell: `ConnectionRecord`'s values and emitters. `radiance`: as for `forward`."""
+        assert isinstance(self._kernel, PathPair)
+        record = ConnectionRecord(weights * self._weight, noise * self._weight, bounces)
+        replay = ReplayState(None, self._replayed(radiance))
+        self._kernel.record_connections(self._scene, self._tables, self._sampler, self._ray, replay, record)
+        return record.values, record.emitters
 
     def vertices(self) -> Any:
         """The number of vertices of each lane's path."""

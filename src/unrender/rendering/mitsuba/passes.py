@@ -23,6 +23,7 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 __all__ = [
     "AdjointPairPass",
     "AdjointPass",
+    "ConnectionsPass",
     "ImagePairPass",
     "ImagePass",
     "LaunchSize",
@@ -256,6 +257,24 @@ class TangentPass(Pass):
         """`own`: the radiance that the primal pass returned."""
         (radiance,) = own
         return dr.square(paths.forward(radiance))
+
+
+@dataclass(frozen=True)
+class ConnectionsPass(Pass):
+    """Path replay forward: what the connections of each lane's path to emitters tell.
+
+    Attributes:
+        bounces: connections of a path at most.
+    """
+
+    bounces: int
+    needs_tangents: ClassVar[bool] = True
+
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
+        """`own`: the radiance that the primal pass returned, and images' worth of weights, of the derivatives and of the radiance."""
+        radiance, *given = own
+        weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in given)
+        return paths.connections(radiance, weights, noise, self.bounces)
 
 
 @dataclass(frozen=True)

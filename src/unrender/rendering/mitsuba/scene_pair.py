@@ -20,6 +20,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
+from unrender.rendering.mitsuba.emitter_tables import emitter_tables
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
@@ -78,6 +79,7 @@ class ScenePair:
         self._cameras: dict[bool, list[int]] = {}
         self._majorants: dict[bool, MajorantSupergrids] = {}
         self._films: film.Films | None = None
+        self._emitters: dict[bool, tuple[np.ndarray, dict[str, Any]]] = {}
 
     def loaded(self, previous: bool = False) -> LoadedScene:
         """The first load or, with `previous`, the second one, which is made when first asked for."""
@@ -147,6 +149,14 @@ class ScenePair:
                 "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
             }
         return self._tables
+
+    def emitter_tables(self, previous: bool, probabilities: np.ndarray) -> dict[str, Any]:
+        """See `emitter_tables.emitter_tables`; made anew where the probabilities are others than the last."""
+        known = self._emitters.get(previous)
+        if known is None or not np.array_equal(known[0], probabilities):
+            found = emitter_tables(self.loaded(previous).scene, probabilities)
+            known = self._emitters[previous] = np.array(probabilities), found
+        return known[1]
 
     def moved_tables(self, moving: AbstractSet[str]) -> dict[str, Any]:
         """The tables of `MovedPair.sample`, for the values that both scenes hold now; `moving`: ids of the meshes that may move."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
+from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
@@ -27,6 +28,7 @@ from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, s
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
     AdjointPass,
+    ConnectionsPass,
     ImagePairPass,
     ImagePass,
     LaunchSize,
@@ -38,33 +40,15 @@ from unrender.rendering.mitsuba.passes import (
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.recordable import is_recordable
+from unrender.rendering.mitsuba.rendered_paths import Paths
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import Rendering, SampleRequest, Space
+from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
 
-__all__ = ["MitsubaSession", "Paths"]
+__all__ = ["MitsubaSession"]
 
 _LANES = 1 << 22
 """Paths per launch of a batch: what fits a small machine's memory."""
-
-
-@dataclass(frozen=True)
-class Paths:
-    """What `adjoint` needs to walk the paths of a rendering again.
-
-    Attributes:
-        request: the samples taken.
-        radiance: per lane.
-        radiance_previous: likewise of the previous state; None unless a pair was rendered.
-        space: where the pair shares its samples.
-        previous: parameters of the previous state; None unless a pair was rendered.
-    """
-
-    request: SampleRequest
-    radiance: mi.Spectrum
-    radiance_previous: mi.Spectrum | None = None
-    space: Space = "path"
-    previous: Tree | None = None
 
 
 class MitsubaSession:
@@ -291,6 +275,27 @@ class MitsubaSession:
             )
         return moments if paths.request.groups > 1 else moments[0]
 
+    def emitters(self) -> np.ndarray:
+        """See `EmitterSession.emitters`."""
+        own = own_probabilities(self._pair.current)
+        moves = self._geometric or any((self._posed, self._camera, self._boundary))
+        if len(own) > 1 and (moves or self._pair.volumetric):
+            reason = "shapes or sensors move" if moves else "it has participating media"
+            raise InputError(f"a scene's emitters keep the probabilities that it gives them where {reason}")
+        return own
+
+    def emitter_moments(
+        self, parameters: Tree, paths: Paths, tangents: Tree, weights: mi.TensorXf, noise: mi.TensorXf
+    ) -> EmitterMoments:
+        """See `EmitterSession.emitter_moments`."""
+        scene = self._pair.loaded()
+        self._check_keys(parameters)
+        scene.set_tangents(parameters, tangents, self._attached)
+        task = ConnectionsPass(max(1, self._max_depth - 1))
+        found = self._run(task, paths.request, paths.radiance, weights, noise)
+        dr.eval(found)
+        return connection_moments(scene.scene, *found)
+
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """See `CountingSession.vertices`."""
         self._set_parameters(parameters)
@@ -357,7 +362,7 @@ class MitsubaSession:
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
         pixels = request.pixels is None, several, request.positions is None
-        key = (task, size, request.groups, pixels, outside, shapes)
+        key = (task, size, request.groups, pixels, outside, shapes, request.emitters is None)
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size, posed)
@@ -366,6 +371,8 @@ class MitsubaSession:
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
         tables = task.tables(pair, self._delta_table, None if several else request.sensor)
+        if request.emitters is not None and len(self.emitters()) > 1:
+            tables = {**tables, **pair.emitter_tables(task.previous, request.emitters)}
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None

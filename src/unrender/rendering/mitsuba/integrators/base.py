@@ -15,10 +15,19 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
-__all__ = ["PathContext", "PathKernel", "ReplayState", "ScatteringVertex", "largest", "relative", "total"]
+__all__ = [
+    "ConnectionRecord",
+    "PathContext",
+    "PathKernel",
+    "ReplayState",
+    "ScatteringVertex",
+    "largest",
+    "relative",
+    "total",
+]
 
 
 @dataclass
@@ -85,6 +94,7 @@ class PathContext:
 
     Args:
         mode, scene, tables, replay, pair, geometry: of `PathKernel.sample`.
+        connections: where a replay forward writes what connections to emitters add; None for nowhere.
 
     Attributes:
         primal, forward: whether `mode` is that.
@@ -100,7 +110,9 @@ class PathContext:
         replay: tuple[ReplayState, ...],
         pair: bool,
         geometry: Any = None,
+        connections: ConnectionRecord | None = None,
     ):
+        self.connections = connections
         self.mode, self.scene, self.tables, self.replay, self.pair = mode, scene, tables, replay, pair
         self.geometry = scene if geometry is None else geometry
         self.primal, self.forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
@@ -130,6 +142,34 @@ class PathContext:
         if self.forward:
             return contributions[0]
         return total([replay.δL * part for replay, part in zip(self.replay, contributions, strict=True)])
+
+
+class ConnectionRecord:
+    """What the connections of paths to emitters add: see `EmitterSession.emitter_moments`. No dataclass: Dr.Jit would take it for state
+    of its loops.
+
+    Args:
+        weights, noise: w / S and n / S of the lanes.
+        bounces: connections of a path at most, >= 1.
+
+    Attributes:
+        values: y of each lane's connections, (lanes * bounces,), 0 where there is none.
+        emitters: likewise the registry id of the emitter that was drawn.
+    """
+
+    def __init__(self, weights: Spectrum, noise: Spectrum, bounces: int):
+        self._weights, self._noise, self._bounces = weights, noise, bounces
+        self._lanes = dr.width(weights)
+        self.values = dr.zeros(mi.Float, self._lanes * bounces)
+        self.emitters = dr.zeros(mi.UInt32, self._lanes * bounces)
+        dr.make_opaque(self.values, self.emitters)
+
+    def write(self, depth: UInt32, emitter: UInt32, f: Spectrum, tangent: Spectrum, active: Bool) -> None:
+        """A connection of each lane that adds f, with a derivative along the tangents, at a vertex of that depth, counted from 0."""
+        value = dr.square(dr.sum(self._weights * tangent)) + dr.sum(dr.square(self._noise * f))
+        index = dr.arange(mi.UInt32, self._lanes) * self._bounces + depth
+        dr.scatter(self.values, value, index, active)
+        dr.scatter(self.emitters, emitter, index, active)
 
 
 @dataclass

@@ -7,12 +7,14 @@ still counts in the other.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
+from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 __all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
 
@@ -21,6 +23,31 @@ def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
     """The power heuristic with exponent 2, detached."""
     a, b = dr.square(pdf_a), dr.square(pdf_b)
     return dr.detach(dr.select(a > 0, a / (a + b), 0))
+
+
+def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
+    """A point on an emitter, its visibility not tested: with the scene's own probabilities or, where `tables` has some, with these."""
+    if "emitter_cdf" not in context.tables:
+        return context.scene.sample_emitter_direction(vertex, sample, False, active)[0]
+    cdf, count = context.tables["emitter_cdf"], len(context.scene.emitters())
+    index = dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, i + 1, active) <= sample.x)
+    first = dr.gather(mi.Float, cdf, index, active)
+    pmf = dr.gather(mi.Float, cdf, index + 1, active) - first
+    pointer = dr.gather(mi.UInt32, context.tables["emitter_ids"], index, active)
+    emitter: Any = dr.reinterpret_array(mi.EmitterPtr, pointer)
+    again = dr.clip((sample.x - first) / pmf, 0, dr.one_minus_epsilon(mi.Float))
+    ds, _ = emitter.sample_direction(vertex, mi.Point2f(again, sample.y), active & (pmf > 0))
+    ds.pdf *= pmf
+    return ds
+
+
+def _pdf_direction(context: PathContext, vertex: mi.Interaction3f, ds: mi.DirectionSample3f, active: Bool) -> Float:
+    """The solid angle density with which `_sample_direction` finds a point on an emitter."""
+    if "emitter_cdf" not in context.tables:
+        return context.scene.pdf_emitter_direction(vertex, ds, active)
+    emitter: Any = ds.emitter
+    pmf = dr.gather(mi.Float, context.tables["emitter_pmf"], registry_id(emitter), active)
+    return emitter.pdf_direction(vertex, ds, active) * pmf
 
 
 def direct_emission(
@@ -40,7 +67,7 @@ def direct_emission(
     """
     scene, si = context.scene, surfaces[0]
     ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
-    mis = mis_weight(last.pdf, scene.pdf_emitter_direction(last.interaction, ds, active & ~last.delta))
+    mis = mis_weight(last.pdf, _pdf_direction(context, last.interaction, ds, active & ~last.delta))
     emitters = context.states.emitters(ds.emitter)
     with context.resume_grad():
         return [
@@ -59,8 +86,13 @@ class EmitterConnection:
 
     def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
         self._context, self._vertex = context, vertex
-        self.ds, _ = context.scene.sample_emitter_direction(vertex, sample, False, active)
+        self.ds = _sample_direction(context, vertex, sample, active)
         self.active = active & (self.ds.pdf != 0)
+
+    @property
+    def emitter(self) -> UInt32:
+        """The registry id of the emitter, 0 for none."""
+        return registry_id(self.ds.emitter)
 
     def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
         """Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached where the caller resumes gradients.

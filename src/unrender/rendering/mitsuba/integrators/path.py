@@ -16,6 +16,7 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators import emitters, specular
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import (
+    ConnectionRecord,
     PathContext,
     ReplayState,
     ScatteringVertex,
@@ -39,6 +40,7 @@ class PathState:
         depth: segments traced.
         L: radiance of each state: gathered so far or, in a replay, still to be gathered.
         δL: derivative of the radiance along the tangents (forward mode).
+        δlogβ: of the logarithm of the throughput, where connections are recorded.
         β: throughput of each state.
         η: relative index of refraction.
         last: the vertex that `ray` leaves.
@@ -49,6 +51,7 @@ class PathState:
     depth: UInt32
     L: list[Spectrum]
     δL: Spectrum
+    δlogβ: Spectrum
     β: list[Spectrum]
     η: Float
     last: ScatteringVertex
@@ -124,12 +127,26 @@ class PathPair:
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
         return mi.Float(self._trace(context, self._begin(context, ray), sampler).depth)
 
+    def record_connections(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        replay: ReplayState,
+        connections: ConnectionRecord,
+    ) -> None:
+        """Replay the paths forward, as `sample` does, and write what connections to emitters add."""
+        context = PathContext(dr.ADMode.Forward, scene, tables, (replay,), False, None, connections)
+        self._trace(context, self._begin(context, ray), sampler)
+
     def _begin(self, context: PathContext, ray: mi.RayDifferential3f) -> PathState:
         return PathState(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
             L=context.initial_radiance(),
             δL=mi.Spectrum(0),
+            δlogβ=mi.Spectrum(0),
             β=[mi.Spectrum(1) for _ in range(context.state_count)],
             η=mi.Float(1),
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
@@ -155,7 +172,7 @@ class PathPair:
 
         # ---------------------- Emitter sampling ----------------------
         active_next = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
-        Ld = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next)
+        Ld, connection = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next)
 
         # ------------------ Detached BSDF sampling -------------------
         direction = self._sample_bsdf(context, surfaces, bsdfs, sampler, active_next)
@@ -163,7 +180,9 @@ class PathPair:
 
         # ---- Update loop variables based on current interaction -----
         path.L = context.accumulate(path.L, Le, Ld)
-        if not context.primal:
+        if context.connections is not None:
+            self._record(context.connections, path, connection, (Le[0], Ld[0], direction.values[0]))
+        elif not context.primal:
             self._differentiate(context, path, Le, Ld, direction.values)
         path.ray = si.spawn_ray(si.to_world(bs.wo))
         path.η *= bs.eta
@@ -190,7 +209,7 @@ class PathPair:
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
         active: Bool,
-    ) -> list[Spectrum]:
+    ) -> tuple[list[Spectrum], emitters.EmitterConnection]:
         """Ld of each state, by next-event estimation."""
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -204,7 +223,7 @@ class PathPair:
                 bsdfₚ.eval(bsdf_ctx, siₚ, wo, connection.active)
                 for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
             ]
-            return connection.contributions(β, [f, *previous], pdf)
+            return connection.contributions(β, [f, *previous], pdf), connection
 
     def _sample_bsdf(
         self,
@@ -249,3 +268,21 @@ class PathPair:
                 path.δL += dr.forward_to(Lo[0])
             else:
                 dr.backward_from(context.adjoint_sum(Lo))
+
+    def _record(
+        self,
+        record: ConnectionRecord,
+        path: PathState,
+        connection: emitters.EmitterConnection,
+        parts: tuple[Spectrum, Spectrum, Spectrum],
+    ) -> None:
+        """Write the connection of this vertex, from its Le, Ld and value of the direction. The derivative of what it adds has a part of its
+        own, and one of the throughput that leads to it."""
+        Le, Ld, value = parts
+        with dr.resume_grad():
+            # Le is of no account; but Dr.Jit wants all that is attached within an iteration to be traversed in it.
+            tangents: Any = dr.forward_to(Le, Ld, relative(value))
+            _, δLd, δlogf = tangents
+        Ld = dr.detach(Ld)
+        record.write(path.depth, connection.emitter, Ld, δLd + Ld * path.δlogβ, connection.active)
+        path.δlogβ += δlogf
