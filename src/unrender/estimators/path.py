@@ -20,6 +20,7 @@ from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, learned
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler, upsampled
+from unrender.rendering.renderer import with_differential_bsdf
 
 __all__ = ["PathGradient", "PathGradientState"]
 
@@ -78,6 +79,10 @@ class PathGradient:
         fresh_from: the estimate, counted from 0, from which eight have `FreshGradient`, too, as again from twice, four times, … that
             count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples (where it
             does not, every gradient is fresh), and with a linear derivative or a tolerance.
+        differential_bsdf: whether the adjoint samples the derivative of rough conductors by their roughness apart, in proportion to it and
+            in antithetic pairs (Belhe et al. 2024). As unbiased; an adjoint costs one and a half times to twice as much, and the variance
+            of roughness gradients is smaller, by the more the smoother the surface. `init` raises `InputError` where no parameter is such
+            a roughness (`RoughLobes`), or views are dealt to workers.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -86,6 +91,7 @@ class PathGradient:
     adjoint_spp: int | None = None
     tolerance: float = 0.0
     fresh_from: int = 0
+    differential_bsdf: bool = False
 
     def __post_init__(self):
         checks.number("PathGradient", "tolerance", self.tolerance, above=0.0, inclusive=True)
@@ -118,8 +124,19 @@ class PathGradient:
         begun = self.fresh_from << ((step // self.fresh_from).bit_length() - 1)
         return step < begun + _WINDOW
 
+    def _rendered(self, problem: Problem) -> Problem:
+        """The problem by the renderer that is asked for."""
+        if not self.differential_bsdf:
+            return problem
+        if problem.gatherer is not None:
+            raise InputError(
+                "PathGradient: differential_bsdf does not work on views that are dealt to workers: leave it out"
+            )
+        return problem.rendered_by(with_differential_bsdf(problem.renderer))
+
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
+        problem = self._rendered(problem)
         problem.renderer.prepare(list(parameters), self.image.space)
         return PathGradientState(self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
@@ -128,6 +145,7 @@ class PathGradient:
     ) -> tuple[Estimate, PathGradientState]:
         """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
         the info of the image estimator, per view that was rendered whole, "pixel_probability" per view of a mini-batch."""
+        problem = self._rendered(problem)
         batch, pixels = MiniBatch(None), state.pixels
         drawn = draws_pixels(self.pixels)
         if not drawn or not self.image.needs_whole_views(parameters, state.image, state.batches):

@@ -16,7 +16,11 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 
-__all__ = ["AdamOptions", "PathOptions"]
+__all__ = ["DIFFERENTIAL_HELP", "AdamOptions", "PathOptions"]
+
+DIFFERENTIAL_HELP = (
+    "whether derivatives by the alpha of rough conductors are sampled apart, in antithetic pairs of paths"
+)
 
 
 class AdamOptions(Options):
@@ -42,9 +46,11 @@ class PathOptions(AdamOptions):
     counts: Literal["equal", "adaptive"] = Field(
         "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
     )
+    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
     denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
-        return PathGradient(Denoised(image) if self.denoise else image, sampler, self.spp, self.adjoint_spp)
+        image = Denoised(image) if self.denoise else image
+        return PathGradient(image, sampler, self.spp, self.adjoint_spp, differential_bsdf=self.differential_bsdf)

@@ -12,7 +12,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.path import PathGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import AdamOptions
+from unrender.methods.adam_options import DIFFERENTIAL_HELP, AdamOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 
@@ -41,10 +41,13 @@ class AdaptiveMethod(AdamOptions):
     )
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
 
+    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
+
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
-        return PathGradient(image, self._sampler(), self.spp), self.optimizer()
+        estimator = PathGradient(image, self._sampler(), self.spp, differential_bsdf=self.differential_bsdf)
+        return estimator, self.optimizer()
 
     def _sampler(self) -> PixelSampler:
         guided: dict[str, Any] = {"refresh": self.refresh}

@@ -38,6 +38,7 @@ from unrender.rendering.mitsuba.passes import (
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.recordable import is_recordable
+from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import Rendering, SampleRequest, Space
@@ -81,9 +82,10 @@ class MitsubaSession:
             would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
         max_depth: longest path in segments.
         sampler: is cloned.
+        differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
 
     Raises `InputError` where poses and other parameters that move geometry come together, or poses with a derivative and poses without:
-    the scenes that posed shapes live in are not rebuilt.
+    the scenes that posed shapes live in are not rebuilt. Likewise where `differential_bsdf` serves nothing.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class MitsubaSession:
         derivatives: AbstractSet[str],
         max_depth: int,
         sampler: mi.Sampler,
+        differential_bsdf: bool = False,
     ):
         traits = {key: pair.parameter_traits(key) for key in keys}
         cameras = [key for key in (*keys, *poses) if moved_sensor(pair.loaded(), key)]
@@ -140,6 +143,8 @@ class MitsubaSession:
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
         self._delta_table = pair.delta_table(self._traits)
+        served = [key for key in keys if key in derivatives] if differential_bsdf and derivatives else None
+        self._rough = RoughLobes(pair, served, self._geometric)
         self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
 
     @cached_property
@@ -147,7 +152,7 @@ class MitsubaSession:
         """The path tracer for these parameters' derivatives."""
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
-            return PathPair(self._max_depth, changing_delta=delta)
+            return PathPair(self._max_depth, changing_delta=delta, differential=self._rough.differential)
         media = any(traits.medium for traits in self._traits)
         emission, field = self._pair.emissive, self._pair.radiance_field
         return VolumePair(
@@ -365,7 +370,7 @@ class MitsubaSession:
         share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
-        tables = task.tables(pair, self._delta_table, None if several else request.sensor)
+        tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None

@@ -18,7 +18,10 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
-__all__ = ["PathContext", "PathKernel", "ReplayState", "ScatteringVertex", "largest", "relative", "total"]
+__all__ = ["KEEP", "PathContext", "PathKernel", "ReplayState", "ScatteringVertex", "largest", "relative", "total"]
+
+KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
+"""Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
 
 
 @dataclass
