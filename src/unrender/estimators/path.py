@@ -80,7 +80,7 @@ class PathGradient:
             count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples (where it
             does not, every gradient is fresh), and with a linear derivative or a tolerance.
         differential_bsdf: whether the adjoint samples the derivative of rough conductors by their roughness apart, in proportion to it and
-            in antithetic pairs (Belhe et al. 2024). As unbiased; an adjoint costs one and a half times to twice as much, and the variance
+            in antithetic pairs (Belhe et al. 2024). As unbiased; an adjoint costs about twice as much, and the variance
             of roughness gradients is smaller, by the more the smoother the surface. `init` raises `InputError` where no parameter is such
             a roughness (`RoughLobes`), or views are dealt to workers.
     """
