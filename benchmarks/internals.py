@@ -32,7 +32,7 @@ from unrender.problem.bounds import project
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.numpy.exponential import RATE
-from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
+from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.vignetting import falloff
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
@@ -92,6 +92,7 @@ __all__ = [
     "vectors",
     "versions",
     "volumetric",
+    "with_differential_bsdf",
 ]
 
 

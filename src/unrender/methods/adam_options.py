@@ -17,9 +17,12 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 
-__all__ = ["EMITTERS_HELP", "AdamOptions", "PathOptions"]
+__all__ = ["DIFFERENTIAL_HELP", "EMITTERS_HELP", "AdamOptions", "PathOptions"]
 
 EMITTERS_HELP = "which of several lights a connection takes: by the scene's weights, or by the gradient's variance"
+DIFFERENTIAL_HELP = (
+    "whether derivatives by the alpha of rough conductors are sampled apart, in antithetic pairs of paths"
+)
 
 
 class AdamOptions(Options):
@@ -46,10 +49,12 @@ class PathOptions(AdamOptions):
         "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
     )
     emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
+    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
     denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
         seen = Denoised(image) if self.denoise else image
-        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, emitters=self.emitters)
+        apart = {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
+        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, **apart)

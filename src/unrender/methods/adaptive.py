@@ -13,7 +13,7 @@ from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import EMITTERS_HELP, AdamOptions
+from unrender.methods.adam_options import DIFFERENTIAL_HELP, EMITTERS_HELP, AdamOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 
@@ -43,10 +43,13 @@ class AdaptiveMethod(AdamOptions):
     emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
 
+    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
+
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
-        return PathGradient(image, self._sampler(), self.spp, emitters=self.emitters), self.optimizer()
+        apart = {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
+        return PathGradient(image, self._sampler(), self.spp, **apart), self.optimizer()
 
     def _sampler(self) -> PixelSampler:
         guided: dict[str, Any] = {"refresh": self.refresh}

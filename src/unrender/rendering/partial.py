@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from unrender.rendering.renderer import (
     counted_vertices,
     differentiated,
     drawing_emitters,
+    with_differential_bsdf,
 )
 
 __all__ = ["HeldParameters", "PartialDerivatives"]
@@ -70,6 +71,10 @@ class PartialDerivatives(_View):
         """See `Renderer.prepare`."""
         wanted = differentiated(keys, derivatives) - self.constant
         return _PartialSession(self.inner.prepare(keys, space, wanted), self.constant)
+
+    def with_differential_bsdf(self) -> PartialDerivatives:
+        """See `DifferentialBsdfRenderer`. Raises `InputError` where the inner renderer is none."""
+        return replace(self, inner=with_differential_bsdf(self.inner))
 
 
 class _PartialSession:

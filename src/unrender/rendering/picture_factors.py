@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from unrender.rendering.renderer import (
     counted_vertices,
     differentiated,
     drawing_emitters,
+    with_differential_bsdf,
 )
 
 __all__ = ["FactorPaths", "FactorSession", "PictureFactors", "WithParameter"]
@@ -67,6 +69,12 @@ class WithParameter:
     def array(self, values: np.ndarray) -> Array:
         """See `Renderer.array`."""
         return self.inner.array(values)
+
+    def with_differential_bsdf(self) -> WithParameter:
+        """See `DifferentialBsdfRenderer`. Raises `InputError` where the inner renderer is none."""
+        found = copy.copy(self)
+        found.inner = with_differential_bsdf(self.inner)
+        return found
 
 
 class PictureFactors(WithParameter):

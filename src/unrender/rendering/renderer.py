@@ -19,6 +19,7 @@ from unrender.core.trees import Tree
 
 __all__ = [
     "CountingSession",
+    "DifferentialBsdfRenderer",
     "EmitterMoments",
     "EmitterSession",
     "LossWeights",
@@ -35,6 +36,7 @@ __all__ = [
     "counted_vertices",
     "differentiated",
     "drawing_emitters",
+    "with_differential_bsdf",
 ]
 
 Space = Literal["path", "primary"]
@@ -327,6 +329,23 @@ class Remeshable(Protocol):
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
         """Another one, of the same scene with these meshes for shapes by their ids, for these keys of parameters."""
         ...
+
+
+@runtime_checkable
+class DifferentialBsdfRenderer(Protocol):
+    """A renderer that can sample directions in proportion to the derivative of a BSDF."""
+
+    def with_differential_bsdf(self) -> Renderer:
+        """The same one, whose adjoints and squared tangents of one state do so for roughness. Its `prepare` raises `InputError` where none
+        of the parameters is one that this serves. As unbiased; images, pairs and adjoints of pairs are the same. Cheap when asked again."""
+        ...
+
+
+def with_differential_bsdf(renderer: Renderer) -> Renderer:
+    """See `DifferentialBsdfRenderer`. Raises `InputError` for a renderer that is none."""
+    if not isinstance(renderer, DifferentialBsdfRenderer):
+        raise InputError("differential_bsdf: this renderer samples no BSDF by its derivative: leave it out")
+    return renderer.with_differential_bsdf()
 
 
 @runtime_checkable

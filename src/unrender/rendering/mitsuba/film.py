@@ -20,6 +20,7 @@ __all__ = [
     "camera_samples_of_many",
     "develop",
     "film_adjoint",
+    "independent",
     "per_sample",
     "rays",
     "sampler_at",
@@ -62,6 +63,17 @@ class RepeatingSampler:
         del active
         first = self.rng.next_float32()
         return mi.Point2f(first, self.rng.next_float32())
+
+
+def independent(sampler: Any, lanes: int) -> RepeatingSampler:
+    """Random numbers apart from those of the path, which is replayed and must meet its own again."""
+    copy: Any = sampler.clone()
+    bits: Any = dr.reinterpret_array(mi.UInt32, copy.next_1d())
+    given = copy.lanes if isinstance(copy, RepeatingSampler) else None
+    lane: Any = dr.arange(mi.UInt32, lanes) if given is None else given
+    state, sequence = mi.sample_tea_32(bits, lane)
+    rng: Any = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
+    return RepeatingSampler(lanes, rng)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import mitsuba as mi
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
-from unrender.rendering.mitsuba.integrators.volpath import independent
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
@@ -208,7 +207,7 @@ class MovedPairPass(Pass):
                     numbers: Any = self.numbers(sampler, size, positions)
                     samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
                     made.append(film.rays(samples) if rays is None else rays[state])
-                choices = independent(numbers, size.pixels * size.spp)
+                choices = film.independent(numbers, size.pixels * size.spp)
                 found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[-1][0]))
                 return found[0] * made[0][1], found[1] * made[-1][1]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
@@ -71,6 +72,7 @@ class MitsubaRenderer:
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}
         self._stock: StockSession | None = None
+        self._differential_bsdf, self._differential = False, None
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
@@ -120,13 +122,20 @@ class MitsubaRenderer:
             chosen = {key: self._poses[key] for key in keys if key in self._poses}
             rest = [key for key in keys if key not in self._poses]
             self._sessions[names, wanted] = MitsubaSession(
-                self.pair, rest, chosen, wanted, self.max_depth, self._sampler
+                self.pair, rest, chosen, wanted, self.max_depth, self._sampler, self._differential_bsdf
             )
         return self._sessions[names, wanted]
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
         """See `Remeshable`."""
         return MitsubaRenderer(self.pair.description, self.max_depth, keys, self.pair.replaced | dict(meshes))
+
+    def with_differential_bsdf(self) -> MitsubaRenderer:
+        """See `DifferentialBsdfRenderer`. Of the same scenes."""
+        if self._differential is None:
+            self._differential = copy.copy(self)
+            self._differential._differential_bsdf, self._differential._sessions = True, {}
+        return self._differential
 
     def stock(self) -> StockSession:
         """See `StockRenderer.stock`."""

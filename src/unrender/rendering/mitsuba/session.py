@@ -41,6 +41,7 @@ from unrender.rendering.mitsuba.passes import (
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.recordable import is_recordable
 from unrender.rendering.mitsuba.rendered_paths import Paths
+from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
@@ -65,9 +66,10 @@ class MitsubaSession:
             would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
         max_depth: longest path in segments.
         sampler: is cloned.
+        differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
 
     Raises `InputError` where poses and other parameters that move geometry come together, or poses with a derivative and poses without:
-    the scenes that posed shapes live in are not rebuilt.
+    the scenes that posed shapes live in are not rebuilt; and where `differential_bsdf` serves nothing.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class MitsubaSession:
         derivatives: AbstractSet[str],
         max_depth: int,
         sampler: mi.Sampler,
+        differential_bsdf: bool = False,
     ):
         traits = {key: pair.parameter_traits(key) for key in keys}
         cameras = [key for key in (*keys, *poses) if moved_sensor(pair.loaded(), key)]
@@ -89,8 +92,7 @@ class MitsubaSession:
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
         moved = {key: moved_shape(pair.loaded(), key) for key in (*keys, *poses) if key not in cameras}
         # Of pairs: what moves, and what stands still.
-        self._moving = frozenset(moved.values()) - {""}
-        self._still_sensors = not cameras
+        self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
         self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
@@ -124,6 +126,8 @@ class MitsubaSession:
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
         self._delta_table = pair.delta_table(self._traits)
+        served = [key for key in keys if key in derivatives] if differential_bsdf and derivatives else None
+        self._rough = RoughLobes(pair, served, self._geometric)
         self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
 
     @cached_property
@@ -131,7 +135,7 @@ class MitsubaSession:
         """The path tracer for these parameters' derivatives."""
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
-            return PathPair(self._max_depth, changing_delta=delta)
+            return PathPair(self._max_depth, changing_delta=delta, differential=self._rough.differential)
         media = any(traits.medium for traits in self._traits)
         emission, field = self._pair.emissive, self._pair.radiance_field
         return VolumePair(
@@ -370,29 +374,25 @@ class MitsubaSession:
         share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
         sensors = (pair.films(), request.sensors) if several else None
-        tables = task.tables(pair, self._delta_table, None if several else request.sensor)
+        tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
-            tables = {**tables, **pair.emitter_tables(task.previous, request.emitters)}
+            tables |= pair.emitter_tables(task.previous, request.emitters)
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
-        before: Callable[[], None] = _nothing if task.needs_tangents else pair.clear_gradients
+        before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
         return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
 
     def _rays_outside(self, request: SampleRequest) -> bool:
         """Whether the camera rays are made outside of the recording, since it cannot hold the sensor."""
-        if request.sensors is None:
-            return not is_recordable(self._pair.current.sensors()[request.sensor])
         # A call through a pointer sees every sensor of the process.
-        return not all(is_recordable(sensor) for loaded in loaded_scenes() for sensor in loaded.scene.sensors())
+        found = [sensor for loaded in loaded_scenes() for sensor in loaded.scene.sensors()]
+        seen = [self._pair.current.sensors()[request.sensor]] if request.sensors is None else found
+        return not all(map(is_recordable, seen))
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
-
-
-def _nothing() -> None:
-    return None
 
 
 def _is_broadcast(values: np.ndarray) -> bool:

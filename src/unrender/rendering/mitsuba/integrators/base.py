@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
 __all__ = [
+    "KEEP",
     "ConnectionRecord",
     "PathContext",
     "PathKernel",
@@ -28,6 +29,9 @@ __all__ = [
     "relative",
     "total",
 ]
+
+KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
+"""Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
 
 
 @dataclass

@@ -6,23 +6,27 @@ differs between the states are lists, the current state first; the previous stat
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import (
+    KEEP,
     ConnectionRecord,
     PathContext,
     ReplayState,
     ScatteringVertex,
     largest,
     relative,
+    total,
 )
+from unrender.rendering.mitsuba.integrators.differential_bsdf import BranchVertex, DifferentialBsdf, RoughLobe
 
 __all__ = ["ROULETTE_FLOOR", "BsdfDirection", "PathPair", "PathState"]
 
@@ -45,6 +49,7 @@ class PathState:
         η: relative index of refraction.
         last: the vertex that `ray` leaves.
         active: lanes whose path goes on.
+        branches: the vertex of the differential paths, where there are any; else nothing.
     """
 
     ray: mi.Ray3f
@@ -56,6 +61,7 @@ class PathState:
     η: Float
     last: ScatteringVertex
     active: Bool
+    branches: list[BranchVertex] = field(default_factory=list)
 
 
 class BsdfDirection:
@@ -87,17 +93,26 @@ class PathPair:
         max_depth: the longest path in segments, as in Mitsuba (1: directly visible emitters only), >= 1.
         rr_depth: the depth from which roulette may end a path.
         changing_delta: whether a BSDF with a parameter to recover has perfectly specular lobes (a few evaluations more per bounce).
+        differential: how derivatives by roughness are sampled in replays of one state; None for like everything else. With it, `tables`
+            has "rough", the BSDFs that this concerns.
 
     Differences from Mitsuba's `path` that matter to the estimates, none to their means: a sampled direction is weighted by the
     BSDF's whole density and value (not by the sampled lobe's own), so that both states share one density; the visibility of
     an emitter is tested apart from its radiance, so that an emitter that is black in one state still counts in the other.
     """
 
-    def __init__(self, max_depth: int, rr_depth: int = 5, changing_delta: bool = False):
+    def __init__(
+        self,
+        max_depth: int,
+        rr_depth: int = 5,
+        changing_delta: bool = False,
+        differential: DifferentialBsdf | None = None,
+    ):
         # No dataclass: Dr.Jit would take it for state of the loop below.
         self.max_depth = max_depth
         self.rr_depth = rr_depth
         self.changing_delta = changing_delta
+        self.differential = differential
 
     def sample(
         self,
@@ -113,6 +128,8 @@ class PathPair:
         """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
         path = self._trace(context, self._begin(context, ray), sampler)
+        if path.branches:
+            self._follow_branches(context, path, sampler)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
     def vertices(
@@ -151,6 +168,7 @@ class PathPair:
             η=mi.Float(1),
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
             active=mi.Bool(True),
+            branches=[BranchVertex.nowhere(mi.Ray3f(dr.detach(ray)))] if self._branches_off(context) else [],
         )
 
     @dr.syntax
@@ -172,10 +190,11 @@ class PathPair:
 
         # ---------------------- Emitter sampling ----------------------
         active_next = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
-        Ld, connection = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next)
+        lobe = self._rough_lobe(context, path, si, bsdfs[0], active_next)
+        Ld, connection = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next, lobe)
 
         # ------------------ Detached BSDF sampling -------------------
-        direction = self._sample_bsdf(context, surfaces, bsdfs, sampler, active_next)
+        direction = self._sample_bsdf(context, surfaces, bsdfs, sampler, active_next, lobe)
         bs = direction.bs
 
         # ---- Update loop variables based on current interaction -----
@@ -209,6 +228,7 @@ class PathPair:
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
         active: Bool,
+        lobe: RoughLobe | None,
     ) -> tuple[list[Spectrum], emitters.EmitterConnection]:
         """Ld of each state, by next-event estimation."""
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
@@ -223,7 +243,12 @@ class PathPair:
                 bsdfₚ.eval(bsdf_ctx, siₚ, wo, connection.active)
                 for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
             ]
-            return connection.contributions(β, [f, *previous], pdf), connection
+            if lobe is None:
+                return connection.contributions(β, [f, *previous], pdf), connection
+            # What competes with these samples for the derivative of the lobe is the branches' directions.
+            rest = connection.contributions(β, [lobe.without(f, wo)], pdf)
+            change = connection.contributions(β, [lobe.change(f, wo)], lobe.pdf(wo))
+            return [total([*rest, *change])], connection
 
     def _sample_bsdf(
         self,
@@ -232,6 +257,7 @@ class PathPair:
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
         active: Bool,
+        lobe: RoughLobe | None,
     ) -> BsdfDirection:
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         samples = sampler.next_1d(), sampler.next_2d()
@@ -243,6 +269,8 @@ class PathPair:
             previous = [
                 bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth) for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
             ]
+            if lobe is not None:
+                f = lobe.without(f, bs.wo)
         values = [f, *previous]
         weights = specular.sampling_weights(values, pdf, weight, smooth, delta)
         if self.changing_delta and (context.pair or not context.primal):
@@ -267,7 +295,8 @@ class PathPair:
             if context.forward:
                 path.δL += dr.forward_to(Lo[0])
             else:
-                dr.backward_from(context.adjoint_sum(Lo))
+                flags = KEEP if path.branches else dr.ADFlag.Default
+                dr.backward_from(context.adjoint_sum(Lo), flags=flags)
 
     def _record(
         self,
@@ -286,3 +315,44 @@ class PathPair:
         Ld = dr.detach(Ld)
         record.write(path.depth, connection.emitter, Ld, δLd + Ld * path.δlogβ, connection.active)
         path.δlogβ += δlogf
+
+    # ------------------------------------------------------------------ differential paths
+
+    def _branches_off(self, context: PathContext) -> bool:
+        return self.differential is not None and not context.primal and not context.pair
+
+    def _rough_lobe(
+        self, context: PathContext, path: PathState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: Bool
+    ) -> RoughLobe | None:
+        """Of the vertex that is the path's first whose roughness derivative is sampled apart, which is kept; None in other passes."""
+        if not path.branches or self.differential is None:
+            return None
+        (branch,) = path.branches
+        lobe = self.differential.lobe(context, si, bsdf, active & ~branch.found)
+        path.branches = [branch.kept(BranchVertex(path.ray, path.depth, path.β[0], path.η, lobe.served))]
+        return lobe
+
+    def _follow_branches(self, context: PathContext, path: PathState, sampler: Any) -> None:
+        """Back-propagate the roughness derivatives that the replay left out, or carry tangents forward."""
+        (branch,) = path.branches
+        numbers = independent(sampler, dr.width(branch.ray))
+        dr.eval(branch, path.δL, numbers)  # Two backward passes in one kernel would race for the same gradients.
+        differential: Any = self.differential
+        contribution = differential.contribution(context, branch, numbers, self._incident(context))
+        with dr.resume_grad():
+            if context.forward:
+                path.δL += dr.forward_to(contribution)
+            else:
+                dr.backward_from(context.adjoint_sum([contribution]))
+
+    def _incident(self, context: PathContext) -> Callable[..., Spectrum]:
+        """See `DifferentialBsdf.contribution`: by ordinary paths."""
+        primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, (), False, context.geometry)
+
+        def trace(branch: BranchVertex, vertex: ScatteringVertex, ray: Any, numbers: Any, active: Bool) -> Spectrum:
+            path = self._begin(primal, ray)
+            path.depth, path.η, path.active = branch.depth + 1, mi.Float(branch.η), mi.Bool(active)
+            path.last = vertex
+            return self._trace(primal, path, numbers).L[0]
+
+        return trace

@@ -12,10 +12,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.film import RepeatingSampler
+from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import (
+    KEEP,
     ReplayState,
     ScatteringVertex,
     largest,
@@ -33,10 +34,7 @@ from unrender.rendering.mitsuba.integrators.volume_path import (
     VolumePathState,
 )
 
-__all__ = ["VolumePair", "independent"]
-
-_KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
-"""Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
+__all__ = ["VolumePair"]
 
 
 class VolumePair:
@@ -287,7 +285,7 @@ class VolumePair:
             if context.forward:
                 path.δL += dr.forward_to(Lo[0])
             else:
-                dr.backward_from(context.adjoint_sum(Lo), flags=_KEEP)
+                dr.backward_from(context.adjoint_sum(Lo), flags=KEEP)
 
     def _scatter_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> Bool:
         """Leave the vertex in the sampled direction. Tells which lanes scattered, or met a boundary that turned them."""
@@ -327,16 +325,5 @@ class VolumePair:
             ]
             if context.forward:
                 return dr.forward_to(Lo[0])
-            dr.backward_from(context.adjoint_sum(Lo), flags=_KEEP)
+            dr.backward_from(context.adjoint_sum(Lo), flags=KEEP)
         return mi.Spectrum(0)
-
-
-def independent(sampler: Any, lanes: int) -> RepeatingSampler:
-    """Random numbers apart from those of the path, which is replayed and must meet its own again."""
-    copy: Any = sampler.clone()
-    bits: Any = dr.reinterpret_array(mi.UInt32, copy.next_1d())
-    given = copy.lanes if isinstance(copy, RepeatingSampler) else None
-    lane: Any = dr.arange(mi.UInt32, lanes) if given is None else given
-    state, sequence = mi.sample_tea_32(bits, lane)
-    rng: Any = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
-    return RepeatingSampler(lanes, rng)
