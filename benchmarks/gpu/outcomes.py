@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what has an outcome."""
-    known = read(config.getoption("--outcomes"))
+    known = read(Path(str(config.getoption("--outcomes"))))
     left_out = [item for item in items if item.nodeid in known]
     config.hook.pytest_deselected(items=left_out)
     items[:] = [item for item in items if item.nodeid not in known]
@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_configure(config: pytest.Config) -> None:
     """Only the first process writes: with pytest-xdist it hears of all workers' tests."""
     if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(_Writer(config.getoption("--outcomes")), "outcomes-writer")
+        config.pluginmanager.register(_Writer(Path(str(config.getoption("--outcomes")))), "outcomes-writer")
 
 
 class _Writer:

@@ -78,12 +78,14 @@ class _OfGroups:
             others = (images.sum(axis=0) - images) / (groups - 1)
 
             def derivative(seen: np.ndarray, index: int = index, like: Any = rendering.images) -> np.ndarray:
-                return arrays.numpy(problem.loss_derivative(index, arrays.like(np.float32(seen), like)))
+                return arrays.numpy(problem.loss_derivative(index, arrays.like(np.asarray(seen, np.float32), like)))
 
             weights, kept = self.weights(images, others, derivative, known)
 
             def adjoint(weights: np.ndarray, rendering: Any = rendering) -> Tree:
-                return session.adjoint(parameters, rendering.paths, arrays.like(np.float32(weights), rendering.images))
+                return session.adjoint(
+                    parameters, rendering.paths, arrays.like(np.asarray(weights, np.float32), rendering.images)
+                )
 
             for name, part in self.combined(adjoint, weights).items():
                 gradient[name] = part + gradient[name] if name in gradient else part
@@ -228,6 +230,34 @@ class ClippedGradient:
                 released, store[name] = share(state.store[name], cut_off, self.release)
                 result = inside + released
             square[name] = (1 - weight) * state.square[name] + weight * inside**2
-            gradient[name] = arrays.like(np.float32(result), value)
+            gradient[name] = arrays.like(np.asarray(result, np.float32), value)
         estimate = ur.Estimate(found.loss, gradient, info={"samples": found.info["samples"]})
         return estimate, _Clipping(inner, square, store, state.step + 1)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An estimator whose estimates are kept by key, for several that wrap it; only for equal parameters and equal chains of keys.
+
+    Args:
+        inner: estimates.
+        tape: what it estimated, and the state after.
+    """
+
+    inner: Estimator
+    tape: dict[Key, Any] = field(default_factory=dict)
+
+    @property
+    def provides(self) -> Any:
+        """See `Estimator.provides`."""
+        return self.inner.provides
+
+    def init(self, problem: ur.Problem, parameters: Tree) -> Any:
+        """See `Estimator.init`."""
+        return self.inner.init(problem, parameters)
+
+    def estimate(self, problem: ur.Problem, parameters: Tree, state: Any, key: Key) -> Any:
+        """See `Estimator.estimate`."""
+        if key not in self.tape:
+            self.tape[key] = self.inner.estimate(problem, parameters, state, key)
+        return self.tape[key]

@@ -20,7 +20,13 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.adaptive.over_uniform.run import rough_box
-from benchmarks.adaptive.tails.prototypes import ClippedGradient, ClippedImages, ClippedWeights, MedianOfMeans
+from benchmarks.adaptive.tails.prototypes import (
+    ClippedGradient,
+    ClippedImages,
+    ClippedWeights,
+    MedianOfMeans,
+    Recorded,
+)
 from benchmarks.internals import Key, element_scales
 from benchmarks.races import total_error
 
@@ -34,17 +40,18 @@ QUICK = {
 }  # fmt: skip
 
 
-def methods(spp: int) -> dict[str, Any]:
-    """{name: estimator} of so many samples a pixel."""
-    control = ur.images.RecursiveControlVariate()
+def methods(spp: int, recorded: bool = False) -> dict[str, Any]:
+    """{name: estimator} of so many samples a pixel; with `recorded`, those that wrap the same estimator have the same estimates."""
+    plain, control = ur.PathGradient(spp=spp), ur.PathGradient(ur.images.RecursiveControlVariate(), spp=spp)
+    inner, controlled = (Recorded(plain), Recorded(control)) if recorded else (plain, control)
     found: dict[str, Any] = {
-        PLAIN: ur.PathGradient(spp=spp),
+        PLAIN: inner,
         "images clipped": ClippedImages(spp),
         "weights clipped": ClippedWeights(spp),
-        "gradient clipped": ClippedGradient(ur.PathGradient(spp=spp)),
-        "gradient clipped, rest dropped": ClippedGradient(ur.PathGradient(spp=spp), release=0.0),
-        "rcv": ur.PathGradient(control, spp=spp),
-        "rcv, gradient clipped": ClippedGradient(ur.PathGradient(control, spp=spp)),
+        "gradient clipped": ClippedGradient(inner),
+        "gradient clipped, rest dropped": ClippedGradient(inner, release=0.0),
+        "rcv": controlled,
+        "rcv, gradient clipped": ClippedGradient(controlled),
     }
     if spp == 2:
         found["image and adjoint 1:1"] = ur.PathGradient(spp=1, adjoint_spp=1)
@@ -62,9 +69,18 @@ def made(name: str, resolution: int) -> ur.Problem:
     return ur.gallery.problem(name, resolution=resolution, reference_spp=256)
 
 
+def remembers(estimator: Any) -> bool:
+    """Whether a step depends on those before it."""
+    if isinstance(estimator, Recorded):
+        return remembers(estimator.inner)
+    if isinstance(estimator, ur.PathGradient):
+        return not isinstance(estimator.image, ur.images.Plain)
+    return not isinstance(estimator, MedianOfMeans)
+
+
 def gradients(problem: ur.Problem, estimator: Any, chains: int, warm: int, steps: int) -> np.ndarray:
-    """(chains, steps, n) gradients at the start, after `warm` steps that are left out."""
-    at = problem.initial()
+    """(chains, steps, n) gradients at the start, after `warm` steps that are left out; none are where nothing is remembered."""
+    at, warm = problem.initial(), warm if remembers(estimator) else 0
     slopes = problem.coordinates.slopes(at)
     found = []
     for chain in range(chains):
@@ -100,7 +116,10 @@ def variances(problem: ur.Problem, spp: tuple[int, ...], chains: int, warm: int,
 
     The reference of the distance is the plain estimator with the most samples, with seeds of its own.
     """
-    found = {n: {name: gradients(problem, e, chains, warm, steps) for name, e in methods(n).items()} for n in spp}
+    found = {
+        n: {name: gradients(problem, e, chains, warm, steps) for name, e in methods(n, recorded=True).items()}
+        for n in spp
+    }
     squares = np.mean([np.square(rows[PLAIN]).mean(axis=(0, 1)) for rows in found.values()], axis=0)
     units = {"plain": np.ones_like(squares), "adam": np.square(element_scales(problem.initial(), squares))}
     own = gradients(problem, ur.PathGradient(spp=max(16, *spp)), 2 * chains, 0, 2 * steps)[chains:]
@@ -137,11 +156,11 @@ def run(
     problem: tuple[str, ...] = PROBLEMS,
     part: tuple[str, ...] = PARTS,
     spp: tuple[int, ...] = (2, 4, 8, 16),
-    chains: int = 12,
-    warm: int = 12,
-    steps: int = 24,
-    descent_spp: tuple[int, ...] = (2, 8),
-    descent_steps: int = 100,
+    chains: int = 8,
+    warm: int = 10,
+    steps: int = 10,
+    descent_spp: tuple[int, ...] = (4,),
+    descent_steps: int = 40,
     seeds: int = 3,
     rates: tuple[float, ...] = (0.01, 0.03),
     resolution: int = 24,
