@@ -60,6 +60,7 @@ __all__ = [
     "SampleRequest",
     "Tree",
     "Whole",
+    "WholeView",
     "advance",
     "allocated",
     "arrays",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, prepare
+from benchmarks.internals import Estimator, ImageEstimator, Key, Tree, WholeView, arrays, prepare
 
 RELEASE = 0.125
 """Share of the store that a step gets."""
@@ -32,6 +32,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _State:
+    image: Any
     views: tuple[_View | None, ...]
 
 
@@ -52,9 +53,11 @@ class _OfGroups:
 
     Args:
         spp: samples per pixel, as many groups up to 16.
+        image: estimates the image.
     """
 
     spp: int = 4
+    image: ImageEstimator = field(default_factory=ur.images.Plain)
 
     @property
     def provides(self) -> Any:
@@ -63,37 +66,37 @@ class _OfGroups:
 
     def init(self, problem: ur.Problem, parameters: Tree) -> Any:
         """No view was seen."""
-        del parameters
-        return _State((None,) * len(problem.views))
+        return _State(self.image.init(problem, parameters), (None,) * len(problem.views))
 
     def estimate(self, problem: ur.Problem, parameters: Tree, state: Any, key: Key) -> Any:
         """See `Estimator.estimate`."""
         session, groups = prepare(problem, parameters), ur.PathGradient(spp=self.spp).groups
         gradient: dict[str, Any] = {}
-        views, loss = [], 0.0
-        for index, (view, known) in enumerate(zip(problem.views, state.views, strict=True)):
-            request = SampleRequest(view.sensor, self.spp, key.fold(index).uint32(), groups)
-            rendering = session.image(parameters, request)
-            images = arrays.numpy(rendering.images).astype(np.float64)
-            others = (images.sum(axis=0) - images) / (groups - 1)
+        views, contributions, loss = [], [], 0.0
+        for index, known in enumerate(state.views):
+            frame = WholeView(problem, index)
+            found, contribution = self.image.estimate(
+                problem, parameters, state.image, frame, self.spp, groups, key.fold(index)
+            )
+            images, others = (arrays.numpy(x).astype(np.float64) for x in (found.images, found.others()))
 
-            def derivative(seen: np.ndarray, index: int = index, like: Any = rendering.images) -> np.ndarray:
+            def derivative(seen: np.ndarray, index: int = index, like: Any = found.images) -> np.ndarray:
                 return arrays.numpy(problem.loss_derivative(index, arrays.like(np.asarray(seen, np.float32), like)))
 
-            weights, kept = self.weights(images, others, derivative, known)
-
-            def adjoint(weights: np.ndarray, rendering: Any = rendering) -> Tree:
+            def adjoint(weights: np.ndarray, found: Any = found) -> Tree:
                 return session.adjoint(
-                    parameters, rendering.paths, arrays.like(np.asarray(weights, np.float32), rendering.images)
+                    parameters, found.paths, arrays.like(np.asarray(weights, np.float32), found.images)
                 )
 
+            weights, kept = self.weights(images, others, derivative, known)
             for name, part in self.combined(adjoint, weights).items():
                 gradient[name] = part + gradient[name] if name in gradient else part
             views.append(kept)
-            loss += arrays.number(problem.loss_value(index, arrays.mean_over_first(rendering.images)))
-        arrays.evaluate(gradient)
-        samples = self.spp * problem.pixels
-        return ur.Estimate(loss, gradient, info={"samples": samples}), _State(tuple(views))
+            contributions.append(contribution)
+            loss += arrays.number(frame.loss_value(found.mean()))
+        image = self.image.advance(parameters, state.image, tuple(contributions))
+        arrays.evaluate(gradient, image)
+        return ur.Estimate(loss, gradient, info={"samples": self.spp * problem.pixels}), _State(image, tuple(views))
 
     def weights(
         self, images: np.ndarray, others: np.ndarray, derivative: Callable[..., np.ndarray], known: _View | None

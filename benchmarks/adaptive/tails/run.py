@@ -8,7 +8,7 @@ rates.
 
 The methods are prototypes (prototypes.py): images that the loss derivative sees, its derivative, or the gradient's elements clipped at
 a running quantile or mean square, what is cut off added later; medians over sample groups; samples divided unevenly between image and
-adjoint; and the recursive control variate, alone and with the gradient clipped.
+adjoint; and the recursive control variate, alone and with weights or the gradient clipped.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ def methods(spp: int, recorded: bool = False) -> dict[str, Any]:
         "gradient clipped": ClippedGradient(inner),
         "gradient clipped, rest dropped": ClippedGradient(inner, release=0.0),
         "rcv": controlled,
+        "rcv, weights clipped": ClippedWeights(spp, ur.images.RecursiveControlVariate()),
         "rcv, gradient clipped": ClippedGradient(controlled),
     }
     if spp == 2:
@@ -112,7 +113,8 @@ def judged(rows: np.ndarray, reference: np.ndarray, weights: np.ndarray) -> dict
 
 
 def variances(problem: ur.Problem, spp: tuple[int, ...], chains: int, warm: int, steps: int) -> dict[str, Any]:
-    """{spp: {method: {"plain": …, "adam": …}}}; units of Adam from the plain estimator's gradients of all numbers of samples.
+    """{spp: {method: {"plain": …, "adam": …}}}; units of Adam from the gradients of all methods and numbers of samples together: from one
+    method's own, elements whose rare gradients it has missed would weigh too much against the others.
 
     The reference of the distance is the plain estimator with the most samples, with seeds of its own.
     """
@@ -120,7 +122,7 @@ def variances(problem: ur.Problem, spp: tuple[int, ...], chains: int, warm: int,
         n: {name: gradients(problem, e, chains, warm, steps) for name, e in methods(n, recorded=True).items()}
         for n in spp
     }
-    squares = np.mean([np.square(rows[PLAIN]).mean(axis=(0, 1)) for rows in found.values()], axis=0)
+    squares = np.mean([np.square(rows).mean(axis=(0, 1)) for of in found.values() for rows in of.values()], axis=0)
     units = {"plain": np.ones_like(squares), "adam": np.square(element_scales(problem.initial(), squares))}
     own = gradients(problem, ur.PathGradient(spp=max(16, *spp)), 2 * chains, 0, 2 * steps)[chains:]
     return {
