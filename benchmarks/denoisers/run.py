@@ -1,4 +1,4 @@
-"""The denoisers that run here, on one noisy picture: error against a picture without noise, and time.
+"""The denoisers that run here, on one noisy picture of the truth: error against a picture without noise, and time.
 
 Open Image Denoise in both qualities, total variation, and on a GPU the denoiser of OptiX (`mi.OptixDenoiser`), each with and without
 albedo and normals as guides where it takes them. Errors are root mean squares over pixels, relative to that of the noisy picture; the
@@ -15,6 +15,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import SampleRequest, arrays, dr, mi, prepare, stock_scene
+from benchmarks.paths import truth
 from unrender.core.errors import InputError
 from unrender.evaluation.denoising import Denoiser, choose, denoise
 
@@ -58,7 +59,8 @@ def ways(albedo: np.ndarray, normals: np.ndarray) -> dict[str, dict[str, Any]]:
 
 def compare(problem: ur.Problem, spp: int, reference_spp: int, repeats: int) -> dict[str, Any]:
     """Error over the noise's, and milliseconds, the least of the repeats."""
-    at = problem.initial()
+    albedo, normals = guides(problem)  # of the scene's own values, which are the truth
+    at = truth(problem)
     session = prepare(problem, at, derivatives=False)
 
     def picture(samples: int, seed: int) -> np.ndarray:
@@ -70,7 +72,7 @@ def compare(problem: ur.Problem, spp: int, reference_spp: int, repeats: int) -> 
     noisy = picture(spp, 1)
     noise = float(np.sqrt(np.mean((noisy - clean) ** 2)))
     found = {}
-    for name, arguments in ways(*guides(problem)).items():
+    for name, arguments in ways(albedo, normals).items():
         denoise(noisy, **arguments)
         times = []
         for _ in range(repeats):
@@ -84,9 +86,9 @@ def compare(problem: ur.Problem, spp: int, reference_spp: int, repeats: int) -> 
 
 def run(
     problem: tuple[str, ...] = PROBLEMS,
-    size: tuple[int, ...] = (64, 256),
+    size: tuple[int, ...] = (64, 192),
     spp: int = 4,
-    reference_spp: int = 1024,
+    reference_spp: int = 512,
     repeats: int = 3,
 ) -> Iterator[dict[str, Any]]:
     """A part per problem and size.

@@ -7,9 +7,11 @@ python -m benchmarks gpu --toy             run the whole plan at toy sizes, on w
 from __future__ import annotations
 
 import argparse
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from benchmarks.gpu.execute import run_slice
 from benchmarks.gpu.page import lines
@@ -31,6 +33,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--toy", action="store_true", help="toy sizes, on the processor where no GPU works")
     parser.add_argument("--minutes", type=float, default=MINUTES, help="for a slice; what goes on is ended (10)")
     parser.add_argument("--again", action="store_true", help="what has ended, too")
+    parser.add_argument(
+        "--copy", type=Path, help="copy states and records there after each slice: from a machine that is lent"
+    )
     parser.add_argument("--list", action="store_true", help="only list; with --toy, what became of the toy plan")
     given = parser.parse_args(arguments)
     folder = toy() if given.toy else full()
@@ -51,6 +56,9 @@ def main(arguments: Sequence[str]) -> int:
             if given.again:
                 folder.forget(part)
             ends.append(run_slice(part, folder, where, given.minutes))
+            if given.copy:
+                for kept in {folder.states, folder.records}:
+                    shutil.copytree(kept, given.copy, dirs_exist_ok=True)
     finally:
         signal.signal(signal.SIGTERM, before)
     for part, end in zip(chosen, ends, strict=True):

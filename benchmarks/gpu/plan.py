@@ -214,7 +214,16 @@ SLICES: tuple[Slice, ...] = (
         for number, name in enumerate(_ADAPTIVE, 1)
     ),
     _one("adaptive-cost", "cost of the importance map to 4096²", (5, "adaptive.cost --largest 4096")),
-    _one("adaptive-samples", "variance times cost over samples", (6, "adaptive.samples --resolution 128")),
+    _one(
+        "adaptive-samples",
+        "variance times cost over samples",
+        (6, "adaptive.samples --problem ajar spiral indirect-room caustic --resolution 128 --runs 16"),
+    ),
+    _one(
+        "adaptive-tails",
+        "what removes the gradient's heavy tails",
+        (8, "adaptive.tails --problem ajar spiral --resolution 96 --chains 12"),
+    ),
     *(
         _one(
             f"volumes-nerf-{number}",

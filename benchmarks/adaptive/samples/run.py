@@ -21,7 +21,10 @@ MERGE = ("problems.*",)
 QUICK = {"problem": ("mirror-trio",), "spp": (1, 2), "runs": 4, "steps": 3, "resolution": 16}
 RATE = 0.005
 """Length of a step along the line, in each element."""
-PROBLEMS = ("ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room")
+PROBLEMS = (
+    "ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room", "poster", "two-planets",
+    "sun-glossy", "lamp", "chalice", "sunlit-vase", "wall", "smoke", "tea", "three-bodies", "nerf-volume",
+)  # fmt: skip
 
 
 def line(problem: ur.Problem, steps: int) -> list[dict[str, Any]]:
