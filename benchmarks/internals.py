@@ -61,7 +61,9 @@ __all__ = [
     "SampleRequest",
     "Tree",
     "Whole",
+    "WholeView",
     "advance",
+    "allocated",
     "arrays",
     "black_box",
     "coupled_gradients",
@@ -133,6 +135,15 @@ def _mitsuba(problem: ur.Problem) -> Any:
     if not isinstance(problem.renderer, MitsubaRenderer):
         raise TypeError(f"{problem.name} is not rendered by Mitsuba")
     return problem.renderer
+
+
+def allocated() -> Callable[[], int]:
+    """From now on, a function that tells the peak of the bytes that Dr.Jit has allocated: of the GPU where the variant runs on one, else of
+    the host."""
+    backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+    return lambda: int(dr.detail.malloc_watermark(backend))
 
 
 def from_tensor(value: Any, like: Any) -> Any:

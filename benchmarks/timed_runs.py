@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
+from benchmarks.runner.timing import work_time
 
 POINTS = 40
 """Of a curve."""
@@ -32,7 +32,7 @@ class Kept(ur.Callback):
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
-        now = time.process_time()
+        now = work_time()
         # The first step is only known by what the others take.
         self._clock += 0.0 if self._since is None else now - self._since
         self.steps += 1
@@ -41,7 +41,7 @@ class Kept(ur.Callback):
             self.found.append((self._clock, run.full()))
         if self._clock >= self._seconds:
             run.stop()
-        self._since = time.process_time()
+        self._since = work_time()
 
 
 def blind(problem: ur.Problem) -> ur.Problem:

@@ -1,9 +1,10 @@
-"""docs/results.md: notes, tables and figures of all benchmarks that were measured."""
+"""docs/results.md: notes, tables and figures of all benchmarks that were measured, and beside them what a GPU gave."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks.gpu.page import beside
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
@@ -37,7 +38,7 @@ def section(benchmark: Benchmark) -> str | None:
     parts = [f"## {title}", measured, notes, benchmark.module("table").table(record)]
     if (benchmark.folder / "figure.png").is_file():
         parts.append(f"![{title}](../{(benchmark.folder / 'figure.png').relative_to(ROOT).as_posix()})")
-    return "\n\n".join(filter(None, parts))
+    return "\n\n".join(filter(None, [*parts, *beside(benchmark)]))
 
 
 def split_notes(benchmark: Benchmark) -> tuple[str, str]:

@@ -10,9 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.internals import dr
+from benchmarks.internals import dr, mi
 
 Times = dict[str, list[float]]
+
+
+def work_time() -> float:
+    """Seconds of work, for differences: the processor's time of this process, which others on the machine do not lengthen; on a GPU, whose
+    work is none of the processor's, the wall clock's once what was begun has ended."""
+    if (mi.variant() or "").startswith("cuda"):
+        dr.sync_thread()
+        return time.perf_counter()
+    return time.process_time()
 
 
 def turns(contenders: Mapping[str, Callable[[int], Any]], repeats: int = 15, warm: int = 4) -> Times:

@@ -212,6 +212,7 @@ def run(
     texture: int = 64,
     reference_spp: int = 4096,
     gallery_reference_spp: int | None = None,
+    gallery_resolution: int | None = None,
     every: int = 2,
     option: tuple[str, ...] = (),
     option_seeds: int = 1,
@@ -231,6 +232,7 @@ def run(
         texture: side of their textures
         reference_spp: of their references
         gallery_reference_spp: of the gallery's references, none for its own
+        gallery_resolution: film size of the gallery's problems, none for its own
         every: steps of the loop between errors
         option: of `auto`, as "spp=2 learning_rate=0.3", each a setting to tune it by as well; none for not to tune it
         option_seeds: runs of each of these settings, of which the median counts
@@ -239,7 +241,8 @@ def run(
     record = None if retune else records.read(Path(__file__).parent)
     known = record["problems"] if record else {}
     made: dict[str, Callable[[], ur.Problem]] = {}
-    options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
+    given = {"reference_spp": gallery_reference_spp, "resolution": gallery_resolution}
+    options = {key: value for key, value in given.items() if value is not None}
     for name in problem:
         made[name] = lambda name=name: ur.gallery.problem(name, **options)
     if assets is not None:

@@ -17,7 +17,6 @@ round a corner; with assets, the place of the published tray beside its base col
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import Estimator
 from benchmarks.races import TUNING_SEED, Entrant, median_and_range, search, total_error
+from benchmarks.runner.timing import work_time
 from benchmarks.suite.scenes import problem as foreign_problem
 
 INGREDIENTS = ("images", "gradients", "pixels", "perturbed")
@@ -153,15 +153,15 @@ class ProcessorBudget(ur.Callback):
 
     def on_start(self, run: Any) -> None:
         """See `Callback.on_start`."""
-        self._mark = time.process_time()
+        self._mark = work_time()
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
-        self.spent += time.process_time() - self._mark
+        self.spent += work_time() - self._mark
         self.steps = run.step
         if self.spent >= self.seconds:
             run.stop("budget")
-        self._mark = time.process_time()
+        self._mark = work_time()
 
 
 def descend(problem: ur.Problem, entrant: Entrant, rate: float, seed: int, seconds: float) -> tuple[float, int]:

@@ -320,7 +320,10 @@ def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
         watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
     (line,) = run.warnings
     assert line.startswith(f"step 25: {key}: the mesh passes through itself at ")
-    run.stopped = "steps"
+    run.warnings = []  # of an estimator without gradients, as of CMA-ES
+    MeshWatch().on_update(SimpleNamespace(run=run), Estimate(0.0, {}), True)  # type: ignore
+    assert run.warnings == [line.replace("step 25", "step 50")]
+    run.warnings, run.stopped = [line], "steps"
     assert watch.warnings(SimpleNamespace(run=run)) == []  # type: ignore
 
 

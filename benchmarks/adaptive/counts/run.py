@@ -12,7 +12,6 @@ which is measured in turns afterwards (of all threads, so that other work on the
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ import unrender as ur
 from benchmarks.adaptive.over_uniform.run import FOREIGN, GALLERY, Kept, rough_box, spread
 from benchmarks.internals import Key, element_scales
 from benchmarks.races import Entrant, Runs, over, race, reached, tenths
+from benchmarks.runner.timing import work_time
 from benchmarks.suite.scenes import problem as foreign_problem
 
 RACED: dict[str, dict[str, Any]] = {
@@ -110,7 +110,7 @@ def seconds_per_path(problem: ur.Problem, chosen: list[Entrant], rounds: int, st
             self.points: list[tuple[float, float]] = []
 
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
-            self.points.append((time.process_time(), float(record["samples"])))
+            self.points.append((work_time(), float(record["samples"])))
 
     found: dict[str, list[float]] = {entrant.name: [] for entrant in chosen}
     for turn in range(rounds + 1):

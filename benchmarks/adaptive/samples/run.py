@@ -18,10 +18,13 @@ import unrender as ur
 from benchmarks.internals import Key, element_scales
 
 MERGE = ("problems.*",)
-QUICK = {"problem": ("quad",), "spp": (1, 2), "runs": 4, "steps": 3, "resolution": 16}
+QUICK = {"problem": ("mirror-trio",), "spp": (1, 2), "runs": 4, "steps": 3, "resolution": 16}
 RATE = 0.005
 """Length of a step along the line, in each element."""
-PROBLEMS = ("ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room")
+PROBLEMS = (
+    "ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room", "poster", "two-planets",
+    "sun-glossy", "lamp", "chalice", "sunlit-vase", "wall", "smoke", "tea", "three-bodies", "nerf-volume",
+)  # fmt: skip
 
 
 def line(problem: ur.Problem, steps: int) -> list[dict[str, Any]]:

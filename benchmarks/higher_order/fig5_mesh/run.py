@@ -8,7 +8,6 @@ images: the loss less that of noise alone, relative to the start. Seconds are th
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, black_box, dr, vectors
+from benchmarks.runner.timing import work_time
 
 SIGMA = 0.05
 SAMPLES = 64
@@ -53,14 +53,14 @@ class _Track(ur.Callback):
         self.points, self.seconds, self.budget, self.resumed = [start], [0.0], budget, 0.0
 
     def on_start(self, run: Any) -> None:
-        self.resumed = time.process_time()
+        self.resumed = work_time()
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        self.seconds.append(self.seconds[-1] + time.process_time() - self.resumed)
+        self.seconds.append(self.seconds[-1] + work_time() - self.resumed)
         self.points.append(vectors.ravel(run.parameters))
         if self.seconds[-1] >= self.budget:
             run.stop("seconds")
-        self.resumed = time.process_time()
+        self.resumed = work_time()
 
 
 def one(problem: ur.Problem, method: str, seconds: float, seed: int) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, black_box, vectors
+from benchmarks.runner.timing import work_time
 
 GOALS = (0.1, 0.01, 0.001)
 """Errors relative to the start: reductions of 90, 99 and 99.9 %."""
@@ -69,17 +69,17 @@ class _Track(ur.Callback):
         self.errors = [1.0]
 
     def on_start(self, run: Any) -> None:
-        self.resumed = time.process_time()
+        self.resumed = work_time()
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        self.clock += time.process_time() - self.resumed
+        self.clock += work_time() - self.resumed
         self.add(vectors.ravel(run.parameters), self.clock)
         self.samples = record["samples"]
         if np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1]:
             run.stop("goal")
         if self.clock >= self.budget:
             run.stop("seconds")
-        self.resumed = time.process_time()
+        self.resumed = work_time()
 
     def add(self, point: np.ndarray, seconds: float) -> None:
         self.points.append(point)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.higher_order.table2.descents import GOALS, WINDOW, Descent, measured, truth_of
 from benchmarks.internals import dr, mi, stock_scene, vectors
+from benchmarks.runner.timing import work_time
 
 MITSUBA = ("BUNNY", "TEXTURE")
 _SPP = {"BUNNY": 4, "TEXTURE": 8}
@@ -60,7 +60,7 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
         optimizer["x"] = mi.Float(start)
         clock, step = 0.0, 0
         while clock < seconds and step < (2 if warm else 100_000):
-            began = time.process_time()
+            began = work_time()
             place(optimizer["x"])
             image = mi.render(
                 scene,
@@ -74,7 +74,7 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
             optimizer.step()
             dr.eval(optimizer["x"])
             dr.sync_thread()
-            clock += time.process_time() - began
+            clock += work_time() - began
             step += 1
             if warm:
                 continue

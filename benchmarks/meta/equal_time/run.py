@@ -73,6 +73,7 @@ def run(
     steps: int | None = None,
     seeds: int = 5,
     resolution: int | None = None,
+    texture_resolution: int | None = None,
     only: tuple[str, ...] = (),
 ) -> Iterator[dict[str, Any]]:
     """A part per problem.
@@ -81,10 +82,12 @@ def run(
         seconds: budget of every run
         steps: budget of every run, in place of seconds
         resolution: film size, for GPUs
+        texture_resolution: side of the unknown textures, for GPUs
         only: methods to run; the others' figures stay
     """
     for name in problem:
-        options = {**OPTIONS[name], **({"resolution": resolution} if resolution else {})}
+        sizes = {"resolution": resolution, "texture_resolution": texture_resolution}
+        options = {**OPTIONS[name], **{key: value for key, value in sizes.items() if value}}
         chosen = [e for e in entrants(name) if not only or e.name in only]
         given = {"seconds": seconds, "steps": steps}
         budget = {k: v for k, v in given.items() if v is not None} or BUDGETS[name]

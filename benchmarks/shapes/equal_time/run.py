@@ -10,7 +10,6 @@ from their references, relative to the start. Time is the processor's, of all th
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 from benchmarks.races import TUNING_SEED, search
+from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import step_seed
 from benchmarks.timed_runs import POINTS, Kept, blind, measured
 
@@ -84,7 +84,7 @@ class StockShapes:
                 others[key] = self.parameters[key]
         clock, step, next_at, found = 0.0, 0, 0.0, []
         while step < steps if steps is not None else clock < seconds:
-            began = time.process_time()
+            began = work_time()
             self.parameters[self.mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
             for key in others.keys():  # noqa: SIM118 (iterating gives pairs)
                 low, high = self.problem.bounds[key]
@@ -108,7 +108,7 @@ class StockShapes:
             others.step()
             dr.eval(vertices["u"])
             dr.sync_thread()
-            clock += time.process_time() - began
+            clock += work_time() - began
             step += 1
             if steps is None and (clock >= next_at or clock >= seconds):
                 next_at = clock + seconds / POINTS

@@ -2,7 +2,7 @@
 
 Each method in a process of its own: its greatest resident size after a few steps, less that of the same method at 16³,
 over the bytes of the unknowns (extinction and emission, 4 floats a voxel). So many copies of the unknowns a method needs,
-scenes, gradients, states and NumPy's arrays included.
+scenes, gradients, states and NumPy's arrays included. On a GPU it is the peak of the device's memory, in which NumPy has no share.
 """
 
 from __future__ import annotations
@@ -11,20 +11,22 @@ import resource
 from typing import Any
 
 import unrender as ur
-from benchmarks.internals import method_parts
+from benchmarks.internals import allocated, method_parts
 from benchmarks.runner.timing import in_new_process
 
 METHODS = ("plain", "rcv", "meta", "coupled")
 SMALL = 16
+MERGE = ("methods",)
 QUICK = {"method": ("plain",), "grid": (20,), "steps": 2}
 
 
 def peak(method: str, grid: int, steps: int) -> float:
-    """Bytes, of this process."""
-    ur.use()
+    """Bytes, of this process; on a GPU, of the device."""
+    on_gpu = ur.use().startswith("cuda")
+    device = allocated()
     problem = ur.gallery.problem("nerf-volume", resolution=32, grid_resolution=grid, views=2, reference_spp=1)
     ur.optimize(problem, *method_parts(method), steps=steps)
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(device()) if on_gpu else 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def run(method: tuple[str, ...] = METHODS, grid: tuple[int, ...] = (64, 128, 256), steps: int = 4) -> dict[str, Any]:

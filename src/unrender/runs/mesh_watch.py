@@ -34,8 +34,12 @@ class MeshWatch(Hook):
         """See `Hook.on_update`."""
         run = descent.run
         for key, faces in run.problem.faces.items() if applied else ():
-            gradient = estimate.gradient[key]
-            if arrays.number(arrays.total(gradient * gradient)) > 0.0:
+            gradient = estimate.gradient.get(
+                key
+            )  # None of estimators that have losses alone, or directions in its place
+            if gradient is None:
+                pass
+            elif arrays.number(arrays.total(gradient * gradient)) > 0.0:
                 self._seen.add(key)
             elif key in self._seen:
                 self._seen.discard(key)

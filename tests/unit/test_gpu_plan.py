@@ -1,0 +1,213 @@
+"""The plan for a GPU, without one: its options, what is run again and what is not, limits of time, and what it writes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.gpu import cli, execute, outcomes, page
+from benchmarks.gpu.plan import SLICES, Command, Slice
+from benchmarks.gpu.states import Folder, device, full, toy
+from benchmarks.runner.catalogue import ROOT, benchmarks
+from benchmarks.runner.options import add_options
+from unrender.backend import variant
+
+NOWHERE = {"name": "a device", "variant": "llvm_ad_rgb"}
+ALL = benchmarks()
+COMMANDS = [command for part in SLICES for command in part.commands]
+
+
+def run_python(monkeypatch: pytest.MonkeyPatch, **programs: str) -> None:
+    """Let each command, by its first word, be a program in Python instead."""
+    monkeypatch.setattr(execute, "words", lambda part, command, folder: [sys.executable, "-c", programs[command.name]])
+
+
+def made(*names: str) -> Slice:
+    return Slice("a-slice", "what it shows", tuple(Command(name, 1.0) for name in names))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Folder:
+    return Folder(tmp_path / "states", tmp_path / "records", is_toy=True)
+
+
+def test_slices_have_names_of_their_own_and_ten_minutes_at_most() -> None:
+    assert len({part.name for part in SLICES}) == len(SLICES)
+    for part in SLICES:
+        assert 0 < part.minutes <= 10, part.name
+        assert len({command.words for command in part.commands}) == len(part.commands)
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("small", [False, True])
+def test_every_benchmark_of_the_plan_has_its_options(small: bool) -> None:
+    for command in COMMANDS:
+        if command.name in ("doctor", "tests"):
+            continue
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--quick", action="store_true")
+        add_options(parser, ALL[command.name].module("run").run)
+        parser.parse_args(command.arguments(small))  # exits where there is no such option or choice
+
+
+def test_tests_of_the_plan_are_there() -> None:
+    for command in (c for c in COMMANDS if c.name == "tests"):
+        for small in (False, True):
+            (path,) = [word for word in command.arguments(small) if word.startswith("tests/")]
+            assert (ROOT / path).exists()
+
+
+@pytest.mark.mitsuba
+def test_two_commands_of_a_benchmark_in_a_slice_merge_into_one_record() -> None:
+    for part in SLICES:
+        names = [c.name for c in part.commands if c.name not in ("doctor", "tests")]
+        for name in {n for n in names if names.count(n) > 1}:
+            assert getattr(ALL[name].module("run"), "MERGE", ()), f"{part.name}: {name} would lose the first's figures"
+
+
+def test_what_ended_is_not_run_again(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = f"open({str(tmp_path / 'runs')!r}, 'a').write('x')"
+    run_python(monkeypatch, good=count, bad=f"{count}; print('why'); raise SystemExit(3)")
+    part = made("good", "bad")
+    assert folder.summary(part) == "not run"
+    for _ in range(2):
+        assert execute.run_slice(part, folder, NOWHERE, 1.0) == "failed"
+        assert (tmp_path / "runs").read_text() == "xx"
+    entry = folder.read(part)["commands"]["bad"]
+    assert (entry["status"], entry["last_line"]) == (3, "why")
+    assert not folder.is_next(part)
+    folder.forget(part)
+    assert folder.is_next(part)
+
+
+def test_a_slice_over_its_minutes_is_cut_short_and_goes_on(
+    folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execute, "_GRACE", 0.2)
+    flag = tmp_path / "flag"
+    wait = f"import pathlib, time; p = pathlib.Path({str(flag)!r}); p.exists() or (p.touch(), time.sleep(600))"
+    run_python(monkeypatch, first="", slow=wait, last="")
+    part = made("first", "slow", "last")
+    assert execute.run_slice(part, folder, NOWHERE, 0.05) == "cut short"
+    assert [folder.ended(part, c) for c in part.commands] == ["done", "cut short", ""]
+    assert folder.is_next(part)
+    assert execute.run_slice(part, folder, NOWHERE, 1.0) == "done"
+
+
+@pytest.mark.mitsuba
+def test_a_state_names_the_device(folder: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_python(monkeypatch, good="")
+    execute.run_slice(made("good"), folder, NOWHERE, 1.0)
+    assert folder.read(made("good"))["device"] == NOWHERE
+    assert device(on_gpu=False)["variant"] == variant.LLVM
+
+
+def test_children_are_told_the_variant(folder: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_python(monkeypatch, asks="import os; raise SystemExit(os.environ['UNRENDER_VARIANT'] != 'some variant')")
+    assert execute.run_slice(made("asks"), folder, {**NOWHERE, "variant": "some variant"}, 1.0) == "done"
+
+
+def test_without_a_gpu_it_refuses_in_one_line(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "full", lambda: folder)
+    monkeypatch.setattr(variant, "gpu_problem", lambda: "it is on holiday")
+    assert cli.main(["--next"]) == 2
+    told = capsys.readouterr().err
+    assert told == "no GPU works here: it is on holiday; --toy runs the plan on the processor\n"
+    assert not folder.states.exists()
+
+
+def test_the_list_has_a_line_for_each_slice(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in told] == [part.name for part in SLICES]
+
+
+def test_next_goes_through_the_plan(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "full", lambda: folder)
+    monkeypatch.setattr(variant, "gpu_problem", lambda: None)
+    monkeypatch.setattr(cli, "device", lambda on_gpu: NOWHERE)
+    monkeypatch.setattr(execute, "words", lambda part, command, folder: [sys.executable, "-c", ""])
+    folder.records.mkdir()
+    for number in range(1, 3):
+        assert cli.main(["--next", "--copy", str(tmp_path / "copy")]) == 0
+        assert len(list((tmp_path / "copy").glob("*.json"))) == number
+        assert [folder.summary(part) == "done" for part in SLICES[:3]] == [True] * number + [False] * (3 - number)
+
+
+TESTS = """
+import os, pathlib
+def test_good(): pass
+def test_bad(): assert 1 == 2
+def test_fatal():
+    if pathlib.Path("fatal").exists(): os._exit(9)
+def test_last(): pass
+"""
+
+
+def test_tests_go_on_after_the_process_has_ended(tmp_path: Path) -> None:
+    (tmp_path / "test_some.py").write_text(TESTS)
+    (tmp_path / "fatal").touch()
+    file = tmp_path / "tests.jsonl"
+    line = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:xdist",
+        "-p",
+        "benchmarks.gpu.outcomes",
+        "--outcomes",
+        str(file),
+    ]
+    line += ["-c", str(tmp_path / "none.ini"), "--rootdir", str(tmp_path), "test_some.py"]
+    (tmp_path / "none.ini").write_text("[pytest]\n")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'src'}"}
+    for expected in (
+        {"passed": 1, "failed": 1},
+        {"passed": 1, "failed": 1, "ended the process": 1},
+        {"passed": 2, "failed": 1, "ended the process": 1},
+    ):
+        subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, check=False)
+        assert outcomes.counts(file) == expected
+
+
+def record(**more: Any) -> dict[str, Any]:
+    versions, hardware = {"mitsuba": "3"}, {"processor": "p", "cores": 2}
+    return {"command": "a command", "date": "2026-01-02", "versions": versions, "hardware": hardware, **more}
+
+
+@pytest.mark.mitsuba
+def test_figures_of_a_gpu_stand_beside_those_of_the_processor(folder: Folder) -> None:
+    part = next(part for part in SLICES if part.name == "speed")
+    sizes = {"16": {"ms": {"image": [7.25, 7, 8]}, "bytes": 0}}
+    file = folder.records / "speed" / "speed.sizes" / "results.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps(record(settings={"spp": 1}, sizes=sizes)))
+    assert page.beside(ALL["speed.sizes"], folder) == []  # not ended
+    where = {"name": "A fast GPU", "variant": "cuda_ad_rgb"}
+    folder.note(part, part.commands[0], where, {"ended": "done", "seconds": 5.0})
+    (told,) = page.beside(ALL["speed.sizes"], folder)
+    assert "A fast GPU" in told
+    assert "| image | 7.25 |" in told
+    assert page.beside(ALL["speed"], folder) == []
+
+
+def test_a_record_of_a_gpu_is_of_a_gpu() -> None:
+    for part in SLICES:
+        state = full().read(part)
+        assert not state or state["device"]["variant"] == variant.CUDA
+
+
+def test_the_toy_plan_has_run_through() -> None:
+    for part in SLICES:
+        assert toy().summary(part) == "done", part.name
