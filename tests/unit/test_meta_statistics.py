@@ -68,7 +68,7 @@ def test_without_change_it_is_the_average(form: str) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_bounded_weight_forgets_exponentially(form: str) -> None:
-    """Of samples as above: the weight of the past ends at its bound, M is their exponentially weighted mean, and its variance that of one."""
+    """Of samples as above: the weight ends at its bound, M is an exponentially weighted mean, and its variance that of one."""
     rng, most = np.random.default_rng(1), 0.8
     F = rng.choice([-1.0, 1.0], (80, 7))
     state, mean = meta.init(F[0]), F[0]
