@@ -18,9 +18,10 @@ from unrender.capture.mesh import ply
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import Estimator
+from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.loss_values import BlackBox
-from unrender.estimators.sample_groups import gather
+from unrender.estimators.sample_groups import gather, leave_one_out_groups
+from unrender.evaluation import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
 from unrender.methods import method
@@ -50,18 +51,23 @@ __all__ = [
     "Camera",
     "CapturedMesh",
     "Corrections",
+    "Estimate",
     "Estimator",
     "ImageEstimate",
     "ImageEstimator",
     "Key",
     "Optimizer",
     "PixelSampler",
+    "PlainState",
+    "RenderSession",
     "Renderer",
     "SampleRequest",
     "Tree",
     "Whole",
+    "WholeView",
     "advance",
     "arrays",
+    "available_denoiser",
     "black_box",
     "coupled_gradients",
     "dr",
@@ -72,6 +78,7 @@ __all__ = [
     "hardly_seen",
     "hardware",
     "image_step",
+    "leave_one_out_groups",
     "loss_derivative",
     "method",
     "method_parts",
@@ -162,6 +169,14 @@ def coupled_gradients(
 def loss_derivative(problem: ur.Problem, view: int, images: Any) -> Any:
     """The derivative of the problem's loss by the images of a view."""
     return problem.loss_derivative(view, images)
+
+
+def available_denoiser() -> denoising.Denoiser:
+    """The denoiser that "auto" means here; total variation where neither OptiX nor Open Image Denoise can run."""
+    try:
+        return denoising.choose("auto")
+    except ur.InputError:
+        return "variation"
 
 
 def black_box(
