@@ -12,7 +12,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import unrender as ur
-from benchmarks.internals import Estimate, Key, PlainState, Tree, WholeView, arrays, leave_one_out_groups, prepare, trees
+from benchmarks.internals import (
+    Estimate,
+    Key,
+    PlainState,
+    Tree,
+    WholeView,
+    arrays,
+    leave_one_out_groups,
+    prepare,
+    trees,
+)
 
 __all__ = ["DebiasedGradient", "bias_correction"]
 
@@ -65,9 +75,7 @@ class DebiasedGradient:
         gradients, losses, samples = [], [], 0
         for view in range(len(problem.views)):
             frame, of_view = WholeView(problem, view), key.fold(view)
-            found, _ = ur.images.Plain().estimate(
-                problem, parameters, state, frame, self.spp, groups, of_view.fold(0)
-            )
+            found, _ = ur.images.Plain().estimate(problem, parameters, state, frame, self.spp, groups, of_view.fold(0))
             more = frame.request(size * self.renders, of_view.fold(1).uint32(), self.renders)
             correction = bias_correction(frame.loss_derivative, session.image(parameters, more).images)
             weights = frame.loss_derivative(found.others()) + arrays.add_first_axis(correction)

@@ -22,6 +22,9 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import gather, leave_one_out_groups
 from unrender.evaluation import denoising
+from unrender.gallery import parts, volumes
+from unrender.gallery.smoke import Smoke
+from unrender.gallery.specification import build_problem
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
 from unrender.methods import method
@@ -62,6 +65,7 @@ __all__ = [
     "RenderSession",
     "Renderer",
     "SampleRequest",
+    "Smoke",
     "Tree",
     "Whole",
     "WholeView",
@@ -69,6 +73,7 @@ __all__ = [
     "arrays",
     "available_denoiser",
     "black_box",
+    "build_problem",
     "coupled_gradients",
     "dr",
     "element_scales",
@@ -84,6 +89,7 @@ __all__ = [
     "method_parts",
     "mi",
     "mitsuba_renderer",
+    "parts",
     "pixel_probability",
     "pixel_shares",
     "ply",
@@ -97,6 +103,7 @@ __all__ = [
     "trees",
     "vectors",
     "versions",
+    "volumes",
     "volumetric",
 ]
 

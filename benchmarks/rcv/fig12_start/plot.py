@@ -18,7 +18,9 @@ def plot(record: Record) -> Figure:
             below.plot(found["mean_square"], color=COLOURS[name], label=name)
             below.plot(found["closed_form"], color="black", ls=":", lw=0.8)
         above.axhline(0, color="#999999", lw=0.5)
-        above.set(title=f"α = {alpha}, first value {record['largest_first']:.1f}", xlabel="n", ylabel="mean of one sequence")
+        above.set(
+            title=f"α = {alpha}, first value {record['largest_first']:.1f}", xlabel="n", ylabel="mean of one sequence"
+        )
         below.set(xlabel="n", ylabel="mean square (dotted: closed form)", yscale="log")
     axes[0][0].legend(fontsize=8)
     return figure

@@ -17,6 +17,7 @@ from unrender.statistics import welford
 RENDERS = False
 QUICK = {"values": 20, "sequences": 200}
 
+
 def first_kept(alpha: float, count: int) -> np.ndarray:
     """The weights of x₀, ..., x_{count-1} in the mean that begins with its first value: Eq. 19."""
     return np.append(alpha ** (count - 1.0), (1 - alpha) * alpha ** np.arange(count - 2.0, -1, -1))

@@ -24,7 +24,13 @@ def table(record: Record) -> str:
                     str(found["forgotten_after"]),
                 ]
             )
-    heads = ["α", "mean", "weight of the first value after 10 / 50 / 200", "mean square", "largest z against the closed form"]
+    heads = [
+        "α",
+        "mean",
+        "weight of the first value after 10 / 50 / 200",
+        "mean square",
+        "largest z against the closed form",
+    ]
     heads += ["values until the first weighs 1 − α or less"]
     settings = record["settings"]
     return f"{settings['sequences']} sequences of normal variates.\n\n{markdown.table(heads, rows)}"

@@ -3,7 +3,6 @@
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
-
 ORDER = ("stock", "plain", "plain, denoised", "rcv, denoised", "rcv")
 
 

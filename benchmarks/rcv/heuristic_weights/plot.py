@@ -29,8 +29,6 @@ def plot(record: Record) -> Figure:
             right.fill_between(found["steps"], error - spread, error + spread, color=colour, alpha=0.2, lw=0)
         right.axhline(1, color="#999999", lw=0.8)
         left.set(title=f"{name}: mean weight", xlabel="step", ylim=(0, 1.03))
-        right.set(
-            title=f"{name}: squared error over a plain render's (± standard error)", xlabel="step", yscale="log"
-        )
+        right.set(title=f"{name}: squared error over a plain render's", xlabel="step", yscale="log")
         right.legend(fontsize=7)
     return figure

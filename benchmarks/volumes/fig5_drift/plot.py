@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 from benchmarks.runner.records import Record
 from benchmarks.volumes.fig5_drift.run import METHODS
 
-
 STYLES = {"plain": "--", "debiased": ":", "rcv": "-"}
 
 
