@@ -37,7 +37,7 @@ def test_crops_are_of_their_pictures_and_the_wall_is_none_of_them() -> None:
     given = train.pictures()
     assert len(given) == len(train.PICTURES)
     assert "astronaut" not in train.PICTURES
-    assert all(picture.ndim == 3 and 0 <= picture.min() and picture.max() <= 1 for picture in given)
+    assert all(picture.ndim == 3 and picture.min() >= 0 and picture.max() <= 1 for picture in given)
     marked = [np.full((12, 12, 3), label / 10, np.float32) for label in range(5)]
     batch, labels = train.crops(marked, 20, 8, np.random.default_rng(0))
     assert batch.shape == (20, 3, 8, 8)

@@ -9,36 +9,30 @@ from matplotlib.figure import Figure
 from benchmarks.derivative_bias import METHODS
 from benchmarks.runner.records import Record
 
-COLOURS = {"plain, 4 spp": "#e8b04a", "plain, 32 spp": "#b0581a", "rcv, 4 spp": "#1f6fb4"}
-
 
 def plot(record: Record) -> Figure:
-    """Derivatives and their biases above, descents below."""
+    """The derivative of one run and its bias, each row in units of its own."""
     maps, found = record["maps"], record["bias"]["losses"]["perceptual"]
-    figure = plt.figure(figsize=(13, 8.5), layout="constrained")
-    halves: Any = figure.subfigures(2, 1)
-    above, below = halves
-    top = float(np.quantile(np.abs(maps["perceptual/reference"]), 0.98))
-    pictures = {"converged": maps["perceptual/reference"]}
-    for method in METHODS:
-        pictures[f"{method}, one run"] = maps[f"perceptual/{method}"]
-    for method in METHODS:
-        pictures[f"{method}: bias, rms {found[method]['rms']:.2f}"] = maps[f"perceptual/{method}/bias"]
-    drawn: Any = None
-    axes = above.subplots(1, len(pictures))
-    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
-        drawn = axis.imshow(picture, vmin=-top, vmax=top, cmap="RdBu_r")
-        axis.set_title(title, fontsize=8)
-        axis.axis("off")
-    above.colorbar(drawn, ax=list(axes), label="∂L/∂pixel", shrink=0.5)
-    above.suptitle("Derivative of the perceptual loss")
-    for axis, error in zip(below.subplots(1, 2), ("features", "texture"), strict=True):
-        for name, entry in record.get("methods", {}).items():
-            for number, run in enumerate(entry["runs"][error]):
-                points = np.array(run)
-                steps = np.linspace(0, record["settings"]["steps"], len(points))
-                label = f"{name}, rate {entry['rate']:g}" if number == 0 else None
-                axis.plot(steps, points[:, 2], color=COLOURS[name], label=label)
-        axis.set(title=f"{error}, over the start", xlabel="step", yscale="log" if error == "features" else "linear")
-        axis.legend(fontsize=8)
+    figure, axes = plt.subplots(2, len(METHODS) + 1, figsize=(11, 5.6), layout="constrained")
+    exact = maps["perceptual/reference"]
+    pictures: list[list[tuple[str, Any]]] = [
+        [("converged", exact), *((f"{method}, one run", maps[f"perceptual/{method}"]) for method in METHODS)],
+        [
+            ("", None),
+            *(
+                (f"{method}: bias, rms {found[method]['rms']:.2f}", maps[f"perceptual/{method}/bias"])
+                for method in METHODS
+            ),
+        ],
+    ]
+    for row, given in zip(axes, pictures, strict=True):
+        for axis, (title, picture) in zip(row, given, strict=True):
+            axis.axis("off")
+            if picture is None:
+                continue
+            top = float(np.quantile(np.abs(picture), 0.98))
+            drawn = axis.imshow(picture, vmin=-top, vmax=top, cmap="RdBu_r")
+            axis.set_title(title, fontsize=9)
+            figure.colorbar(drawn, ax=axis, shrink=0.8)
+    figure.suptitle("Derivative of the perceptual loss by each pixel, each picture with a scale of its own")
     return figure
