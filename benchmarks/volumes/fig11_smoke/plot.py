@@ -17,7 +17,7 @@ def plot(record: Record) -> Figure:
     budgets = record["budgets"]
     figure, axes = plt.subplots(2, len(budgets), figsize=(4.6 * len(budgets), 8), squeeze=False, layout="constrained")
     for (above, below), (budget, entry) in zip(axes.T, budgets.items(), strict=True):
-        found = entry["methods"]
+        found, by_samples = entry["methods"], budget not in ("steps", "time")
         title = f"smoke, equal {budget}" if budget in ("steps", "time") else f"{budget}, equal steps"
         plain = [name for name in found if name.startswith("plain")]
         spp = [int(name.split(", ")[1]) for name in plain]
@@ -29,7 +29,8 @@ def plot(record: Record) -> Figure:
         above.set_xticks(spp, [str(n) for n in spp])
         above.legend(fontsize=8)
         for name, each in found.items():
-            draw(below, {"runs": each["runs"]["both"]}, 0, SHADES[name], f"{name}: {each['final']['both'][0]:.3f}")
-        below.set(title=title, xlabel="seconds", ylabel="error / initial")
+            label = f"{name}: {each['final']['both'][0]:.3f}"
+            draw(below, {"runs": each["runs"]["both"]}, int(by_samples), SHADES[name], label)
+        below.set(title=title, xlabel="paths" if by_samples else "seconds", ylabel="error / initial")
         below.legend(fontsize=7)
     return figure

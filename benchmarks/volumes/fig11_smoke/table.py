@@ -9,9 +9,10 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """Final errors by samples of the image, and how many a control variate is worth."""
 
-    def summary(entry: dict[str, Any]) -> str:
+    def summary(entry: dict[str, Any], timed: bool) -> str:
         middle, low, high = entry["final"]["both"]
-        return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f}), {entry['runs']['both'][0][-1][0]:.0f} s"
+        seconds = f", {entry['runs']['both'][0][-1][0]:.0f} s" if timed else ""
+        return f"{entry['rate']:g}: {middle:.3f} ({low:.3f} to {high:.3f}){seconds}"
 
     parts = []
     of_smoke = {name: budget for name, budget in record["budgets"].items() if name in ("steps", "time")}
@@ -24,7 +25,10 @@ def table(record: Record) -> str:
         rows = [
             [
                 name,
-                *(summary(budget["methods"][name]) if name in budget["methods"] else "" for budget in budgets.values()),
+                *(
+                    summary(budget["methods"][name], by in of_smoke) if name in budget["methods"] else ""
+                    for by, budget in budgets.items()
+                ),
             ]
             for name in first["methods"]
         ]
@@ -37,5 +41,5 @@ def table(record: Record) -> str:
                     f"For the error of {name} spp a plain image needs {plain} spp at equal steps: {times} times the samples."
                 )
         parts += [" ".join(told), markdown.table(["image, paths per pixel", *heads], rows)]
-    head = "Learning rate of the albedo, error over the initial one: median (range), seconds of a run."
+    head = "Learning rate of the albedo, error over the initial one: median (range); of `smoke`, seconds of a run."
     return "\n\n".join([head, *parts])
