@@ -7,7 +7,14 @@ from matplotlib.figure import Figure
 from benchmarks.runner.records import Record
 from benchmarks.volumes.fig5_drift.run import METHODS
 
-STYLES = {"plain": "--", "debiased": ":", "rcv": "-"}
+STYLES = {
+    "plain, 2 spp": ("#e8b04a", "--"),
+    "plain, 4 spp": ("#d1782a", "--"),
+    "plain, 16 spp": ("#8a4a1a", "--"),
+    "debiased, 2 spp": ("#b03a3a", ":"),
+    "rcv, 2 spp": ("#1f6fb4", "-"),
+    "rcv, 4 spp": ("#7fb2dd", "-"),
+}
 
 
 def plot(record: Record) -> Figure:
@@ -21,9 +28,8 @@ def plot(record: Record) -> Figure:
                 if (found := entry["methods"].get(f"{loss}, {name}")) is None:
                     continue
                 curve = np.array(found["curve"])[:, number]
-                axis.plot(
-                    np.linspace(0, entry["steps"], len(curve)), curve, label=name, ls=STYLES[name.partition(",")[0]]
-                )
+                colour, line = STYLES[name]
+                axis.plot(np.linspace(0, entry["steps"], len(curve)), curve, label=name, color=colour, ls=line)
             axis.axhline(0, color="black", lw=0.5)
             axis.set(title=f"{loss}: {key}", xlabel="step", ylabel="relative distance from the truth")
     axes[0][0].legend(fontsize=7)
