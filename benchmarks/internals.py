@@ -18,10 +18,14 @@ from unrender.capture.mesh import ply
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import Estimator
+from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
-from unrender.estimators.sample_groups import gather
+from unrender.estimators.sample_groups import gather, leave_one_out_groups
+from unrender.evaluation import denoising
+from unrender.gallery import parts, volumes
+from unrender.gallery.smoke import Smoke
+from unrender.gallery.specification import build_problem
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
 from unrender.methods import method
@@ -51,21 +55,27 @@ __all__ = [
     "Camera",
     "CapturedMesh",
     "Corrections",
+    "Estimate",
     "Estimator",
     "ImageEstimate",
     "ImageEstimator",
     "Key",
     "Optimizer",
     "PixelSampler",
+    "PlainState",
+    "RenderSession",
     "Renderer",
     "SampleRequest",
+    "Smoke",
     "Tree",
     "Whole",
     "WholeView",
     "advance",
     "allocated",
     "arrays",
+    "available_denoiser",
     "black_box",
+    "build_problem",
     "coupled_gradients",
     "dr",
     "element_scales",
@@ -75,11 +85,13 @@ __all__ = [
     "hardly_seen",
     "hardware",
     "image_step",
+    "leave_one_out_groups",
     "loss_derivative",
     "method",
     "method_parts",
     "mi",
     "mitsuba_renderer",
+    "parts",
     "pixel_probability",
     "pixel_shares",
     "ply",
@@ -93,6 +105,7 @@ __all__ = [
     "trees",
     "vectors",
     "versions",
+    "volumes",
     "volumetric",
     "with_differential_bsdf",
 ]
@@ -175,6 +188,14 @@ def coupled_gradients(
 def loss_derivative(problem: ur.Problem, view: int, images: Any) -> Any:
     """The derivative of the problem's loss by the images of a view."""
     return problem.loss_derivative(view, images)
+
+
+def available_denoiser() -> denoising.Denoiser:
+    """The denoiser that "auto" means here; total variation where neither OptiX nor Open Image Denoise can run."""
+    try:
+        return denoising.choose("auto")
+    except ur.InputError:
+        return "variation"
 
 
 def black_box(

@@ -28,12 +28,14 @@ def stock_loop(
     every: int = 5,
     falling: bool = False,
     error: Callable[[dict[str, Any]], Any] | None = None,
+    timer: Callable[[], float] = time.perf_counter,
 ) -> list[dict[str, Any]]:
     """`mi.render` with `prb`, or `prbvolpath` where there are media, `dr.backward`, `mi.ad.Adam`, values clipped.
 
     With `falling`, rates fall over the budget as half a cosine.
 
-    `error` is what the history has under "parameter_error"; None for the problem's own.
+    `error` is what the history has under "parameter_error"; None for the problem's own. `timer` counts the seconds: `time.process_time`
+    for those of the processor.
 
     Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
     """
@@ -51,7 +53,7 @@ def stock_loop(
         parameters.update(optimizer)
         clock, step = 0.0, 0
         while clock < seconds and step < (2 if warm else steps):
-            began = time.perf_counter()
+            began = timer()
             loss: Any = 0.0
             for view in range(len(problem.views)):
                 number = step_seed(seed, step, view)
@@ -77,7 +79,7 @@ def stock_loop(
             parameters.update(optimizer)
             value = float(np.array(dr.detach(loss)).reshape(-1)[0])
             dr.sync_thread()
-            clock += time.perf_counter() - began
+            clock += timer() - began
             step += 1
             if not warm and (step % every == 0 or clock >= seconds or step >= steps):
                 now = {key: mi.TensorXf(dr.ravel(dr.detach(optimizer[key])), tuple(start[key].shape)) for key in start}

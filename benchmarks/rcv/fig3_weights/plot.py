@@ -12,6 +12,7 @@ RULES = {
     "analytic": ("analytic n/(n+1)", "#222222"),
     "online": ("Eq. 8, running statistics of F_CV", "#d1782a"),
     "absolute": ("Eq. 8 + recurrence, absolute", "#8a55a8"),
+    "zero start": ("Eq. 8 + recurrence, relative, weight 0 at first", "#4a9a6a"),
     "relative": ("Eq. 8 + recurrence, relative (unrender)", "#1f6fb4"),
 }
 
@@ -34,7 +35,7 @@ def plot(record: Record) -> Figure:
         axes["variance"].fill_between(steps + 1, mean - error, mean + error, color=colour, alpha=0.2, lw=0)
     axes["variance"].plot(steps + 1, 1 / (steps + 1), color="#999999", lw=4, alpha=0.5, zorder=0, label="1/(n+1)")
     axes["variance"].plot(
-        steps[3:] + 1, 1 / (steps[3:] - 1), color="#999999", ls=":", label="1/(n-1): statistics from step 1 on"
+        steps[3:] + 1, 1 / (steps[3:] - 1), color="#999999", ls=":", label="1/(n-1): weight 0 at steps 1 and 2"
     )
     axes["weight"].set(
         xlabel="step n", ylabel="control weight (mean; 10th to 90th percentile)", title="Weights", ylim=(0, 1.02)

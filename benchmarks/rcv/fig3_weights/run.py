@@ -1,17 +1,18 @@
 """Steady state of the control weights (RCV Fig. 3): weights and variance on a scene that does not change.
 
-On an unchanging `indirect-room` the best weight is n/(n+1) and the variance 1/(n+1) of one render's. Four rules weigh
-the same renders:
+On an unchanging `indirect-room` the best weight is n/(n+1) and the variance 1/(n+1) of one render's. Five rules weigh
+the same renders (`benchmarks/weight_rules.py`):
 
 - analytic: n/(n+1);
 - online: Eq. 8 with Var[F_CV] from running statistics of F_CV itself, as if consecutive images were independent;
 - relative: Eq. 8 with the recurrence (10), kept relative to Var[F]: `unrender.images.RecursiveControlVariate` itself;
-- absolute: the same recurrence in absolute units, which keeps early, bad estimates of Var[F].
+- zero start: the same, its weight 0 while the statistics know no variance, at two steps: the paper's start;
+- absolute: the recurrence in absolute units, which keeps early, bad estimates of Var[F]; its start is the paper's, too.
 
-All but the analytic rule estimate variances from earlier renders, from step 1 on, so that the first weight above 0 is
-that of step 3: the best that they can reach is 1/(n-1), a dotted line in the figure. The variance is that over
-independent runs, per pixel, summed, divided by that of one render. The bias is the mean over runs less that of the
-analytic rule on the same renders (which is unbiased), relative to the mean of the image.
+All but the analytic rule estimate variances from earlier renders, from step 1 on, so that the first weight from
+statistics is that of step 3. With weight 0 until then, the best that they can reach is 1/(n-1), a dotted line in the
+figure. The variance is that over independent runs, per pixel, summed, divided by that of one render. The bias is the
+mean over runs less that of the analytic rule on the same renders (which is unbiased), relative to the mean of the image.
 """
 
 from __future__ import annotations
@@ -21,62 +22,11 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, SampleRequest, advance, arrays, prepare
 from benchmarks.moments import Moments, summed_variances
-from benchmarks.paths import images_along
-from unrender import statistics
-from unrender.statistics import welford
+from benchmarks.weight_rules import one_run
 
-RULES = ("analytic", "online", "absolute", "relative")
+RULES = ("analytic", "online", "absolute", "zero start", "relative")
 QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3}
-
-
-class Simulated:
-    """A control variate on renders F = H of an unchanging scene, in NumPy, with one of the other rules."""
-
-    def __init__(self, rule: str, first: np.ndarray):
-        self.rule, self.step, self.image = rule, 0, first
-        self.renders = welford.init(first)
-        self.own = welford.update(welford.init(first), first, first)
-        self.variance = np.zeros_like(first)
-
-    def advance(self, F: np.ndarray) -> np.ndarray:
-        """Takes the next render; returns the weight that it used."""
-        self.step += 1
-        var = welford.covariance(self.renders)
-        if self.rule == "analytic":
-            weight = np.full_like(F, self.step / (self.step + 1))
-        else:
-            var_cv = welford.covariance(self.own) if self.rule == "online" else self.variance
-            weight = statistics.control_weight(var, var, var_cv)
-        self.image = advance(self.image, F, F, weight)
-        self.renders = welford.update(self.renders, F, F)
-        self.own = welford.update(self.own, self.image, self.image)
-        var = welford.covariance(self.renders)
-        self.variance = statistics.control_variate_variance(weight, var, var, var, self.variance)
-        return weight
-
-
-def one_run(
-    problem: ur.Problem, steps: int, spp: int, seed: int
-) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Renders (steps, H, W, 3), and per rule the images and the weights (0 at the first step) of the same shape."""
-    start = problem.initial()
-    session, sensor = prepare(problem, start, "path"), problem.views[0].sensor
-    requests = [SampleRequest(sensor, spp, Key(seed, step).uint32()) for step in range(steps)]
-    renders = np.stack([arrays.numpy(session.image(start, request).images[0]) for request in requests])
-    renders = renders.astype(np.float64)
-    images, weights = {}, {}
-    for rule in ("analytic", "online", "absolute"):
-        simulated = Simulated(rule, renders[0])
-        used, kept = [np.zeros_like(renders[0])], [renders[0]]
-        for F in renders[1:]:
-            used.append(simulated.advance(F))
-            kept.append(simulated.image)
-        images[rule], weights[rule] = np.stack(kept), np.stack(used)
-    relative = ur.images.RecursiveControlVariate()
-    images["relative"], weights["relative"] = images_along(problem, relative, [start] * steps, spp, seed)
-    return renders, images, weights
 
 
 def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> dict[str, Any]:
@@ -90,8 +40,8 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
     spread: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
     maps: dict[str, np.ndarray] = {}
     for number in range(runs):
-        renders, kept, used = one_run(problem, steps, spp, number)
-        for F in renders:
+        kept, used = one_run(problem, [problem.initial()] * steps, spp, number, ("plain", *RULES))
+        for F in kept["plain"]:
             single.add(F)
         for rule in RULES:
             images[rule].append(kept[rule].astype(np.float32))

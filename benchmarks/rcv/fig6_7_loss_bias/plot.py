@@ -13,13 +13,13 @@ from benchmarks.runner.records import Record
 
 def plot(record: Record) -> Figure:
     """Fig. 6 above, Fig. 7 below."""
-    whole = plt.figure(figsize=(12.5, 13), layout="constrained")
+    whole = plt.figure(figsize=(14.5, 13), layout="constrained")
     halves: Any = whole.subfigures(2, 1, height_ratios=[1.3, 1])
     above, below = halves
     plot_landscape(above.subplots(2, 2), record["fig6"], "the wall's albedo")
     s = record["settings"]
     above.suptitle(f"Fig. 6: indirect-room, {s['resolution']}², mean of {s['runs']} renders (± standard error)")
-    plot_derivatives(below.subplots(2, 5), below, record)
+    plot_derivatives(below.subplots(2, 6), below, record)
     words = "bias and variance relative to the mean of |derivative| and its square"
     below.suptitle(f"Fig. 7: derivative of the loss at step {s['step']} of a descent, {s['runs']} runs; {words}")
     return whole
@@ -36,6 +36,7 @@ def plot_derivatives(axes: Any, figure: Any, record: Record) -> None:
             "plain": f"plain, {record['settings']['spp']} spp, one run",
             "rcv": "control variate, one run",
             "plain/bias": f"plain: bias {entry['plain']['signed']:+.1%}, rms {entry['plain']['rms']:.1%}",
+            "debiased/bias": f"Eq. 14: bias {entry['debiased']['signed']:+.1%}, rms {entry['debiased']['rms']:.1%}",
             "rcv/bias": f"control v.: bias {entry['rcv']['signed']:+.1%}, rms {entry['rcv']['rms']:.1%}",
         }
         drawn: Any = None

@@ -8,7 +8,8 @@ At factor 1.2, 4 spp, the mean of `unrender.PathGradient` (path replay) must agr
 
 Fig. 7: the derivative of the loss by each pixel at step 20 of a real descent, from a plain render and from a control
 variate that took the same 20 steps; mean over runs less the derivative at a converged image, its mean square freed of
-the runs' noise, and the variance. Derivatives are per pixel, times the number of pixels and channels, so that L1's
+the runs' noise, and the variance. "debiased" is the plain render's with its bias subtracted, as 256 more renders tell it (Eq. 14): an
+ablation, at 257 times the samples. Derivatives are per pixel, times the number of pixels and channels, so that L1's
 are ±1.
 """
 
@@ -19,16 +20,16 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Tree, arrays
+from benchmarks.derivative_bias import derivatives
+from benchmarks.internals import Tree
 from benchmarks.loss_landscape import LOSSES, check, places, sample, statistics
-from benchmarks.moments import Moments, paired_bias
-from benchmarks.paths import converged, descent, follow
+from benchmarks.paths import converged, descent
 
 KEY = "back.bsdf.reflectance.data"
 TRUE_SCALE = 0.7
 """The true wall is this share of the photograph, so that factors up to 1.4 keep its albedo below 1."""
 CHECK_FACTOR, CHECK_SPP = 1.2, 4
-QUICK = {"resolution": 8, "runs": 3, "step": 3, "factors": 3, "reference_spp": 256}
+QUICK = {"resolution": 8, "runs": 3, "step": 3, "factors": 3, "renders": 4, "reference_spp": 256}
 
 
 def at(problem: ur.Problem, factor: float) -> Tree:
@@ -50,45 +51,14 @@ def by_factor(problem: ur.Problem, factors: np.ndarray, runs: int, reference_spp
     return {**found, "check": checked}
 
 
-def derivatives(
-    problem: ur.Problem, steps: int, spp: int, runs: int, reference_spp: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Fig. 7: numbers per loss and method, and maps."""
-    path = descent(problem, ur.PathGradient(spp=16), 0.02, steps + 1)
-    target = converged(problem, {KEY: problem.renderer.array(problem.truth[KEY])}, reference_spp).mean
-    image = converged(problem, path[-1], reference_spp, seed=123_456).mean
-    methods = {"plain": ur.images.Plain(), "rcv": ur.images.RecursiveControlVariate()}
-    moments = {(loss, method): Moments() for loss in LOSSES for method in methods}
-    variance = {method: Moments() for method in methods}
-    maps: dict[str, np.ndarray] = {}
-    for method, estimator in methods.items():
-        taken = path if method == "rcv" else path[-1:]  # a plain render knows nothing of the steps before
-        for run in range(runs):
-            *_, last = follow(problem, estimator, taken, spp, run)
-            noisy = arrays.numpy(last.mean()).astype(np.float64)
-            variance[method].add(noisy)
-            for name, loss in LOSSES.items():
-                slope = loss.derivative(noisy, target)
-                moments[name, method].add(slope - loss.derivative(image, target))
-                if run == 0:
-                    maps[f"{name}/{method}"] = slope.mean(axis=-1)
-    result: dict[str, Any] = {}
-    for name, loss in LOSSES.items():
-        reference = loss.derivative(image, target)
-        scale = float(np.abs(reference).mean())
-        maps[f"{name}/reference"] = reference.mean(axis=-1)
-        result[name] = {"scale": scale}
-        for method in methods:
-            found = moments[name, method]
-            spread = float(found.variance.mean() / scale**2)
-            result[name][method] = {**paired_bias(found, scale), "variance": spread}
-            maps[f"{name}/{method}/bias"] = found.mean.mean(axis=-1)
-    gain = float(variance["plain"].variance.sum() / variance["rcv"].variance.sum())
-    return {"losses": result, "image_variance_ratio": gain}, maps
-
-
 def run(
-    resolution: int = 40, runs: int = 24, spp: int = 4, step: int = 20, factors: int = 13, reference_spp: int = 8192
+    resolution: int = 40,
+    runs: int = 24,
+    spp: int = 4,
+    step: int = 20,
+    factors: int = 13,
+    renders: int = 256,
+    reference_spp: int = 8192,
 ) -> dict[str, Any]:
     """Both figures.
 
@@ -96,8 +66,11 @@ def run(
         spp: of Fig. 7
         step: of Fig. 7
         factors: points between 0.6 and 1.4
+        renders: that tell the bias of Eq. 14
     """
     problem = ur.gallery.problem("indirect-room", resolution=resolution, texture_resolution=resolution, loss="L1")
     fig6 = by_factor(problem, np.linspace(0.6, 1.4, factors), runs, reference_spp)
-    fig7, maps = derivatives(problem, step, spp, runs, reference_spp)
+    path = descent(problem, ur.PathGradient(spp=16), 0.02, step + 1)
+    target = converged(problem, {KEY: problem.renderer.array(problem.truth[KEY])}, reference_spp).mean
+    fig7, maps = derivatives(problem, path, LOSSES, target, spp, runs, renders, reference_spp)
     return {"fig6": fig6, "fig7": fig7, "maps": maps}

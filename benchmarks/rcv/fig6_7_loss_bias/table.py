@@ -1,6 +1,7 @@
 """Table."""
 
 from benchmarks import markdown
+from benchmarks.derivative_bias import METHODS
 from benchmarks.runner.records import Record
 
 
@@ -9,7 +10,7 @@ def table(record: Record) -> str:
     settings = record["settings"]
     rows = []
     for loss, entry in record["fig7"]["losses"].items():
-        for method in ("plain", "rcv"):
+        for method in METHODS:
             f = entry[method]
             rows.append(
                 [

@@ -3,20 +3,28 @@
 Each method is tuned on a seed of its own over a grid of samples per pixel and learning rates for the whole budget; the
 best by final parameter error then runs on the seeds, all methods in turns. The error is each parameter's RMSE relative
 to where it began, averaged over parameters. `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` is this
-library's gradient on leave-one-out sample groups; `rcv` has a recursive control variate besides.
+library's gradient on leave-one-out sample groups; `rcv` has a recursive control variate besides. "denoised" is either of
+these with its images denoised before the loss sees them, by Open Image Denoise or OptiX; where neither is there, by total
+variation, and the record says by which.
+
+Equal time is that of the clock; with `--processor` that of the processor, all cores together, which other work on the
+machine does not change much: entries of their own, on smaller films.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
+from benchmarks.internals import ImageEstimator, available_denoiser
 from benchmarks.races import TUNING_SEED, median_and_range, total_error
 from benchmarks.stock_loop import stock_loop
+from benchmarks.timed_runs import Kept, blind
 
 Grid = dict[str, list[tuple[int, float]]]
 
@@ -31,6 +39,26 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "sunlit-vase": {"resolution": 64, "reference_spp": 4096},
     "lamp": {"resolution": 64, "reference_spp": 4096},
 }
+# By processor time, on films of at most this size: three configurations each.
+SMALL: dict[str, dict[str, Any]] = {
+    "indirect-room": {"resolution": 64, "texture_resolution": 32, "reference_spp": 4096},
+    "tea": {"resolution": 32, "reference_spp": 8192},
+}
+GRID: Grid = {
+    "plain": [(8, 1e-2), (32, 1e-2), (32, 3e-2)],
+    "stock": [(32, 1e-2), (32, 2e-2), (32, 3e-2)],
+    "rcv": [(4, 1e-2), (4, 2e-2), (8, 2e-2)],
+    "plain, denoised": [(8, 1e-2), (8, 2e-2), (32, 2e-2)],
+    "rcv, denoised": [(4, 1e-2), (4, 2e-2), (8, 2e-2)],
+}
+METHODS = ("plain", "stock", "rcv")
+DENOISED = ("plain, denoised", "rcv, denoised")
+IMAGES: dict[str, Callable[[], ImageEstimator]] = {
+    "plain": ur.images.Plain,
+    "rcv": ur.images.RecursiveControlVariate,
+    "plain, denoised": lambda: ur.images.Denoised(ur.images.Plain(), by=available_denoiser()),
+    "rcv, denoised": lambda: ur.images.Denoised(ur.images.RecursiveControlVariate(), by=available_denoiser()),
+}
 MERGE = ("entries",)
 QUICK = {
     "problem": ("indirect-room",), "loss": ("L2",), "seconds": 0.5, "seeds": 2, "resolution": 16,
@@ -39,49 +67,55 @@ QUICK = {
 
 
 def descend(
-    problem: ur.Problem, method: str, spp: int, rate: float, seconds: float, seed: int
+    problem: ur.Problem, method: str, spp: int, rate: float, seconds: float, seed: int, processor: bool
 ) -> list[tuple[float, float]]:
     """(seconds, error) along one run."""
-    if method == "stock":
-        history = stock_loop(problem, spp, rate, seconds=seconds, seed=seed)
-    else:
-        image = ur.images.Plain() if method == "plain" else ur.images.RecursiveControlVariate()
-        optimizer = ur.optimizers.Adam(learning_rate=rate)
-        history = ur.optimize(problem, ur.PathGradient(image, spp=spp), optimizer, seconds=seconds, seed=seed).history
     start = problem.parameter_error(problem.initial())
+    if method == "stock":
+        timer = time.process_time if processor else time.perf_counter
+        history = stock_loop(problem, spp, rate, seconds=seconds, seed=seed, timer=timer)
+    else:
+        estimator, optimizer = ur.PathGradient(IMAGES[method](), spp=spp), ur.optimizers.Adam(learning_rate=rate)
+        if processor:
+            kept, limit = Kept(seconds), 100 * seconds  # of the clock, never reached
+            ur.optimize(blind(problem), estimator, optimizer, seconds=limit, seed=seed, callbacks=[kept])
+            return [(at, total_error(problem.parameter_error(values), start)) for at, values in kept.found]
+        history = ur.optimize(problem, estimator, optimizer, seconds=seconds, seed=seed).history
     return [(h["seconds"], total_error(h["parameter_error"], start)) for h in history if "parameter_error" in h]
 
 
 def tune(
-    problem: ur.Problem, method: str, grid: list[tuple[int, float]], seconds: float
+    problem: ur.Problem, method: str, grid: list[tuple[int, float]], seconds: float, processor: bool
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The best of the grid and all that were tried; where there is nothing to choose, no error and nothing tried."""
     if len(grid) == 1:
         return {"spp": grid[0][0], "rate": grid[0][1], "error": None}, []
     tried: list[dict[str, Any]] = []
     for spp, rate in grid:
-        error = descend(problem, method, spp, rate, seconds, TUNING_SEED)[-1][1]
+        error = descend(problem, method, spp, rate, seconds, TUNING_SEED, processor)[-1][1]
         tried.append({"spp": spp, "rate": rate, "error": error})
         print(f"{problem.name} {method} spp {spp} rate {rate}: {error:.3f}", flush=True)
     return min(tried, key=lambda t: t["error"]), tried
 
 
 def compare(
-    name: str, loss: str, seconds: float, seeds: int, options: dict[str, Any], chosen: Grid | None
+    name: str, loss: str, seconds: float, seeds: int, options: dict[str, Any], chosen: Grid | None, processor: bool
 ) -> dict[str, Any]:
     """Tune every method, then run its best on the seeds, in turns."""
     problem = ur.gallery.problem(name, loss=loss, **options)
     found: dict[str, Any] = {"problem": name, "loss": loss, "seconds": seconds, "options": options, "methods": {}}
     methods, counts = found["methods"], NOISY if name == "indirect-room" else SPP
-    for method in ("plain", "stock", "rcv"):
+    if processor:
+        found |= {"processor": True, "denoiser": available_denoiser()}
+    for method in (*METHODS, *(DENOISED if processor else ())):
         # The stock loop takes plain's spp: its estimate is the same but for the sample groups.
-        spp = (methods["plain"]["spp"],) if method == "stock" else counts[method]
-        grid = list(itertools.product(spp, RATES))
-        best, tried = tune(problem, method, chosen.get(method, grid) if chosen else grid, seconds)
+        spp = (methods["plain"]["spp"],) if method == "stock" else counts.get(method, ())
+        grid = GRID[method] if processor else list(itertools.product(spp, RATES))
+        best, tried = tune(problem, method, chosen.get(method, grid) if chosen else grid, seconds, processor)
         methods[method] = {**best, "tried": tried, "runs": []}
     for seed in range(seeds):
         for method, entry in methods.items():
-            entry["runs"].append(descend(problem, method, entry["spp"], entry["rate"], seconds, seed))
+            entry["runs"].append(descend(problem, method, entry["spp"], entry["rate"], seconds, seed, processor))
             print(f"{name} {loss} {method} seed {seed}: {entry['runs'][-1][-1][1]:.3f}", flush=True)
     found["summary"] = summarise(found)
     return found
@@ -94,7 +128,7 @@ def summarise(found: dict[str, Any]) -> dict[str, Any]:
         final = [run[-1][1] for run in entry["runs"]]
         rows[method] = {"final": median_and_range(final), "best": median_best(entry["runs"])}
     ours = found["methods"]["rcv"]["runs"]
-    for method in ("stock", "plain"):
+    for method in (method for method in found["methods"] if method != "rcv"):
         rows[method]["ratio"] = rows["rcv"]["final"][0] / rows[method]["final"][0]
         reached = [next((t for t, e in run if e <= rows[method]["best"]), None) for run in ours]
         rows[method]["rcv_reaches_its_best_after"] = reached
@@ -116,21 +150,26 @@ def parse(given: tuple[str, ...]) -> Grid | None:
 
 
 def run(
-    problem: tuple[str, ...] = tuple(OPTIONS),
+    problem: tuple[str, ...] = (*OPTIONS, "tea"),
     loss: tuple[str, ...] = ("L1", "L2"),
     seconds: float | None = None,
     seeds: int = 5,
     resolution: int | None = None,
     grid: tuple[str, ...] = (),
+    processor: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """A part per problem and loss.
 
     Args:
-        seconds: budget of every run (15 for indirect-room, else 4)
+        problem: by the clock all but tea, by processor time indirect-room and tea
+        seconds: budget of every run (15 for indirect-room, else 4; by processor time 8)
         resolution: film size, for GPUs
         grid: METHOD=SPP:RATE,..., in place of the method's grid; a single one is taken as it is
+        processor: whether seconds are of the processor; then with denoised images, too, and smaller films
     """
-    for name, which in itertools.product(problem, loss):
-        options = {**OPTIONS[name], **({"resolution": resolution} if resolution else {})}
-        budget = seconds or BUDGETS.get(name, 4.0)
-        yield {"entries": {f"{name}, {which}": compare(name, which, budget, seeds, options, parse(grid))}}
+    sizes = SMALL if processor else OPTIONS
+    for name, which in itertools.product((name for name in problem if name in sizes), loss):
+        options = {**sizes[name], **({"resolution": resolution} if resolution else {})}
+        budget = seconds or (8.0 if processor else BUDGETS.get(name, 4.0))
+        entry = f"{name}, {which}{', processor' if processor else ''}"
+        yield {"entries": {entry: compare(name, which, budget, seeds, options, parse(grid), processor)}}

@@ -3,13 +3,15 @@
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
+ORDER = ("stock", "plain", "plain, denoised", "rcv, denoised", "rcv")
+
 
 def table(record: Record) -> str:
     """Equal-time reconstruction."""
     rows = []
     for entry in record["entries"].values():
         summary = entry["summary"]
-        for method in ("stock", "plain", "rcv"):
+        for method in (each for each in ORDER if each in entry["methods"]):
             chosen, row = entry["methods"][method], summary[method]
             middle, low, high = row["final"]
             other = ""
@@ -24,7 +26,7 @@ def table(record: Record) -> str:
                 [
                     entry["problem"],
                     entry["loss"],
-                    f"{entry['seconds']:g} s",
+                    f"{entry['seconds']:g} s{' of the processor' if 'processor' in entry else ''}",
                     f"{method} ({chosen['spp']} spp, {chosen['rate']:g})",
                     f"{middle:.3f} ({low:.3f} to {high:.3f})",
                     f"{row['best']:.3f}",

@@ -1,8 +1,11 @@
-"""Samples that a control variate of the image saves (RCV Fig. 11): `smoke`, L1.
+"""Samples that a control variate of the image saves (RCV Fig. 11): three volumes, L1.
+
+The gallery's `smoke`, under a bright sky; the same smoke with a lamp inside it, under a dim one; and the volume of
+Mitsuba's tutorials under the bright sky, which is left out where the assets are not there (`scenes.py`).
 
 Differential ratio tracking with 1 adjoint path per pixel throughout; the image with 1 to 32 paths per pixel without a
 control variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget:
-the albedo's, extinction's being 10 times that. At equal steps, and some of them at equal time.
+the albedo's, extinction's being 10 times that. At equal steps, and of `smoke` some of them at equal time.
 
 Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient
 (extinction times albedo), averaged: the albedo of empty voxels shows in no image. "needs" says how many samples a plain
@@ -12,6 +15,7 @@ image needs for the error that a control variate leaves: between the two neighbo
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +23,21 @@ import numpy as np
 import unrender as ur
 from benchmarks.measured_races import compete, scaled
 from benchmarks.races import Entrant
+from benchmarks.volumes.fig11_smoke.scenes import FILE, problem
 from benchmarks.volumes.smoke_error import measure
 
-PLAIN, WITH = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16)}, (1, 2)
-RATES = {"steps": (0.001, 0.0018, 0.003), "time": (0.001, 0.003)}
+PLAIN = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16), "lit inside": (1, 4, 16), "tutorial": (1, 4, 16)}
+WITH = {"steps": (1, 2), "time": (1, 2), "lit inside": (1,), "tutorial": (1,)}
+RATES = {
+    "steps": (0.001, 0.0018, 0.003),
+    "time": (0.001, 0.003),
+    "lit inside": (0.001, 0.002, 0.004),
+    "tutorial": (0.002, 0.004, 0.008),
+}
+OTHERS = ("lit inside", "tutorial")
+"""Volumes beside `smoke`, at equal steps."""
 MERGE = ("budgets.*.methods",)
-QUICK = {"budget": ("steps",), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
+QUICK = {"budget": ("steps", "lit inside"), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
 
 
 def entrants(budget: str) -> list[Entrant]:
@@ -35,7 +48,8 @@ def entrants(budget: str) -> list[Entrant]:
         for n in PLAIN[budget]
     ]
     return plain + [
-        Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget]) for n in WITH
+        Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget])
+        for n in WITH[budget]
     ]
 
 
@@ -61,9 +75,11 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
     for budget in (b for b in PLAIN if b in record["budgets"]):
         entry, names = record["budgets"][budget], [entrant.name for entrant in entrants(budget)]
         budgets[budget] = {**entry, "methods": {n: entry["methods"][n] for n in names if n in entry["methods"]}}
-    found, methods = {"budgets": budgets}, budgets.get("steps", {}).get("methods", {})
-    if len(methods) == len(entrants("steps")):
-        found["needs"] = {f"rcv, {n}": needs(methods, f"rcv, {n}") for n in WITH}
+    found: dict[str, Any] = {"budgets": budgets, "needs": {}}
+    for budget, entry in budgets.items():
+        methods = entry["methods"]
+        if budget != "time" and len(methods) == len(entrants(budget)):
+            found["needs"][budget] = {f"rcv, {n}": needs(methods, f"rcv, {n}") for n in WITH[budget]}
     return found
 
 
@@ -75,19 +91,24 @@ def run(
     only: tuple[str, ...] = (),
     resolution: int = 24,
     grid: int = 16,
+    assets: Path = Path("../shared/assets"),
 ) -> Iterator[dict[str, Any]]:
     """A part per budget.
 
     Args:
-        budget: those to race; the other's figures stay
+        budget: those to race, steps and time of smoke, or another volume at equal steps; the others' figures stay
         seconds: of every run at equal time
         steps: of every run at equal steps
         only: methods to run; the others' figures stay
         grid: voxels along a side
+        assets: folder with tutorials/volume.vol
     """
-    problem = ur.gallery.problem("smoke", resolution=resolution, grid_resolution=grid, reference_spp=4096)
     for by in budget:
+        made = problem(by if by in OTHERS else "smoke", resolution, grid, 4096, assets)
+        if made is None:
+            print(f"{by}: no {FILE} below {assets}: left out", flush=True)
+            continue
         limit = {"seconds": seconds} if by == "time" else {"steps": steps}
         chosen = [entrant for entrant in entrants(by) if not only or entrant.name in only]
-        methods = compete(problem, chosen, measure(problem), "both", seeds, **limit)
+        methods = compete(made, chosen, measure(made), "both", seeds, **limit)
         yield {"budgets": {by: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}}

@@ -6,13 +6,13 @@ from benchmarks.runner.records import Record
 
 def table(record: Record) -> str:
     """Distances from the truth."""
-    keys = list(next(iter(record["drift"].values())))
+    entry = record["descents"]["three-bodies"]
+    keys = list(next(iter(entry["methods"].values()))["distance"])
     rows = [
-        [name, *(f"{100 * mean:+.1f} ± {100 * error:.1f} %" for mean, error in entry.values())]
-        for name, entry in record["drift"].items()
+        [name, *(f"{100 * mean:+.1f} ± {100 * error:.1f} %" for mean, error in found["distance"].values())]
+        for name, found in entry["methods"].items()
     ]
-    settings = record["settings"]
     return (
-        f"`three-bodies`, {settings['resolution']}², {settings['steps']} steps, learning rate {record['rate']:g}, "
-        f"{settings['seeds']} seeds.\n\n{markdown.table(['loss, method', *keys], rows)}"
+        f"`three-bodies`, {entry['resolution']}², {entry['steps']} steps, learning rate {entry['rate']:g}, "
+        f"{entry['seeds']} seeds.\n\n{markdown.table(['loss, method', *keys], rows)}"
     )

@@ -1,0 +1,56 @@
+"""The bias of a perceptual loss's derivative from noisy images (RCV Fig. 10).
+
+The loss is `unrender.losses.Perceptual` on relu1_2 and relu2_2; its weights are trained first, in a minute, on pictures that come with
+scikit-image (`train.py`): features of VGG's shape, not those of ImageNet. The scene is `indirect-room`, a photograph on the
+back wall of a closed room.
+
+Compared is the derivative by each pixel at a step of a descent, from a plain render, from one whose bias 32 more renders tell (Eq.
+14), and from a control variate that took the same steps; mean over runs less the derivative at a converged image.
+"""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import unrender as ur
+from benchmarks.derivative_bias import derivatives
+from benchmarks.paths import converged, descent, truth
+from benchmarks.rcv.fig10_perceptual.train import LAYERS, train
+
+QUICK = {"resolution": 8, "runs": 3, "step": 2, "renders": 2, "reference_spp": 64, "train_steps": 2}
+
+
+def run(
+    resolution: int = 32,
+    spp: int = 4,
+    step: int = 20,
+    runs: int = 12,
+    renders: int = 32,
+    reference_spp: int = 8192,
+    train_steps: int = 1000,
+) -> dict[str, Any]:
+    """The network, then the bias.
+
+    Args:
+        renders: that tell the bias of Eq. 14
+        train_steps: of the network
+    """
+    importlib.import_module("torch").set_num_threads(1)  # on pictures this small several only wait for each other
+    with tempfile.TemporaryDirectory() as folder:
+        weights = Path(folder) / "weights.pth"
+        network = train(weights, train_steps)
+        print(f"accuracy {network['accuracy']:.2f}", flush=True)
+        loss = ur.losses.Perceptual(weights, LAYERS)
+        made = ur.gallery.problem(
+            "indirect-room", resolution=resolution, texture_resolution=resolution, reference_spp=2048
+        )
+        problem = ur.Problem(
+            made.renderer, made.parameters, made.given_views, loss, made.max_depth, truth=made.truth, name=made.name
+        )
+        target = converged(problem, truth(problem), reference_spp).mean
+        path = descent(problem, ur.PathGradient(spp=16, adjoint_spp=16), 0.02, step + 1)
+        bias, maps = derivatives(problem, path, {"perceptual": loss}, target, spp, runs, renders, reference_spp)
+    return {"network": network, "bias": bias, "maps": maps}

@@ -1,0 +1,28 @@
+"""Table."""
+
+from benchmarks import markdown
+from benchmarks.derivative_bias import METHODS
+from benchmarks.runner.records import Record
+
+
+def table(record: Record) -> str:
+    """The bias of each image."""
+    settings, network = record["settings"], record["network"]
+    sizes = (
+        f"{settings['resolution']}², {settings['spp']} spp, {settings['runs']} runs, step {settings['step']}; relative to the derivative's "
+        f"mean. The network tells {network['accuracy']:.0%} of new crops, by chance {network['chance']:.0%}."
+    )
+    found = record["bias"]["losses"]["perceptual"]
+    rows = []
+    for method in METHODS:
+        f = found[method]
+        rows.append(
+            [
+                method,
+                f"{f['rms']:.2f} ({f['square']:.3f} ± {f['square_error']:.3f})",
+                f"{f['signed']:+.1%} ± {f['signed_error']:.1%}",
+                f"{f['variance']:.2f}",
+            ]
+        )
+    parts = [sizes, markdown.table(["image", "bias, RMS over pixels (its square)", "mean bias", "variance"], rows)]
+    return "\n\n".join(parts)

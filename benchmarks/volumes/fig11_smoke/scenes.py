@@ -1,0 +1,98 @@
+"""The volumes of the race: the gallery's smoke, the same with a lamp inside, and one that somebody else made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from skimage.transform import resize
+
+import unrender as ur
+from benchmarks.internals import Smoke, build_problem, mi, parts, volumes
+
+FILE = "tutorials/volume.vol"
+"""Of Mitsuba's tutorials, below the folder of assets."""
+DENSEST = 6.0
+
+
+@dataclass(frozen=True)
+class Volume:
+    """The specification of a problem whose unknowns, cameras and sizes are those of `smoke`.
+
+    Attributes:
+        smoke: these.
+        change: makes its scene another's; the size of grids is given.
+    """
+
+    smoke: Smoke
+    change: Callable[[dict[str, Any], int], dict[str, Any]]
+
+    @property
+    def resolution(self) -> int:
+        """Of the films."""
+        return self.smoke.resolution
+
+    @property
+    def reference_spp(self) -> int:
+        """Of the references."""
+        return self.smoke.reference_spp
+
+    @property
+    def max_depth(self) -> int:
+        """Of paths."""
+        return self.smoke.max_depth
+
+    @property
+    def loss(self) -> Any:
+        """L1."""
+        return self.smoke.loss
+
+    def scene(self) -> dict[str, Any]:
+        """A new one at each call."""
+        return self.change(self.smoke.scene(), self.smoke.grid_resolution)
+
+    def parameters(self) -> tuple[ur.Parameter, ...]:
+        """Extinction and albedo."""
+        return self.smoke.parameters()
+
+
+def lit_inside(scene: dict[str, Any], grid: int) -> dict[str, Any]:
+    """A ball of light in the middle of the plume, under a dim sky."""
+    del grid
+    ball = {"type": "sphere", "center": [0.0, -0.3, 0.0], "radius": 0.12, "bsdf": parts.diffuse(0.0)}
+    return scene | {
+        "sky": {"type": "constant", "radiance": parts.colour(0.05, 0.06, 0.08)},
+        "lamp": ball | {"emitter": parts.light(30.0, 25.0, 18.0)},
+    }
+
+
+def from_file(file: Path) -> Callable[[dict[str, Any], int], dict[str, Any]]:
+    """Its density in the place of the smoke's, under the same sky; one albedo everywhere, warm."""
+
+    def change(scene: dict[str, Any], grid: int) -> dict[str, Any]:
+        found = np.array(mi.VolumeGrid(str(file)), np.float32)
+        density = np.asarray(resize(found.reshape(*found.shape[:3], -1)[..., 0], (grid,) * 3, anti_aliasing=True))
+        colour = np.broadcast_to(np.array([0.9, 0.78, 0.6]), (grid, grid, grid, 3))
+        medium = {
+            "type": "heterogeneous",
+            "sigma_t": volumes.grid((density * (DENSEST / density.max()))[..., None]),
+            "albedo": volumes.grid(colour),
+            "phase": {"type": "isotropic"},
+        }
+        return scene | {"smoke": volumes.cube(medium)}
+
+    return change
+
+
+def problem(name: str, resolution: int, grid: int, reference_spp: int, assets: Path) -> ur.Problem | None:
+    """The problem of "smoke", "lit inside" or "tutorial"; None where the file of the last is not below `assets`."""
+    smoke = Smoke(resolution=resolution, grid_resolution=grid, reference_spp=reference_spp)
+    if name == "smoke":
+        return ur.gallery.problem("smoke", resolution=resolution, grid_resolution=grid, reference_spp=reference_spp)
+    if name == "lit inside":
+        return build_problem(name, Volume(smoke, lit_inside))
+    file = assets / FILE
+    return build_problem(name, Volume(smoke, from_file(file))) if file.is_file() else None
