@@ -33,9 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--toy", action="store_true", help="toy sizes, on the processor where no GPU works")
     parser.add_argument("--minutes", type=float, default=MINUTES, help="for a slice; what goes on is ended (10)")
     parser.add_argument("--again", action="store_true", help="what has ended, too")
-    parser.add_argument(
-        "--copy", type=Path, help="copy states and records there after each slice: from a machine that is lent"
-    )
+    parser.add_argument("--copy", type=Path, help="copy states and records there after each slice")
     parser.add_argument("--list", action="store_true", help="only list; with --toy, what became of the toy plan")
     given = parser.parse_args(arguments)
     folder = toy() if given.toy else full()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import time
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ def device(on_gpu: bool) -> State:
         first = subprocess.run(asked, capture_output=True, text=True, timeout=30, check=True).stdout.splitlines()[0]
         name, memory, driver = (part.strip() for part in first.split(","))
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        name, memory, driver = f"GPU of {platform.node()}", "", ""
+        name, memory, driver = "GPU", "", ""
     return {"name": name, "memory": memory, "driver": driver, "variant": "cuda_ad_rgb"}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -398,9 +399,23 @@ def test_an_optimizer_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_
     resumed = ur.resume(tmp_path / "run", problem(None), steps=8)
     np.testing.assert_array_equal(resumed.parameters[KEY], whole.parameters[KEY])
 
-    small = ur.optimizers.ScheduleFree(0.05, coarse_to_fine={KEY: (3, 6, 9, 12, 15)})
-    with pytest.raises(InputError, match="too small to be coarser 5 times by 2"):
-        ur.optimize(problem(None), estimator, small, steps=1)
+    parts = ur.optimizers.Partitioned((KEY,), brings, ur.optimizers.Adam(0.1))
+    found = ur.optimize(problem(None), estimator, parts, steps=2, seed=1)
+    assert found.history[0]["resolution"][KEY] == (4, 3)
+
+
+def test_resolutions_of_an_optimizer_that_make_no_sense_are_refused() -> None:
+    def descend(**options: Any) -> None:
+        ur.optimize(problem(None), ur.PathGradient(spp=2), ur.optimizers.ScheduleFree(0.05, **options), steps=1)
+
+    with pytest.raises(InputError, match=f"parameter {KEY}: coarse_to_fine: .*too small to be coarser 5 times by 2"):
+        descend(coarse_to_fine={KEY: (3, 6, 9, 12, 15)})
+    with pytest.raises(InputError, match='coarse_to_fine: unknown parameter "fields"'):
+        descend(coarse_to_fine={"fields": (3,)})
+    with pytest.raises(InputError, match=f"ScheduleFree: {KEY}: steps must be whole numbers"):
+        descend(coarse_to_fine={KEY: (6, 3)})
+    with pytest.raises(InputError, match="coarse_to_fine must be {key: steps}"):
+        descend(coarse_to_fine=[3, 6])
 
 
 @pytest.mark.parametrize(
@@ -415,9 +430,17 @@ def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: 
     assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
     assert choice.optimizer.coarse_to_fine == ({KEY: steps} if steps else {})
     assert any("coarse to fine" in reason for reason in choice.reasons) == bool(steps)
-    whole = method("auto").choose(made, {"coarse": False}).optimizer
-    assert isinstance(whole, ur.optimizers.ScheduleFree)
-    assert whole.coarse_to_fine == {}
+    detailed = truth + np.arange(cells[0]).reshape(-1, *(1,) * len(cells)) * 0.01
+    for others, options in (
+        (unknown, {"coarse": False}),
+        (replace(unknown, initial=detailed), {}),  # detail that coarse cells would lose
+        (replace(unknown, coarse_to_fine=(5,)), {}),
+    ):
+        made = ur.Problem(renderer, [others], [ur.View(renderer.at(truth.shape).exact({KEY: truth}))])
+        choice = method("auto").choose(made, options)
+        assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
+        assert choice.optimizer.coarse_to_fine == {}
+        assert not any("coarse to fine" in reason for reason in choice.reasons)
 
 
 @pytest.mark.parametrize("strength", [0.5, 20.0])

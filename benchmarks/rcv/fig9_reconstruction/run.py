@@ -23,6 +23,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import ImageEstimator, available_denoiser
 from benchmarks.races import TUNING_SEED, median_and_range, total_error
+from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
 from benchmarks.timed_runs import Kept, blind
 
@@ -72,7 +73,7 @@ def descend(
     """(seconds, error) along one run."""
     start = problem.parameter_error(problem.initial())
     if method == "stock":
-        timer = time.process_time if processor else time.perf_counter
+        timer = work_time if processor else time.perf_counter
         history = stock_loop(problem, spp, rate, seconds=seconds, seed=seed, timer=timer)
     else:
         estimator, optimizer = ur.PathGradient(IMAGES[method](), spp=spp), ur.optimizers.Adam(learning_rate=rate)

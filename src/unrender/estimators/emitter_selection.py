@@ -23,6 +23,7 @@ __all__ = [
     "EmitterRequest",
     "EmitterSelection",
     "EmitterState",
+    "check",
     "connections",
     "init",
     "learned",

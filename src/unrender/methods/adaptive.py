@@ -40,9 +40,8 @@ class AdaptiveMethod(AdamOptions):
     image: Literal["plain", "rcv"] = Field(
         "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
     )
-    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
-
+    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
     differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
 
     def build(self) -> tuple[Estimator, Optimizer]:

@@ -176,7 +176,7 @@ class AutoMethod(Options):
             for k, p in problem.parameterisations.items()
             if k in problem.coordinates.transforms
         }
-        coarse = {} if meshes or not self.coarse else _coarse(problem, smoothed)
+        coarse = {} if meshes or not self.coarse else _coarse(problem)
         rates = {**first_rates(problem, self.learning_rate), **given}
         optimizer: Optimizer = ScheduleFree(
             {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
@@ -284,15 +284,21 @@ class AutoMethod(Options):
         )
 
 
-def _coarse(problem: Problem, smoothed: Sequence[str]) -> dict[str, tuple[int, ...]]:
+def _coarse(problem: Problem) -> dict[str, tuple[int, ...]]:
     """{key: steps before which the resolution doubles} of grids: a few cells find where there is something with less noise than many. Not
-    of textures, where smoothed gradients do the same; nor where views are dealt to workers, which know one resolution."""
-    known, found = problem.renderer.parameters(), {}
+    of textures, where smoothed gradients do the same; of grids that start with detail, which would be lost; nor of dealt views."""
+    known, start, found = problem.renderer.parameters(), problem.initial_values(), {}
     for key, shape in problem.shapes().items():
         ways = [steps for cells, steps in _COARSE if len(shape) == _GRID and min(shape[:-1]) >= cells]
-        if ways and key in smoothed and known[key].resizable and problem.gatherer is None:
+        own = key in problem.coarse_to_fine or key in problem.preconditioners
+        if ways and not own and known[key].resizable and problem.gatherer is None and not _detail(start[key]):
             found[key] = ways[0]
     return found
+
+
+def _detail(grid: np.ndarray) -> bool:
+    """Whether its cells differ."""
+    return bool((grid != grid[:1, :1, :1]).any())
 
 
 def _shows_half(problem: Problem, sampler: PixelSampler) -> bool:

@@ -29,6 +29,10 @@ from unrender.problem.problem import Problem
 
 __all__ = ["HybridMethod"]
 
+_IMAGE_MEMORY, _GRADIENT_MEMORY = 0.95, 0.8
+"""Greatest weights of the past, of images and gradients: what is remembered for longer is noise that no optimizer averages, see
+`benchmarks/together`."""
+
 
 @register(name="hybrid", position=7)
 class HybridMethod(AdamOptions):
@@ -78,7 +82,7 @@ class HybridMethod(AdamOptions):
         return None if self.perturbed is None else tuple(key.strip() for key in self.perturbed.split(","))
 
     def _parts(self, space: Literal["path", "primary"], rates: Tree) -> tuple[Estimator, Optimizer]:
-        image = Plain() if self.image == "plain" else RecursiveControlVariate(space)
+        image = Plain() if self.image == "plain" else RecursiveControlVariate(space, max_weight=_IMAGE_MEMORY)
         widths = parse_widths(self.sigma)
         smoothing = SmoothedDerivatives(
             widths,
@@ -95,7 +99,9 @@ class HybridMethod(AdamOptions):
     def _path(self, image: ImageEstimator, space: Literal["path", "primary"]) -> Estimator:
         sampler: PixelSampler = pixels.Adaptive(self.pixels) if self.pixels else pixels.All()
         if self.gradient == "coupled":
-            return MetaEstimator(coupled=True, spp=self.spp, image=image, space=space, pixels=sampler)
+            return MetaEstimator(
+                coupled=True, spp=self.spp, image=image, space=space, pixels=sampler, max_weight=_GRADIENT_MEMORY
+            )
         return PathGradient(image, sampler, self.spp)
 
     def optimizer(self) -> Optimizer:

@@ -12,7 +12,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Reparameterising
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Refining, Reparameterising
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem.upsampling import Upsampler, restarted, upsampled
@@ -79,11 +79,16 @@ class Partitioned:
     @property
     def parameterisations(self) -> Mapping[str, Any]:
         """See `Reparameterising`."""
-        pairs = (
-            (part, part.parameterisations)
-            for part in (self.optimizer, self.others)
-            if isinstance(part, Reparameterising)
-        )
+        return self._given(lambda part: part.parameterisations if isinstance(part, Reparameterising) else {})
+
+    @property
+    def coarse_to_fine(self) -> Mapping[str, tuple[int, ...]]:
+        """See `Refining`."""
+        return self._given(lambda part: part.coarse_to_fine if isinstance(part, Refining) else {})
+
+    def _given(self, of: Callable[[Optimizer], Mapping[str, Any]]) -> dict[str, Any]:
+        """What both parts give for their own parameters."""
+        pairs = ((part, of(part)) for part in (self.optimizer, self.others))
         return {
             k: given
             for part, found in pairs

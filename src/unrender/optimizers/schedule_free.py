@@ -189,8 +189,9 @@ class ScheduleFree:
         named = self.parameterisations
         if not isinstance(named, Mapping) or not all(isinstance(x, str) for pair in named.items() for x in pair):
             raise InputError(f"ScheduleFree: parameterisations must be {{key: name}}, got {named!r:.80}")
-
-        steps = {key: checked_steps("ScheduleFree", given) for key, given in self.coarse_to_fine.items()}
+        if not isinstance(self.coarse_to_fine, Mapping):
+            raise InputError(f"ScheduleFree: coarse_to_fine must be {{key: steps}}, got {self.coarse_to_fine!r:.80}")
+        steps = {key: checked_steps(f"ScheduleFree: {key}", given) for key, given in self.coarse_to_fine.items()}
         object.__setattr__(self, "coarse_to_fine", steps)
 
     @property
@@ -221,9 +222,9 @@ class ScheduleFree:
         ones = dict.fromkeys(parameters, 1.0)
         none = dict.fromkeys(parameters, 0.0)
         smooth = self.preconditioner
-        for key in self.parameterisations:
-            if key not in parameters:
-                raise InputError(f'ScheduleFree: parameterisations: unknown parameter "{key}"')
+        for name in ("parameterisations", "coarse_to_fine"):
+            if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
+                raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')
         smoothed = () if smooth is None else self.preconditioned
         near = {key: zeros[key] for key in smoothed} if self.wiener else {}
         fits = dict.fromkeys(smoothed if isinstance(smooth, Sobolev) else (), StrengthFit())

@@ -43,6 +43,7 @@ from unrender.problem.validation import (
     check_parameter,
     check_parameterisation,
     check_preconditioner,
+    check_resolutions,
     check_sequence,
     check_truth,
     mesh_topology,
@@ -219,9 +220,9 @@ class Problem:
 
     def refining(self, given: Mapping[str, CoarseToFine]) -> Problem:
         """The same problem, parameters with no resolutions of their own coarse at first. Raises `InputError` for what does not suit."""
-        missing = self._missing("coarse_to_fine", given)
+        missing, known = self._missing("coarse_to_fine", given), self.renderer.parameters()
         for key, way in missing.items():
-            way.check(self._initial[key].shape)
+            check_resolutions(key, way, known[key])
         found = self._completed("coarse_to_fine", missing)
         found.coarse_to_fine = self.coarse_to_fine | missing
         return found

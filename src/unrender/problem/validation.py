@@ -249,12 +249,24 @@ def _coarse_to_fine(parameter: Parameter, info: ParameterInfo) -> CoarseToFine |
     if parameter.coarse_to_fine is None:
         return None
     schedule = coarse_to_fine.of(parameter.coarse_to_fine)
-    if not info.resizable:
-        raise InputError("its resolution is fixed; expected the data of a bitmap texture or a grid volume")
-    schedule.check(info.shape)
+    _check_resolutions(schedule, info)
     if parameter.preconditioner is not None:
         parameter.preconditioner.check(parameter.key, schedule.shape(info.shape, 0))
     return schedule
+
+
+def check_resolutions(key: str, schedule: CoarseToFine, info: ParameterInfo) -> None:
+    """Raise `InputError` for a parameter that cannot have these resolutions."""
+    try:
+        _check_resolutions(schedule, info)
+    except InputError as error:
+        raise InputError(f"parameter {key}: coarse_to_fine: {error}") from error
+
+
+def _check_resolutions(schedule: CoarseToFine, info: ParameterInfo) -> None:
+    if not info.resizable:
+        raise InputError("its resolution is fixed; expected the data of a bitmap texture or a grid volume")
+    schedule.check(info.shape)
 
 
 def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> tuple[np.ndarray, str]:

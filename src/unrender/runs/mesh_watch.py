@@ -34,14 +34,12 @@ class MeshWatch(Hook):
         """See `Hook.on_update`."""
         run = descent.run
         for key, faces in run.problem.faces.items() if applied else ():
-            gradient = estimate.gradient.get(
-                key
-            )  # None of estimators that have losses alone, or directions in its place
-            if gradient is None:
-                pass
-            elif arrays.number(arrays.total(gradient * gradient)) > 0.0:
+            # None of estimators that have losses alone, or directions in its place.
+            gradient = estimate.gradient.get(key)
+            shown = gradient is not None and arrays.number(arrays.total(gradient * gradient)) > 0.0
+            if shown:
                 self._seen.add(key)
-            elif key in self._seen:
+            elif gradient is not None and key in self._seen:
                 self._seen.discard(key)
                 run.warnings.append(
                     f"step {run.step}: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"

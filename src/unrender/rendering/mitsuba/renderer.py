@@ -132,6 +132,8 @@ class MitsubaRenderer:
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """See `DifferentialBsdfRenderer`. Of the same scenes."""
+        if self._differential_bsdf:
+            return self
         if self._differential is None:
             self._differential = copy.copy(self)
             self._differential._differential_bsdf, self._differential._sessions = True, {}

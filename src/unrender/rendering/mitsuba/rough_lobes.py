@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.integrators.differential_bsdf import DISTRIBUTIONS, DifferentialBsdf
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -60,7 +61,10 @@ class RoughLobes:
         table = np.zeros(max(kinds) + 2, np.uint32)
         for number, kind in kinds.items():
             table[number] = DISTRIBUTIONS[kind][0]
-        self.differential, self.tables = DifferentialBsdf(dict.fromkeys(kinds.values())), {"rough": mi.UInt32(table)}
+        self.differential, self.tables = (
+            DifferentialBsdf(dict.fromkeys(kinds.values())),
+            {"rough": arrays.owned(table, mi.UInt32)},
+        )
 
 
 def _lobe(parameters: mi.SceneParameters, key: str) -> tuple[Any, str, str]:

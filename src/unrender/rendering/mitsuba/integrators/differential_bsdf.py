@@ -114,7 +114,11 @@ class RoughLobe:
     def log_derivative(self, wo: mi.Vector3f) -> Float:
         """∂ log D / ∂α, detached; 0 where the lane does not take part."""
         _, t = self._slope(wo)
-        return dr.select(self.served, self._select(lambda of: of.log_derivative(self._α, t)), 0)
+        return dr.select(
+            self.served & (dr.squared_norm(self._wi + wo) > 0),
+            self._select(lambda of: of.log_derivative(self._α, t)),
+            0,
+        )
 
     def pdf(self, wo: mi.Vector3f) -> Float:
         """Solid angle density of that direction of the pair to whose part `wo` belongs."""
