@@ -383,6 +383,18 @@ def solve(strength: float, size: tuple[int, ...], x: np.ndarray) -> np.ndarray:
     return np.asarray(scipy.sparse.linalg.spsolve(matrix, x.ravel())).reshape(x.shape)
 
 
+class Sizes(ur.Callback):
+    """What a callback sees of the parameter's size; its error can be asked for."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[int, ...]] = []
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        self.seen.append(arrays.shape(run.parameters[KEY]))
+        if not run.problem.as_given.coarse_to_fine:
+            assert problem(None).parameter_error(run.parameters)[KEY] < 1
+
+
 def test_an_optimizer_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     """As those of `Parameter`, with states carried; a parameter's own come first."""
     estimator = ur.PathGradient(image=rcv(), spp=2)
@@ -399,6 +411,13 @@ def test_an_optimizer_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_
     resumed = ur.resume(tmp_path / "run", problem(None), steps=8)
     np.testing.assert_array_equal(resumed.parameters[KEY], whole.parameters[KEY])
 
+    sizes = Sizes()
+    ur.optimize(problem(None), estimator, brings, steps=4, callbacks=[sizes])
+    assert sizes.seen == [TRUTH.shape] * 4  # callbacks see nothing that the problem did not ask for
+    present = Sizes()
+    ur.optimize(problem((3,)), estimator, brings, steps=4, callbacks=[present])
+    assert present.seen == [(8, 6, 1)] * 3 + [TRUTH.shape]
+
     parts = ur.optimizers.Partitioned((KEY,), brings, ur.optimizers.Adam(0.1))
     found = ur.optimize(problem(None), estimator, parts, steps=2, seed=1)
     assert found.history[0]["resolution"][KEY] == (4, 3)
@@ -414,7 +433,7 @@ def test_resolutions_of_an_optimizer_that_make_no_sense_are_refused() -> None:
         descend(coarse_to_fine={"fields": (3,)})
     with pytest.raises(InputError, match=f"ScheduleFree: {KEY}: steps must be whole numbers"):
         descend(coarse_to_fine={KEY: (6, 3)})
-    with pytest.raises(InputError, match="coarse_to_fine must be {key: steps}"):
+    with pytest.raises(InputError, match="coarse_to_fine must be"):
         descend(coarse_to_fine=[3, 6])
 
 

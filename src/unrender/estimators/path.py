@@ -92,8 +92,9 @@ class PathGradient:
         emitters: how a connection takes one of several emitters: "scene", uniformly or by the scene's own sampling weights, or
             "adaptive", by the variance of the gradient, in units of Adam's steps (`emitter_selection.EmitterState`). As unbiased either
             way. The first steps, and one in 20, cost two passes more, from which the probabilities are learnt; four fifths of the scene's
-            own are kept at first, and down to a tenth as samples confirm what was learnt. These passes keep eight bytes for each path and vertex. Needs at least two leave-one-out groups, and a
-            scene without participating media and without moving shapes or sensors; a single emitter leaves nothing to choose.
+            own are kept at first, and down to a tenth as samples confirm what was learnt. These passes keep eight bytes for each path and
+            vertex. Needs at least two leave-one-out groups, and a scene without participating media and without moving shapes or sensors; a
+            single emitter leaves nothing to choose.
         differential_bsdf: whether the adjoint samples the derivative of rough conductors by their roughness apart, in proportion to it and
             in antithetic pairs (Belhe et al. 2024). As unbiased; an adjoint costs about twice as much, and the variance
             of roughness gradients is smaller, by the more the smoother the surface. `init` raises `InputError` where no parameter is such

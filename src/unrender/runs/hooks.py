@@ -69,15 +69,18 @@ class CallbackHook(Hook):
 
     def on_start(self, descent: Descent) -> None:
         """See `Hook.on_start`."""
-        for callback in self._callbacks:
-            callback.on_start(descent.run)
+        with descent.run.shown() as run:
+            for callback in self._callbacks:
+                callback.on_start(run)
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """See `Hook.on_step`."""
-        for callback in self._callbacks:
-            callback.on_step(descent.run, record)
+        with descent.run.shown() as run:
+            for callback in self._callbacks:
+                callback.on_step(run, record)
 
     def on_end(self, descent: Descent, result: Result) -> None:
         """See `Hook.on_end`."""
-        for callback in self._callbacks:
-            callback.on_end(descent.run, result)
+        with descent.run.shown() as run:
+            for callback in self._callbacks:
+                callback.on_end(run, result)

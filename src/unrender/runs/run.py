@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.signals import GRACEFUL
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
@@ -33,7 +34,7 @@ class Run:
         folder: the run folder; None for a run without one.
         step: how many steps are done.
         clock: seconds of optimization so far.
-        parameters: the current ones (the renderer's arrays), at the present resolution where they are coarse at first.
+        parameters: the current ones (the renderer's arrays), at the present resolution where the problem has them coarse at first.
         estimate: the last one.
         skipped: steps not applied so far.
         warnings: one line each.
@@ -62,6 +63,20 @@ class Run:
     def full(self) -> dict[str, np.ndarray]:
         """The parameters as NumPy arrays at the scene's own resolution."""
         return self.problem.full(self.parameters)
+
+    @contextmanager
+    def shown(self) -> Iterator[Run]:
+        """The run as callbacks see it: at the scene's own resolution what its optimizer made coarse, and the problem did not ask for."""
+        present, own = self.parameters, self.problem.as_given.coarse_to_fine
+        shapes, size = self.problem.shapes(), arrays.shape
+        coarse = [k for k in self.problem.coarse_to_fine if k not in own and size(present[k]) != shapes[k]]
+        full = self.full() if coarse else {}
+        seen = self.parameters = {**present, **{key: self.problem.renderer.array(full[key]) for key in coarse}}
+        try:
+            yield self
+        finally:
+            if self.parameters is seen:
+                self.parameters = present
 
     def progress(self) -> float:
         """The share of the budget used, in [0, 1]."""
