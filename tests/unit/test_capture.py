@@ -91,7 +91,10 @@ def test_crumbs_are_left_out_and_decimation_keeps_the_place() -> None:
     far = Mesh(1e6 * ball.vertices, ball.faces)
     small = decimate(far, 500)
     assert len(small.faces) <= 500
-    np.testing.assert_allclose(small.vertices.mean(0) / 1e6, CENTRE, atol=0.05)
+    triangles = small.vertices[small.faces]
+    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    # The centroid of the surface: where vertices are dense is the decimation's own affair.
+    np.testing.assert_allclose(area @ triangles.mean(axis=1) / area.sum() / 1e6, CENTRE, atol=0.005)
 
 
 def test_an_atlas_has_no_overlaps_and_keeps_the_surface() -> None:

@@ -203,8 +203,9 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     choice = method("hybrid").choose(asked, settings)
     estimator, optimizer = choice.estimator, choice.optimizer
     assert isinstance(estimator, ur.HybridGradient)
+    image, drawn = CV("primary", max_weight=0.95), ur.pixels.Adaptive(16)
     assert estimator.path == ur.MetaEstimator(
-        coupled=True, spp=2, image=CV("primary"), space="primary", pixels=ur.pixels.Adaptive(16)
+        coupled=True, spp=2, image=image, space="primary", pixels=drawn, max_weight=0.8
     )
     assert isinstance(optimizer, ur.optimizers.MetaAdam)
     assert optimizer.learning_rate == pytest.approx({"*": 0.01, "pose": 0.03})
