@@ -1,4 +1,4 @@
-"""All four methods at once: every combination of the ingredients on six problems, at equal time.
+"""All four methods at once: every combination of the ingredients, at equal time.
 
 The ingredients: a memory of images (recursive control variates), a memory of gradients (coupled meta-estimation), samples where
 the gradient's variance is, and, where there is a pose, perturbed renders for that alone (`HybridGradient`); without, it has path
@@ -37,6 +37,7 @@ GALLERY: dict[str, tuple[str, dict[str, Any]]] = {
     "indirect-room": ("indirect-room", {"resolution": 48, "texture_resolution": 32}),
     "caustic": ("caustic", {}),
     "plain-and-textured": ("plain-and-textured", {}),
+    "sun-glossy": ("sun-glossy", {"resolution": 48, "texture_resolution": 32}),
 }
 """Problem and its options."""
 TRAY = "tray, moved"
