@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
 
@@ -17,12 +17,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 
-__all__ = ["DIFFERENTIAL_HELP", "EMITTERS_HELP", "AdamOptions", "PathOptions"]
-
-EMITTERS_HELP = "which of several lights a connection takes: by the scene's weights, or by the gradient's variance"
-DIFFERENTIAL_HELP = (
-    "whether derivatives by the alpha of rough conductors are sampled apart, in antithetic pairs of paths"
-)
+__all__ = ["AdamOptions", "PathOptions", "SamplingOptions"]
 
 
 class AdamOptions(Options):
@@ -40,7 +35,24 @@ class AdamOptions(Options):
         return Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.one_rate)
 
 
-class PathOptions(AdamOptions):
+class SamplingOptions(AdamOptions):
+    """Options of `PathGradient` on how its paths are sampled."""
+
+    emitters: EmitterSelection = Field(
+        "scene",
+        description="which of several lights a connection takes: by the scene's weights, or by the gradient's variance",
+    )
+    differential_bsdf: bool = Field(
+        False,
+        description="whether derivatives by the alpha of rough conductors are sampled apart, in antithetic pairs of paths",
+    )
+
+    def sampling(self) -> dict[str, Any]:
+        """The arguments of `PathGradient` that these are."""
+        return {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
+
+
+class PathOptions(SamplingOptions):
     """Options of every method that follows path gradients."""
 
     spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
@@ -48,13 +60,10 @@ class PathOptions(AdamOptions):
     counts: Literal["equal", "adaptive"] = Field(
         "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
     )
-    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
-    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
     denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
         """The path gradient of what the loss sees in `image`."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
         seen = Denoised(image) if self.denoise else image
-        apart = {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
-        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, **apart)
+        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, **self.sampling())

@@ -9,11 +9,10 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from unrender import pixels
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
-from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import DIFFERENTIAL_HELP, EMITTERS_HELP, AdamOptions
+from unrender.methods.adam_options import SamplingOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 
@@ -21,7 +20,7 @@ __all__ = ["AdaptiveMethod"]
 
 
 @register(name="adaptive", position=5)
-class AdaptiveMethod(AdamOptions):
+class AdaptiveMethod(SamplingOptions):
     """mini-batches of pixels drawn where the gradient's variance is, from all views at once, Adam"""
 
     pixels: PositiveInt = Field(4096, description="pixels a step, drawn from all pixels of all views")
@@ -41,14 +40,11 @@ class AdaptiveMethod(AdamOptions):
         "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
     )
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
-    emitters: EmitterSelection = Field("scene", description=EMITTERS_HELP)
-    differential_bsdf: bool = Field(False, description=DIFFERENTIAL_HELP)
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
-        apart = {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
-        return PathGradient(image, self._sampler(), self.spp, **apart), self.optimizer()
+        return PathGradient(image, self._sampler(), self.spp, **self.sampling()), self.optimizer()
 
     def _sampler(self) -> PixelSampler:
         guided: dict[str, Any] = {"refresh": self.refresh}

@@ -70,7 +70,10 @@ class Run:
         present, own = self.parameters, self.problem.as_given.coarse_to_fine
         shapes, size = self.problem.shapes(), arrays.shape
         coarse = [k for k in self.problem.coarse_to_fine if k not in own and size(present[k]) != shapes[k]]
-        full = self.full() if coarse else {}
+        if not coarse:
+            yield self
+            return
+        full = self.full()
         seen = self.parameters = {**present, **{key: self.problem.renderer.array(full[key]) for key in coarse}}
         try:
             yield self
