@@ -5,10 +5,11 @@
 - analytic: n/(n+1), the weight of a mean of all renders;
 - online: Eq. 8 with Var[F_CV] from running statistics of F_CV itself, as if consecutive images were independent;
 - absolute: Eq. 8 with the recurrence (10) in absolute units, which keeps early, bad estimates of Var[F];
-- zero start: with the recurrence relative to Var[F], and weight 0 while the statistics know no variance, which is the paper's start;
-- relative: the same with the weight of an average meanwhile: `unrender.images.RecursiveControlVariate` itself.
+- relative: Eq. 8 with the recurrence relative to Var[F];
+- greater: Eq. 8 with the greater of both variances where anything has moved: `unrender.images.RecursiveControlVariate` itself.
 
-All but the first three estimate variances from earlier renders, from step 1 on, so that the first weight from statistics is that of step 3.
+All but the first three estimate variances from earlier renders, from step 1 on, so that the first weight from
+statistics is that of step 3. Until then the last has the weight of an average, the others 0, which is the paper's start.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from benchmarks.paths import images_along
 from unrender import statistics
 from unrender.statistics import welford
 
-SIMULATED = ("plain", "one", "analytic", "online", "absolute", "zero start")
-RULES = (*SIMULATED, "relative")
+SIMULATED = ("plain", "one", "analytic", "online", "absolute", "relative")
+RULES = (*SIMULATED, "greater")
 
 
 class Simulated:
@@ -68,7 +69,7 @@ class Simulated:
         of_cv = {
             "online": lambda: welford.covariance(self.own),
             "absolute": lambda: self.variance,
-            "zero start": lambda: self.relative * of_h,
+            "relative": lambda: self.relative * of_h,
         }
         return statistics.control_weight(cov, of_h, of_cv[self.rule]())
 
@@ -87,9 +88,9 @@ def one_run(
             used.append(simulated.advance(F, H))
             kept.append(simulated.image)
         images[rule], weights[rule] = np.stack(kept), np.stack(used)
-    if "relative" in rules:
-        relative = ur.images.RecursiveControlVariate()
-        images["relative"], weights["relative"] = images_along(problem, relative, path, spp, seed)
+    if "greater" in rules:
+        library = ur.images.RecursiveControlVariate()
+        images["greater"], weights["greater"] = images_along(problem, library, path, spp, seed)
     return images, weights
 
 

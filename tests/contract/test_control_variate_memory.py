@@ -8,7 +8,10 @@ from analytic import problem
 
 import unrender as ur
 from unrender.core.random import Key
+from unrender.images.recursive_control_variate import ViewMemory
+from unrender.problem.batches import WholeView
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.statistics import welford
 
 STEPS, RUNS, NOISE, SPP = 30, 12, 0.5, 2
 WEIGHT = 0.8
@@ -52,3 +55,35 @@ def test_weights_above_one_or_below_zero_are_refused() -> None:
     for weight in (0, 1.5, -0.1, float("nan")):
         with pytest.raises(ur.InputError, match="RecursiveControlVariate: max_weight must be"):
             ur.images.RecursiveControlVariate(max_weight=weight)
+
+
+def along(move: float) -> tuple[ViewMemory, np.ndarray]:
+    """After 20 steps in which the map's brightness rises by `move` of itself at each; Var[H] of the statistics."""
+    asked = problem(noise=NOISE)
+    image = ur.images.RecursiveControlVariate()
+    state = image.init(asked, asked.initial())
+    for step in range(20):
+        at = {key: value * (1.0 + move) ** step for key, value in asked.initial().items()}
+        _, kept = image.estimate(asked, at, state, WholeView(asked, 0), SPP, 1, Key(0, step))
+        state = image.advance(at, state, (kept,))
+    (memory,) = state.views
+    return memory, np.asarray(welford.covariance(memory.previous))
+
+
+def below(memory: ViewMemory, unit: np.ndarray, relative: np.ndarray) -> float:
+    """The share of pixels whose variance by `relative` is below that in absolute units."""
+    return float(np.mean(relative * unit < np.asarray(memory.variance) * (1 - 1e-4)))
+
+
+def test_the_variance_is_the_greater_of_two_recurrences() -> None:
+    memory, unit = along(0.05)
+    assert below(memory, unit, np.asarray(memory.relative_variance)) == 0
+    # Relative to a variance that has been learnt to be a third of what it was: the absolute recurrence does not follow.
+    assert below(memory, unit, np.asarray(memory.relative_variance) / 3) > 0.9
+
+
+def test_where_nothing_moves_images_are_averaged() -> None:
+    memory, _ = along(0.0)
+    np.testing.assert_allclose(memory.relative_variance, 1 / 20, rtol=1e-4)
+    moved, _ = along(0.05)
+    assert np.abs(np.asarray(moved.relative_variance) * 20 - 1).max() > 0.01

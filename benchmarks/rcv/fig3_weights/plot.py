@@ -12,15 +12,15 @@ RULES = {
     "analytic": ("analytic n/(n+1)", "#222222"),
     "online": ("Eq. 8, running statistics of F_CV", "#d1782a"),
     "absolute": ("Eq. 8 + recurrence, absolute", "#8a55a8"),
-    "zero start": ("Eq. 8 + recurrence, relative, weight 0 at first", "#4a9a6a"),
-    "relative": ("Eq. 8 + recurrence, relative (unrender)", "#1f6fb4"),
+    "relative": ("Eq. 8 + recurrence, relative", "#4a9a6a"),
+    "greater": ("Eq. 8 + greater of both recurrences (unrender)", "#1f6fb4"),
 }
 
 
 def plot(record: Record) -> Figure:
     """Weights and variance over steps; the last weights of one run as maps."""
     maps = record["maps"]
-    mosaic: Any = [["weight"] * 3 + ["variance"] * 3, ["online"] * 2 + ["absolute"] * 2 + ["relative"] * 2]
+    mosaic: Any = [["weight"] * 3 + ["variance"] * 3, ["online"] * 2 + ["absolute"] * 2 + ["greater"] * 2]
     figure, axes = plt.subplot_mosaic(mosaic, figsize=(11, 7.4), layout="constrained", height_ratios=[1.25, 1])
     steps = np.arange(record["settings"]["steps"])
     for rule, (label, colour) in RULES.items():
@@ -46,14 +46,14 @@ def plot(record: Record) -> Figure:
     axes["variance"].set(xscale="log", yscale="log")
     axes["variance"].legend(loc="lower left", fontsize=8)
     drawn: Any = None
-    for rule in ("online", "absolute", "relative"):
+    for rule in ("online", "absolute", "greater"):
         drawn = axes[rule].imshow(maps[rule], vmin=0, vmax=1, cmap="viridis")
         mean = record["rules"][rule]["weight"][-1]
         best = record["rules"]["analytic"]["weight"][-1]
         words = f"{RULES[rule][0]}\nlast weights of one run (mean {mean:.3f}; n/(n+1) = {best:.3f})"
         axes[rule].set_title(words, fontsize=8)
         axes[rule].axis("off")
-    figure.colorbar(drawn, ax=[axes[r] for r in ("online", "absolute", "relative")], label="control weight", shrink=0.9)
+    figure.colorbar(drawn, ax=[axes[r] for r in ("online", "absolute", "greater")], label="control weight", shrink=0.9)
     figure.suptitle(
         f"indirect-room, unchanging, {record['settings']['resolution']}², {record['settings']['spp']} spp a step"
     )

@@ -5,9 +5,10 @@ the same renders (`benchmarks/weight_rules.py`):
 
 - analytic: n/(n+1);
 - online: Eq. 8 with Var[F_CV] from running statistics of F_CV itself, as if consecutive images were independent;
-- relative: Eq. 8 with the recurrence (10), kept relative to Var[F]: `unrender.images.RecursiveControlVariate` itself;
-- zero start: the same, its weight 0 while the statistics know no variance, at two steps: the paper's start;
-- absolute: the recurrence in absolute units, which keeps early, bad estimates of Var[F]; its start is the paper's, too.
+- absolute: Eq. 8 with the recurrence (10) in absolute units, which keeps early, bad estimates of Var[F];
+- relative: with the recurrence kept relative to Var[F];
+- greater: with the greater of both where anything has moved, and the weight of an average while the statistics know no variance, where the
+  others have the paper's 0: `unrender.images.RecursiveControlVariate` itself.
 
 All but the analytic rule estimate variances from earlier renders, from step 1 on, so that the first weight from
 statistics is that of step 3. With weight 0 until then, the best that they can reach is 1/(n-1), a dotted line in the
@@ -25,7 +26,7 @@ import unrender as ur
 from benchmarks.moments import Moments, summed_variances
 from benchmarks.weight_rules import one_run
 
-RULES = ("analytic", "online", "absolute", "zero start", "relative")
+RULES = ("analytic", "online", "absolute", "relative", "greater")
 QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3}
 
 

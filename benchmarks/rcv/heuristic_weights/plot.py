@@ -11,8 +11,8 @@ STYLES = {
     "analytic": ("n/(n+1)", "#222222", "--"),
     "online": ("Eq. 8, running statistics of F_CV", "#d1782a", "-"),
     "absolute": ("Eq. 8 + recurrence, absolute", "#8a55a8", "-"),
-    "zero start": ("relative, weight 0 at first", "#4a9a6a", ":"),
-    "relative": ("relative (unrender)", "#1f6fb4", "-"),
+    "relative": ("Eq. 8 + recurrence, relative", "#4a9a6a", "-"),
+    "greater": ("Eq. 8 + greater of both (unrender)", "#1f6fb4", "-"),
 }
 
 

@@ -41,11 +41,13 @@ class ViewMemory:
         image: the control variate ⟨F_n⟩_CV.
         relative_variance: of `image`, in units of one step's ⟨F_n⟩_n, by the recurrence (10); in units of one sample's, where pixels
             have different numbers of samples.
+        variance: of `image`, by the recurrence in absolute units; 0 before there are statistics.
         current, previous, joint: running statistics of ⟨F_n⟩_n, of ⟨F_{n-1}⟩_n, and of both; of one sample's, likewise.
     """
 
     image: Array
     relative_variance: Array
+    variance: Array
     current: welford.State
     previous: welford.State
     joint: welford.State
@@ -116,9 +118,11 @@ class RecursiveControlVariate:
 
     The state starts anew when a parameter changes its shape.
 
-    Var[⟨F_n⟩_CV] is stored relative to Var[⟨F_n⟩_n], to which the recurrence (10) is invariant. An absolute value would freeze the
-    first, worst estimate of the variance: a pixel whose first samples happen to agree would have variance 0 and weight 1, and keep its
-    first value for ever.
+    Var[⟨F_n⟩_CV] is the greater of two recurrences (10). One is relative to Var[⟨F_n⟩_n], to which (10) is invariant: an absolute value
+    freezes the first, worst estimate of the variance, and a pixel whose first samples happen to agree has variance 0 and weight 1, and
+    keeps its first value for ever. The other is absolute: a relative value follows Var[⟨F_n⟩_n] where parameters move, which the error
+    of the image does not. Where the two states have always agreed, as in pixels that show nothing unknown, the relative one alone is
+    exact, and images are averaged.
 
     Where the sample variance is still zero, at the first steps or in a pixel that has only been black, the two states count as fully
     correlated: the weight is 1 / (1 + r) for the relative variance r, which becomes r / (1 + r), so that images are averaged. A weight
@@ -205,7 +209,9 @@ class RecursiveControlVariate:
         first = sum(math.prod(size[:2]) for size in sizes[:view])
         rows = slice(first, first + math.prod(sizes[view][:2]))
         image, relative = (arrays.reshape(x[rows], sizes[view]) for x in (snapshot.image, snapshot.relative_variance))
-        return replace(memory, image=image, relative_variance=relative)
+        known = memory.relative_variance > 0
+        shrunk = arrays.where(known, relative / arrays.where(known, memory.relative_variance, 1.0), 1.0)
+        return replace(memory, image=image, relative_variance=relative, variance=shrunk * memory.variance)
 
     def estimate(
         self,
@@ -292,12 +298,24 @@ class RecursiveControlVariate:
         known = var_current > 0
         averaged = weight * weight * past + (1.0 - weight) * (1.0 - weight) / number
         relative = arrays.where(known, variance / arrays.where(known, var_current, 1.0), averaged)
+        begun = memory.variance > 0
+        absolute = statistics.control_variate_variance(
+            weight,
+            var_current / number,
+            var_previous / number,
+            cov / number,
+            arrays.where(begun, memory.variance, past * var_previous),
+        )
+        moved = ((cov != var_previous) | (cov != var_current)) & (var_previous > 0)
+        of_absolute = absolute / arrays.where(moved, var_previous, 1.0)
+        relative = arrays.where(moved, arrays.maximum(relative, of_absolute), relative)
+        variance = relative * var_current
         info = {"control_weight": weight, "variance": variance}
         previous = advance(image, asked.previous, rendering.previous, of_each)
         if (within := variance_of_mean(rendering.images, counts)) is not None:
             variance = arrays.where(known, variance, relative * number * within)
         estimate = ImageEstimate(current, asked.paths, info, previous, variance, fresh=rendering.images, counts=counts)
-        return estimate, replace(observed, image=estimate.mean(), relative_variance=relative)
+        return estimate, replace(observed, image=estimate.mean(), relative_variance=relative, variance=absolute)
 
     def advance(
         self, parameters: Tree, state: RecursiveControlVariateState, kept: tuple[Any, ...]
@@ -322,7 +340,9 @@ class RecursiveControlVariate:
         """Eq. 7: the first image is its own control variate."""
         empty = welford.init(image)
         relative = image * 0.0 + 1.0
-        return ViewMemory(image, relative if counts is None else relative / counts.divisors, empty, empty, empty)
+        if counts is not None:
+            relative = relative / counts.divisors
+        return ViewMemory(image, relative, image * 0.0, empty, empty, empty)
 
     def _observe(self, memory: ViewMemory, F: Array, H: Array, number: Array | float) -> ViewMemory:
         return replace(
