@@ -1,17 +1,21 @@
 """Photographs: held-out ones against the hull with photographs projected on it, a stock loop and each method, at equal time.
 
-The folder holds posed photographs with masks, such as an LLFF capture. One import makes the hull, the atlas and the unknowns; all start
-from it.
-"projection": each texel has the mean of the training photographs that see it, weighted by the square of the cosine. "stock": `mi.render`
-of a few views a step, `dr.backward`, `mi.ad.Adam`, values clipped, tuned over samples and rates; the best by held-out photographs is
-kept, which is in its favour. PSNR is as displayed, inside the masks, the mean of the held-out photographs.
+The folder holds posed photographs with masks, such as an LLFF capture. One import makes the hull, the atlas and the unknowns, a normal map
+among them; all start from it.
+"projection": each texel has the mean of the training photographs that see it, weighted by the square of the cosine. "stages": the file that
+the import writes, as `unrender run stages.toml` has it; "stages-flat": that of an import without normals, with roughness from 0.02; methods
+by name are one run of all unknowns. "stock": `mi.render` of a few views a step, `dr.backward`, `mi.ad.Adam`, values clipped, with the
+unknowns of "stages-flat"; "stock-normals": with those of "stages". Both are tuned over samples and rates; the best by held-out photographs
+is kept, which is in its favour. Seconds are of one thread of the processor, so that others on the machine cost nobody steps; what compiles
+before the first step does not count. PSNR is as displayed, inside the masks, the mean of the held-out photographs.
 """
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, from_tensor, project, stock_scene
+from benchmarks.internals import Whole, dr, from_tensor, project, stages_file, stock_scene
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import scratch
 from unrender import methods
@@ -32,13 +36,15 @@ METHODS: dict[str, dict[str, Any]] = {
     "plain": {"spp": 2, "learning_rate": 0.02},
     "rcv": {"spp": 2, "learning_rate": 0.02},
 }
-UNKNOWNS = ("colour", "roughness", "metallic", "light")
+ENTRANTS = ("start", "projection", "stages", "stages-flat", *METHODS, "stock", "stock-normals")
+FLAT = ("colour", "roughness", "metallic", "light")
+MERGE = ("races.*.found", "maps")
 QUICK = {
     "seconds": 0.2,
     "resolution": 16,
     "texture": 16,
     "faces": 300,
-    "method": ("auto",),
+    "entrant": ("start", "projection", "stages", "auto", "stock", "stock-normals"),
     "spp": (2,),
     "rates": (0.02,),
     "final_spp": 2,
@@ -52,14 +58,24 @@ class Judge:
         given = ur.Problem.from_file(folder / "held-out.toml")
         parameters = [ur.Parameter(key) for key in keys]
         self.problem = ur.Problem(given.origin["scene"], parameters, given.given_views, max_depth=given.max_depth)
-        self.spp = spp
+        self.folder, self.spp = folder, spp
+        self.picture = np.zeros(0)
 
     def psnr(self, image: Callable[[int], np.ndarray]) -> list[float]:
-        """Of the pictures of all held-out views."""
+        """Of the pictures of all held-out views; the first is kept as `picture`."""
+        pictures = [image(index) for index in range(len(self.problem.views))]
+        self.picture = pictures[0]
         return [
-            measure(image(index), np.asarray(view.reference), np.asarray(view.mask)).psnr
-            for index, view in enumerate(self.problem.views)
+            measure(picture, np.asarray(view.reference), np.asarray(view.mask)).psnr
+            for picture, view in zip(pictures, self.problem.views, strict=True)
         ]
+
+    def cut(self, picture: np.ndarray) -> np.ndarray:
+        """What a picture of the first held-out view shows inside the mask, cropped to it; white elsewhere."""
+        mask = np.asarray(self.problem.views[0].mask) > 0
+        rows, columns = np.nonzero(mask)
+        box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+        return np.where(mask[..., None], picture, 1.0)[box]
 
     def of(self, values: dict[str, np.ndarray]) -> list[float]:
         """Of a result."""
@@ -79,7 +95,7 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
         parameters.update(optimizer)
         clock, step = 0.0, 0
         while step < len(problem.views) if warm else clock < seconds:
-            began = time.perf_counter()
+            began = time.process_time()
             loss: Any = 0.0
             drawn = rng.choice(len(problem.views), min(views, len(problem.views)), replace=False)
             for view in [step] if warm else drawn:
@@ -101,78 +117,160 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
                 optimizer[key] = project(optimizer[key], *problem.bounds[key])
             parameters.update(optimizer)
             dr.sync_thread()
-            clock += time.perf_counter() - began
+            clock += time.process_time() - began
             step += 1
     shapes = {key: tuple(value.shape) for key, value in start.items()}
     return {key: np.array(dr.ravel(optimizer[key])).reshape(shape) for key, shape in shapes.items()}, step
 
 
-def prepare(photographs: Path, folder: Path, resolution: int, texture: int, faces: int) -> None:
-    """Import the photographs."""
-    shutil.rmtree(folder, ignore_errors=True)
-    options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=UNKNOWNS)
+class Clock(ur.Callback):
+    """Ends a run after so many seconds of the processor. Its first step, which compiles, does not count."""
+
+    def __init__(self, seconds: float):
+        self.seconds, self.spent, self.steps = seconds, 0.0, 0
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `ur.Callback`."""
+        del record
+        now = time.process_time()
+        self.spent += now - self._since if self.steps else 0.0
+        self.steps += 1
+        if self.spent >= self.seconds:
+            run.stop()
+        self._since = now
+
+
+def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.ndarray], int]:
+    """What the stages of an import find, and in how many steps."""
+    stages = stages_file.read(folder / stages_file.FILE)
+    whole = Whole.read(stages)
+    shares = [share or 0.0 for _, share in stages_file.split(replace(stages, steps=None, seconds=seconds))]
+    values: dict[str, np.ndarray] = {}
+    steps = 0
+    for index, (stage, share) in enumerate(zip(stages.stages, shares, strict=True)):
+        problem = whole.of_stage(stage, values, folder / "scenes" / stage.name)
+        parts = method_parts(stage.method or stages.method, problem, stages.settings_of(stage))
+        clock = Clock(share)
+        result = ur.optimize(problem, *parts, steps=1_000_000, seed=seed + index, callbacks=[clock])
+        values |= {key: np.asarray(value) for key, value in result.parameters.items()}
+        steps += clock.steps
+    return values, steps
+
+
+def prepare(
+    photographs: Path,
+    folder: Path,
+    resolution: int,
+    texture: int,
+    faces: int,
+    unknowns: tuple[str, ...] | None,
+    spp: int,
+) -> tuple[ur.Problem, Judge]:
+    """Import the photographs; the problem, and the judge of its results by pictures of `spp` samples per pixel."""
+    options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=unknowns)
     importing.import_capture(photographs, folder, options)
+    problem = ur.Problem.from_file(folder / "problem.toml")
+    return problem, Judge(folder, [parameter.key for parameter in problem.parameters], spp)
 
 
 def run(
-    photographs: Path,
+    photographs: Path | None = None,
     seconds: float = 60.0,
-    resolution: int = 250,
+    resolution: int = 96,
     texture: int = 256,
     faces: int = 10_000,
-    method: tuple[str, ...] = tuple(METHODS),
-    spp: tuple[int, ...] = (8, 32),
-    rates: tuple[float, ...] = (0.01, 0.03),
+    entrant: tuple[str, ...] = ENTRANTS,
+    spp: tuple[int, ...] = (4,),
+    rates: tuple[float, ...] = (0.003, 0.01),
     stock_views: int = 2,
     seeds: int = 1,
-    final_spp: int = 32,
-) -> dict[str, Any]:
-    """All on one import.
+    final_spp: int = 64,
+) -> Iterator[dict[str, Any]]:
+    """A part for each entrant, all on one import.
 
     Args:
-        photographs: folder of the capture
-        seconds: budget of each descent, without compiling
+        photographs: folder of a capture; left out, photographs of a vase that the project renders
+        seconds: of the processor, for each descent, without compiling
+        entrant: who takes part; the others' figures stay
         spp: of the stock loop, tried with each of the rates
         stock_views: views a step of the stock loop
         final_spp: of the pictures that are measured
     """
-    folder = scratch("photographs/asset")
-    prepare(photographs, folder, resolution, texture, faces)
-    problem = ur.Problem.from_file(folder / "problem.toml")
-    judge = Judge(folder, [parameter.key for parameter in problem.parameters], final_spp)
-    sizes = {"views": len(problem.views), "held_out": len(judge.problem.views), "pixels": problem.pixels}
-    found: dict[str, Any] = {"start": {"psnr": [judge.of(problem.initial_values())]}}
-    projection = Projection(folder, problem, texture)
-    found["projection"] = {"psnr": [judge.psnr(lambda view: projection.picture(judge.problem, view))]}
-    print({name: np.mean(row["psnr"]) for name, row in found.items()}, flush=True)
-    for name in method:
-        parts = method_parts(name, problem)
-        rows = found.setdefault(name, {"psnr": [], "steps": [], "settings": METHODS[name]})
-        for seed in range(seeds):
-            result = ur.optimize(problem, *parts, seconds=seconds, seed=seed)
-            rows["psnr"].append(judge.of(result.parameters))
-            rows["steps"].append(len(result.history))
-            print(name, seed, rows["steps"][-1], np.mean(rows["psnr"][-1]), flush=True)
-    grid: list[dict[str, Any]] = []
-    for samples in spp:
-        for rate in rates:
-            values, steps = stock(problem, samples, rate, seconds, stock_views, 0)
-            grid.append({"spp": samples, "rate": rate, "steps": steps, "psnr": judge.of(values)})
-            print("stock", samples, rate, steps, np.mean(grid[-1]["psnr"]), flush=True)
-    best = max(grid, key=lambda row: np.mean(row["psnr"]))
-    found["stock"] = {
-        "psnr": [best["psnr"]],
-        "steps": [best["steps"]],
-        "settings": {k: best[k] for k in ("spp", "rate")},
-    }
+    dr.set_thread_count(1)
+    own = photographs is None
+    name = "vase" if photographs is None else photographs.resolve().name
+    folder = scratch(f"photographs/{name}-{resolution}-{'-'.join(entrant)}")
+    shutil.rmtree(folder)
+    given = photographs or ur.gallery.photographs(folder / "photographs", size=resolution, spp=64)
+    imports: dict[str, tuple[ur.Problem, Judge]] = {}
+    maps: dict[str, np.ndarray] = {}
+    for who in entrant:
+        kind = "flat" if who in ("stock", "stages-flat") else "normals"
+        if kind not in imports:
+            # The others' scenes would be in all kernels.
+            imports.clear()
+            imports[kind] = prepare(
+                given, folder / kind, resolution, texture, faces, FLAT if kind == "flat" else None, final_spp
+            )
+        problem, judge = imports[kind]
+        found: dict[str, Any] = {"psnr": [], "steps": []}
+        if who == "start":
+            found = {"psnr": [judge.of(problem.initial_values())]}
+        elif who == "projection":
+            projection = Projection(judge.folder, problem, texture)
+            found = {"psnr": [judge.psnr(lambda view, by=projection, of=judge: by.picture(of.problem, view))]}
+        elif who in ("stock", "stock-normals"):
+            found = tuned(problem, judge, [(s, r) for s in spp for r in rates], seconds, stock_views, seeds)
+        else:
+            for seed in range(seeds):
+                if who in ("stages", "stages-flat"):
+                    values, steps = in_stages(judge.folder, seconds, 100 * seed)
+                else:
+                    clock = Clock(seconds)
+                    parts = method_parts(who, problem, METHODS[who])
+                    result = ur.optimize(problem, *parts, steps=1_000_000, seed=seed, callbacks=[clock])
+                    values, steps = result.parameters, clock.steps
+                found["psnr"].append(judge.of(values))
+                found["steps"].append(steps)
+                print(who, seed, steps, np.mean(found["psnr"][-1]), flush=True)
+            found["settings"] = METHODS.get(who, {})
+        print(who, np.mean(found["psnr"]), flush=True)
+        conditions = {
+            "views": len(problem.views),
+            "held_out": len(judge.problem.views),
+            "pixels": problem.pixels,
+            "seconds": seconds,
+        }
+        part: dict[str, Any] = {"races": {f"{name}, {resolution}": {**conditions, "found": {who: found}}}}
+        if own:
+            maps |= {
+                "photograph": judge.cut(np.asarray(judge.problem.views[0].reference)),
+                who: judge.cut(judge.picture),
+            }
+            part["maps"] = maps
+        yield part
+
+
+def tuned(
+    problem: ur.Problem, judge: Judge, settings: list[tuple[int, float]], seconds: float, views: int, seeds: int
+) -> dict[str, Any]:
+    """The stock loop with each of the settings, samples and rate; then further seeds of the best."""
+    tried: list[dict[str, Any]] = []
+    for samples, rate in settings:
+        values, steps = stock(problem, samples, rate, seconds, views, 0)
+        tried.append({"spp": samples, "rate": rate, "steps": steps, "psnr": judge.of(values)})
+        print("stock", samples, rate, steps, np.mean(tried[-1]["psnr"]), flush=True)
+    best = max(tried, key=lambda row: np.mean(row["psnr"]))
+    found: dict[str, Any] = {"psnr": [best["psnr"]], "steps": [best["steps"]], "tried": tried}
+    found["settings"] = {key: best[key] for key in ("spp", "rate")}
     for seed in range(1, seeds):
-        values, steps = stock(problem, best["spp"], best["rate"], seconds, stock_views, seed)
-        found["stock"]["psnr"].append(judge.of(values))
-        found["stock"]["steps"].append(steps)
-    return {"sizes": sizes, "found": found, "grid": grid, "seconds": seconds}
+        values, steps = stock(problem, best["spp"], best["rate"], seconds, views, seed)
+        found["psnr"].append(judge.of(values))
+        found["steps"].append(steps)
+    return found
 
 
-def method_parts(name: str, problem: ur.Problem) -> tuple[Any, Any]:
+def method_parts(name: str, problem: ur.Problem, settings: dict[str, Any]) -> tuple[Any, Any]:
     """Estimator and optimizer of a method for the problem."""
-    choice = methods.method(name).choose(problem, METHODS[name])
+    choice = methods.method(name).choose(problem, settings)
     return choice.estimator, choice.optimizer

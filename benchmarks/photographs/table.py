@@ -1,4 +1,4 @@
-"""Table."""
+"""Tables."""
 
 import numpy as np
 
@@ -7,20 +7,28 @@ from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """Held-out PSNR of each."""
+    """Held-out PSNR of each, of each capture and resolution."""
+    return "\n\n".join(_race(name, race) for name, race in sorted(record["races"].items()))
+
+
+def _race(name: str, race: Record) -> str:
     rows = []
-    for name, entry in record["found"].items():
+    for who, entry in race["found"].items():
         means = [float(np.mean(one)) for one in entry["psnr"]]
         spread = f" ± {np.std(means):.2f}" if len(means) > 1 else ""
         settings = ", ".join(f"{key} {value:g}" for key, value in entry.get("settings", {}).items())
         steps = f"{np.mean(entry['steps']):.0f}" if "steps" in entry else ""
-        rows.append([name, f"{np.mean(means):.2f}{spread}", f"{min(entry['psnr'][0]):.2f}", steps, settings])
-    sizes = record["sizes"]
-    said = f"{sizes['views']} photographs, {sizes['held_out']} held out, {record['seconds']:g} s each."
-    head = ["", "held-out PSNR (dB)", "the worst of them", "steps", "settings"]
-    grid = [
-        [f"{row['spp']}", f"{row['rate']:g}", f"{row['steps']}", f"{np.mean(row['psnr']):.2f}"]
-        for row in record["grid"]
+        rows.append(
+            [who, f"{np.mean(means):.2f}{spread}", f"{min(entry['psnr'][0]):.2f}", str(len(means)), steps, settings]
+        )
+    capture, size = name.rsplit(", ", 1)
+    counts = f"{race['views']} photographs of {size} pixels along the longer side, {race['held_out']} more held out"
+    said = f"{capture}: {counts}, {race['seconds']:g} s of the processor each."
+    head = ["", "held-out PSNR (dB)", "the worst of them", "seeds", "steps", "settings"]
+    tried = [
+        [who, str(row["spp"]), f"{row['rate']:g}", str(row["steps"]), f"{np.mean(row['psnr']):.2f}"]
+        for who, entry in race["found"].items()
+        for row in entry.get("tried", [])
     ]
-    tried = markdown.table(["stock loop: spp", "rate", "steps", "held-out PSNR (dB)"], grid)
-    return f"{said}\n\n{markdown.table(head, rows)}\n\n{tried}"
+    columns = ["tried", "spp", "rate", "steps", "held-out PSNR (dB)"]
+    return f"{said}\n\n{markdown.table(head, rows)}" + (f"\n\n{markdown.table(columns, tried)}" if tried else "")

@@ -25,12 +25,13 @@ pytest.importorskip("fast_simplification", reason="hulls need fast-simplificatio
 import made_capture as made
 import unrender as ur
 from unrender.capture.cameras import Lens
-from unrender.io import images
+from unrender.io import images, toml_lines
 from unrender.stages import stages_file
 
 LENS = Lens(40, 40, 48.0, 48.0, 20.0, 20.0)
 SMALL = ("--voxels", 24, "--faces", 400, "--texture", 16)
 VIEWS = 9
+MATERIAL, NORMALS = ("base_color.data", "roughness.data", "metallic.data"), "asset.bsdf.normalmap.data"
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +84,24 @@ def test_masks_alone_become_a_problem_that_runs(unrender: Unrender, capture: Pat
         *("references", "masks", "textures"),
     }
     assert [path.name for path in Path().iterdir() if "part" in path.name] == []
+    # The hull's normals are unknown, in a last stage of their own.
+    assert _keys(folder) == [*(f"asset.bsdf.nested_bsdf.{name}" for name in MATERIAL), NORMALS, "light.data"]
+    stages = stages_file.read(folder / "stages.toml").stages
+    assert [NORMALS in stage.unknowns for stage in stages] == [False, False, True]
+    assert [set(stage.unknowns) for stage in stages[2:]] == [set(_keys(folder))]
+
+
+def test_normals_of_a_mesh_that_is_given_are_taken_as_they_are(unrender: Unrender, capture: Path, mesh: Path) -> None:
+    answer = unrender("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4)
+    assert answer.status == 0, answer.error
+    assert _keys(Path("asset")) == [*(f"asset.bsdf.{name}" for name in MATERIAL), "light.data"]
+
+
+def _keys(folder: Path) -> list[str]:
+    """The unknowns of a problem file."""
+    return [
+        table["key"] for table in toml_lines.parse((folder / "problem.toml").read_text(), "problem.toml")["parameters"]
+    ]
 
 
 @pytest.mark.slow

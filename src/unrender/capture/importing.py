@@ -30,7 +30,7 @@ from unrender.capture.formats import lights
 from unrender.capture.mesh import Mesh
 from unrender.capture.silhouettes import Silhouettes, overlap
 from unrender.capture.stored import StoredViews
-from unrender.capture.unknowns import DEFAULT, parse
+from unrender.capture.unknowns import DEFAULT, OF_HULL, parse
 from unrender.capture.views import prepare
 from unrender.core import checks, phases
 from unrender.core.errors import InputError
@@ -70,7 +70,8 @@ class ImportOptions:
         voxels: along the longest side of the hull, at most `MOST_VOXELS`.
         faces: of the hull, about.
         texture: texels along the sides of the textures.
-        unknowns: of the asset, of `unknowns.NAMES`.
+        unknowns: of the asset, of `unknowns.NAMES`; None for `unknowns.DEFAULT` of a mesh that is given, `unknowns.OF_HULL` of a hull,
+            colour and normals under known lights, radiance and light of a field.
         band: pixels along the border of masks that count little.
         turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
         field: voxels along a side of a radiance field, which needs neither masks nor a mesh; None for an asset.
@@ -87,7 +88,7 @@ class ImportOptions:
     voxels: int = 96
     faces: int = 10_000
     texture: int = 512
-    unknowns: tuple[str, ...] = DEFAULT
+    unknowns: tuple[str, ...] | None = None
     band: int = 0
     turntable: bool | None = None
     field: int | None = None
@@ -96,7 +97,8 @@ class ImportOptions:
         for name in ("mesh", "masks"):
             given = getattr(self, name)
             object.__setattr__(self, name, None if given is None else Path(given))
-        object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
+        if self.unknowns is not None:
+            object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
         for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
             checks.integer("import", name, getattr(self, name), at_least=least)
         if self.field is not None:
@@ -191,7 +193,7 @@ def import_capture(
                 mesh,
                 found.silhouettes,
                 options.texture,
-                options.unknowns,
+                options.unknowns or (OF_HULL if options.mesh is None else DEFAULT),
                 options.band,
                 found.turntable,
             )
@@ -212,7 +214,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     with phases.phase("photographs"):
         views = photometric.prepare(capture, options.resolution, options.scale, options.hold_out)
     name = folder.resolve().name
-    chosen = LIT_DEFAULT if options.unknowns == DEFAULT else options.unknowns
+    chosen = options.unknowns or LIT_DEFAULT
     _write_folder(out, lambda place: photometric_folder.write(place, name, views, chosen))
     held_out = sum(views.held_out)
     notices = ["one camera under known lights: normals and colours of a plate, without shadows that it casts"]
@@ -225,7 +227,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """What has no surface."""
     assert options.field is not None
-    voxels, chosen = options.field, field_folder.NAMES[:2] if options.unknowns == DEFAULT else options.unknowns
+    voxels, chosen = options.field, options.unknowns or field_folder.NAMES[:2]
     if others := [one for one in chosen if one not in field_folder.NAMES]:
         raise InputError(f"--unknowns {others[0]}: of a radiance field, expected some of light, exposure")
     variant.ensure()

@@ -16,10 +16,12 @@ from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.vignetting import VIGNETTING
 from unrender.stages.stages_file import Stage, Stages
 
-__all__ = ["DEFAULT", "NAMES", "keys", "parameters", "parse", "stages", "textures"]
+__all__ = ["DEFAULT", "NAMES", "OF_HULL", "keys", "parameters", "parse", "stages", "textures"]
 
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")
+OF_HULL = ("colour", "roughness", "metallic", "normal", "light")
+"""Likewise, of a hull, whose own normals know no hollows."""
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _SMOOTHEST, _SMOOTHEST_WITH_NORMALS = 0.02, 0.25
@@ -34,6 +36,8 @@ _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 _COARSER = 4
 _OF_PICTURES = ("exposure", "vignetting")
 """Unknowns that move in all stages."""
+_NORMALS_RATE, _LATE = 0.01, {"learning_rate": 0.02}
+"""First steps of a normal map; and the rate of `auto` for the others from then on, a fifth of that of the first stages: they settle."""
 _POSE_RATE = 0.05
 """First step of poses, in degrees and units like them."""
 
@@ -74,7 +78,7 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
         "colour": unit,
         "roughness": {"bounds": [_SMOOTHEST_WITH_NORMALS if "normal" in unknowns else _SMOOTHEST, 1.0]},
         "metallic": unit,
-        "normal": unit,
+        "normal": {**unit, "learning_rate": _NORMALS_RATE},
         "light": {"bounds": [0.0, math.inf]},
         "shape": {
             "learning_rate": _VERTEX_RATE * diagonal,
@@ -100,23 +104,26 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving.
+    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving, beside normals
+    and shape by shorter steps.
 
     Poses move from the second stage on, when there is a texture to see them by.
     """
     of, found = keys(unknowns, turntable), []
     moved: list[str] = []
 
-    def add(name: str, more: Sequence[str], share: float, coarser: int = 1) -> None:
+    def add(
+        name: str, more: Sequence[str], share: float, coarser: int = 1, settings: dict[str, Any] | None = None
+    ) -> None:
         given = [one for one in more if one in unknowns]
         if given:
             moved.extend(one for one in given if one not in moved)
             moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
-            found.append(Stage(name, tuple(of[one] for one in moving), share, coarser))
+            found.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
 
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
     add("materials", (*_MATERIALS, "poses"), 3.0)
-    add("normals", ("normal",), 1.0)
-    add("shape", ("shape",), 1.0)
+    add("normals", ("normal",), 4.0, settings=_LATE)
+    add("shape", ("shape",), 1.0, settings=_LATE)
     rest = [name for name in _OF_PICTURES if name in unknowns]
     return Stages(problem, tuple(found or [Stage("photographs", tuple(of[name] for name in rest))]))

@@ -49,9 +49,11 @@ _Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape
 _Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
 _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
 _Unknowns = Annotated[
-    str,
+    str | None,
     typer.Option(
-        metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses."
+        metavar="NAMES",
+        help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses. Default: colour,roughness,metallic,light, "
+        "and normal of a carved shape.",
     ),
 ]
 _Band = Annotated[
@@ -86,7 +88,7 @@ def import_(
     voxels: _Voxels = 96,
     faces: _Faces = 10_000,
     texture: _Texture = 512,
-    unknowns: _Unknowns = "colour,roughness,metallic,light",
+    unknowns: _Unknowns = None,
     band: _Band = 0,
     turntable: _Turntable = None,
     field: _Field = None,
@@ -103,7 +105,7 @@ def import_(
     from unrender.capture import importing
     from unrender.capture.unknowns import parse
 
-    names = parse(unknowns)
+    names = None if unknowns is None else parse(unknowns)
     # fmt: off
     options = importing.ImportOptions(
         mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field
