@@ -208,8 +208,9 @@ def _render(
         ready_made.write_bitmap(ready_made.as_bitmap(own), folder / f"{LIGHT}.exr")
     relit = []
     if light is not None:
-        sensors = scenes.sensors(problem)
-        scene = scenes.load_scene(path, light, scenes.turned_up(scenes.up_axis(sensors)) if upright else None)
+        up = scenes.turned_up(scenes.up_axis(scenes.sensors(problem))) if upright else None
+        scene = scenes.load_scene(path, light, up)
+        sensors = scene.sensors()
         with phases.phase("other light") as advance:
             for index, view in enumerate(problem.views):
                 relit.append(scenes.render(scene, sensors[view.sensor], spp, problem.max_depth)[..., :3])
