@@ -35,6 +35,7 @@ from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
+from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.vignetting import falloff
@@ -103,6 +104,7 @@ __all__ = [
     "stock_scene",
     "time_run_folder",
     "trees",
+    "turntable_turns",
     "vectors",
     "versions",
     "volumes",
@@ -157,6 +159,12 @@ def allocated() -> Callable[[], int]:
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
     return lambda: int(dr.detail.malloc_watermark(backend))
+
+
+def turntable_turns(scene: Any) -> np.ndarray | None:
+    """How a turntable's light is turned before each camera, (V, 3, 3), of a live scene; None where no light turns."""
+    found = [light for light in scene.emitters() if turntable_light.is_turntable(light)]
+    return turntable_light.turns(found[0]) if found else None
 
 
 def from_tensor(value: Any, like: Any) -> Any:
