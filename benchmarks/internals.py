@@ -15,6 +15,7 @@ import numpy as np
 import unrender as ur
 from unrender.capture.mesh import Mesh as CapturedMesh
 from unrender.capture.mesh import ply
+from unrender.capture.turntable import light_turns
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -38,6 +39,7 @@ from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.rendering.response import curve
 from unrender.rendering.vignetting import falloff
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
@@ -78,6 +80,7 @@ __all__ = [
     "black_box",
     "build_problem",
     "coupled_gradients",
+    "curve",
     "dr",
     "element_scales",
     "falloff",
@@ -87,6 +90,7 @@ __all__ = [
     "hardware",
     "image_step",
     "leave_one_out_groups",
+    "light_turns",
     "loss_derivative",
     "method",
     "method_parts",

@@ -36,7 +36,8 @@ def recovered(tmp_path_factory: pytest.TempPathFactory) -> tuple[ur.Problem, ur.
 def test_exports_lose_less_than_a_decibel(recovered: Any, tmp_path: Path) -> None:
     from benchmarks.round_trip.run import compare
 
-    found = compare(*recovered, tmp_path / "asset", SPP)
+    problem, held_out, values = recovered
+    found = compare(problem, held_out, values, tmp_path / "asset", SPP)
     own = np.array(found["run"]["photographs"])
     for kind, row in found.items():
         print(kind, row)
@@ -54,7 +55,8 @@ def test_a_planted_fault_loses_more(recovered: Any, tmp_path: Path, monkeypatch:
         ]
 
     monkeypatch.setitem(readers.READERS, "glb", wrong)
-    found = run.compare(*recovered, tmp_path / "asset", SPP)
+    problem, held_out, values = recovered
+    found = run.compare(problem, held_out, values, tmp_path / "asset", SPP)
     own = np.array(found["run"]["photographs"])
     assert (own - found["glb"]["photographs"] > LOSS).any()
     assert np.mean(found["glb"]["pictures"]) < np.mean(found["run"]["pictures"]) - NOISE

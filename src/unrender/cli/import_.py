@@ -51,13 +51,20 @@ _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the s
 _Unknowns = Annotated[
     str,
     typer.Option(
-        metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses."
+        metavar="NAMES", help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,response,poses."
     ),
 ]
 _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
 ]
 
+_Response = Annotated[
+    str,
+    typer.Option(
+        metavar="CURVE",
+        help="Of files of 8 or 16 bits: srgb, linear, an exponent such as 2.2, or fit to find what differs from sRGB.",
+    ),
+]
 _Turntable = Annotated[
     bool | None,
     typer.Option(
@@ -88,6 +95,7 @@ def import_(
     texture: _Texture = 512,
     unknowns: _Unknowns = "colour,roughness,metallic,light",
     band: _Band = 0,
+    response: _Response = "srgb",
     turntable: _Turntable = None,
     field: _Field = None,
     overwrite: Overwrite = False,
@@ -106,7 +114,8 @@ def import_(
     names = parse(unknowns)
     # fmt: off
     options = importing.ImportOptions(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field,
+        response,
     )
     # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
