@@ -41,6 +41,7 @@ class Made:
         rows: corrections of the poses that would undo their errors, as `Corrections` has them, (V, 6); to first order.
         cameras: the poses of the folder, (V, 4, 4).
         responded: whether the camera's curve is `responded`.
+        sky: the light as the photographs' values have it, (16, 32, 3).
     """
 
     drift: np.ndarray
@@ -48,6 +49,7 @@ class Made:
     rows: np.ndarray
     cameras: np.ndarray
     responded: bool
+    sky: np.ndarray
 
 
 def body() -> CapturedMesh:
@@ -151,14 +153,14 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
     distortion = DISTORTION if "distortion" in given else {}
     pictures = [photograph(scenes[v % len(scenes)], pose, size, distortion, spp) for v, pose in enumerate(true)]
     white = np.quantile(np.stack([p[..., :3][p[..., 3] > 0.99].max() for p in pictures]), 0.5)
+    scale = (_HEADROOM if RESPONSE in given else 1.0) / white
     frames = []
     for v, picture in enumerate(pictures):
         values = picture[..., :3] + (1 - picture[..., 3:]) * _WALL * white
         if "vignetting" in given:
             values = values * falloff(LENS_FALLOFF, size, size)
-        values = values * 2.0 ** drift[v] / white
-        if RESPONSE in given:
-            values = responded(np.clip(_HEADROOM * values, 0, 1))
+        values = values * 2.0 ** drift[v] * scale
+        values = responded(np.clip(values, 0, 1)) if RESPONSE in given else values
         mask = picture[..., 3]
         mask = np.roll(mask, (SHIFT, -SHIFT), (0, 1)) if "masks" in given else mask
         Image.fromarray(np.uint8(np.round(255 * mask))).save(folder / "masks" / f"{v}.png")
@@ -175,7 +177,7 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
     lens |= distortion if told else {}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}), encoding="utf-8")
     vignetting = float(LENS_FALLOFF.sum()) if "vignetting" in given else 0.0
-    return Made(drift, vignetting, -errors, wrong, RESPONSE in given)
+    return Made(drift, vignetting, -errors, wrong, RESPONSE in given, scale * sky)
 
 
 def _turned(rotation: np.ndarray) -> Any:

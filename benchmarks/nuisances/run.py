@@ -63,7 +63,7 @@ def errors(problem: ur.Problem, found: dict[str, np.ndarray], made: capture.Made
     own, true = found[COLOUR][seen], colour[seen]
     scale = (own * true).sum(0) / np.square(own).sum(0)
     lit = next(found[key] for key in LIGHTS if key in found)
-    light = np.log(np.maximum(lit[:, :32], 1e-6)) - np.log(sky)
+    light = np.log(np.maximum(lit[:, 1:-1], 1e-6)) - np.log(sky)
     light = (light - light.mean((0, 1)))[1:-1]
     result = {"colour": _rms(scale * own - true), "light": _rms(light)}
     if "exposure" in found:
@@ -72,8 +72,8 @@ def errors(problem: ur.Problem, found: dict[str, np.ndarray], made: capture.Made
         result["vignetting"] = float(abs(found["vignetting"].sum() - made.vignetting))
     if made.responded:
         x = np.linspace(0, 1, 101)[:, None]
-        power, shoulder = found.get("response", np.zeros((3, 2))).T
-        result["response"] = _rms(curve(power, shoulder, x).values - capture.responded(x))
+        contrast, brightness = found.get("response", np.zeros((3, 2))).T
+        result["response"] = _rms(curve(contrast, brightness, x).values - capture.responded(x))
     rows = found.get("poses", np.zeros_like(made.rows))
     result["poses"] = float(np.mean(_angles(problem, rows, made)))
     return result

@@ -46,7 +46,7 @@ def test_curves_begin_at_black_end_at_white_and_rise() -> None:
 def test_curves_are_a_power_after_a_moebius_transformation() -> None:
     x = np.linspace(0.01, 1, 30)[:, None]
     a, b = GIVEN.T
-    np.testing.assert_allclose(values(GIVEN * [1, 0], x), x ** np.exp(a), rtol=1e-12)
+    np.testing.assert_allclose(values(np.stack([a, -1.6 * a], 1), x), x ** np.exp(a), rtol=1e-12)
     np.testing.assert_allclose(values(GIVEN * [0, 1], x), np.exp(b) * x / (1 - x + np.exp(b) * x), rtol=1e-12)
 
 
@@ -56,8 +56,8 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     h = 1e-6
     for found, one, two in (
         (at.slopes, values(GIVEN, x + h), values(GIVEN, x - h)),
-        (at.by_power, values(GIVEN + [h, 0], x), values(GIVEN - [h, 0], x)),
-        (at.by_shoulder, values(GIVEN + [0, h], x), values(GIVEN - [0, h], x)),
+        (at.by_contrast, values(GIVEN + [h, 0], x), values(GIVEN - [h, 0], x)),
+        (at.by_brightness, values(GIVEN + [0, h], x), values(GIVEN - [0, h], x)),
     ):
         np.testing.assert_allclose(found, (one - two) / (2 * h), rtol=1e-5, atol=1e-7)
 

@@ -39,7 +39,7 @@ _OF_PICTURES = ("exposure", "vignetting", "response")
 _POSE_RATE = 0.05
 """First step of poses, in degrees and units like them."""
 _RESPONSE_RATE = 0.02
-"""First step of logarithms of the response's power and shoulder."""
+"""First step of the response's contrast and brightness."""
 
 
 def parse(text: str) -> tuple[str, ...]:

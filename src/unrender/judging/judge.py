@@ -257,8 +257,8 @@ def _photographed(
     if exposed:
         images = [_exposed(image, view) for image, view in zip(images, problem.views, strict=True)]
     if RESPONSE in of_camera:
-        power, shoulder = of_camera[RESPONSE].T
-        images = [curve(power, shoulder, image).values for image in images]
+        contrast, brightness = of_camera[RESPONSE].T
+        images = [curve(contrast, brightness, image).values for image in images]
     return images
 
 

@@ -30,6 +30,8 @@ RESPONSE = "response"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 RESPONSE_BOUND = 1.5
 """Of the absolute values: exponents from 0.22 to 4.5."""
+_SLANT = 1.6
+"""Shoulder that goes with a power: more contrast about a radiance of 0.37, which is half way to white as displayed."""
 _DARK = 2.0**-10
 """Below, curves are straight: a power has no end of slope, or none, at 0."""
 
@@ -41,36 +43,38 @@ class Curve:
     Attributes:
         values: f(x).
         slopes: ∂f/∂x, > 0.
-        by_power, by_shoulder: ∂f/∂a and ∂f/∂b.
+        by_contrast, by_brightness: ∂f/∂c and ∂f/∂d.
     """
 
     values: Array
     slopes: Array
-    by_power: Array
-    by_shoulder: Array
+    by_contrast: Array
+    by_brightness: Array
 
 
-def curve(power: Array, shoulder: Array, x: Array) -> Curve:
+def curve(contrast: Array, brightness: Array, x: Array) -> Curve:
     """The curve of a response and its derivatives.
 
-        f(x) = m(x)^γ,   γ = exp(a),   m(x) = e^b x / (1 + (e^b - 1) x),   for x from 2⁻¹⁰ to 1,
+        f(x) = m(x)^γ,   m(x) = e^b x / (1 + (e^b - 1) x),   γ = exp(c),   b = d + 1.6 c,   for x from 2⁻¹⁰ to 1,
 
-    a power after a shoulder (b > 0) or a toe (b < 0): f(0) = 0 and f(1) = 1, strictly increasing for all a and b. Below 2⁻¹⁰ and above 1 it
-    goes on straight, towards 0 and with the slope γ e^-b that it has at 1.
+    a power after a shoulder (b > 0) or a toe (b < 0): f(0) = 0 and f(1) = 1, strictly increasing for all c and d. Below 2⁻¹⁰ and above 1 it
+    goes on straight, towards 0 and with the slope γ e^-b that it has at 1. A power alone, x^γ, has d = -1.6 c. Powers and shoulders do
+    nearly the opposite to middle radiances; c and d, contrast and brightness, do different things, so that a descent need not follow a valley.
 
     Args:
-        power, shoulder: a and b, of each channel, or of a shape that broadcasts to the images'.
+        contrast, brightness: c and d, of each channel, or of a shape that broadcasts to the images'.
         x: linear radiance.
     """
-    gamma, rise = arrays.exp(power), arrays.exp(shoulder)
+    shoulder = brightness + _SLANT * contrast
+    gamma, rise = arrays.exp(contrast), arrays.exp(shoulder)
     inside = arrays.clip(x, _DARK, 1.0)
     below = 1.0 + (rise - 1.0) * inside
     moebius = rise * inside / below
     logarithm = arrays.log(inside) + shoulder - arrays.log(below)
     found = arrays.exp(gamma * logarithm)
     slopes = gamma * found / (inside * below)
-    by_power = gamma * logarithm * found
-    by_shoulder = gamma * found * (1.0 - moebius)
+    by_brightness = gamma * found * (1.0 - moebius)
+    by_contrast = gamma * logarithm * found + _SLANT * by_brightness
     dark, bright = x < _DARK, x > 1.0
     low = x * (1.0 / _DARK)
     end = gamma / rise
@@ -82,8 +86,8 @@ def curve(power: Array, shoulder: Array, x: Array) -> Curve:
     return Curve(
         joined(low * found, found, 1.0 + over),
         joined(found * (1.0 / _DARK), slopes, end + 0.0 * x),
-        joined(low * by_power, by_power, over),
-        joined(low * by_shoulder, by_shoulder, -over),
+        joined(low * by_contrast, by_contrast, (1.0 - _SLANT) * over),
+        joined(low * by_brightness, by_brightness, -over),
     )
 
 
@@ -91,7 +95,7 @@ class RespondingRenderer(WithParameter):
     """A renderer whose pictures are as photographs show them that were decoded with another curve than their camera's.
 
     A camera with the response R encodes radiance x as R(x), which is decoded by the sRGB curve S: the photograph's values are
-    S⁻¹(R(x)) = f(x). The parameter `response` (3, 2) holds a and b of `curve` for each channel, as natural logarithms: 0 where the camera's
+    S⁻¹(R(x)) = f(x). The parameter `response` (3, 2) holds c and d of `curve` for each channel, as natural logarithms: 0 where the camera's
     curve is sRGB. It is the outermost of what photographs have: exposure and vignetting are factors of radiance.
 
     What is not known: unknown exposures leave any response undetermined up to a power, x^γ (M. Grossberg, S. Nayar, "Determining the camera
@@ -157,8 +161,8 @@ class RespondingSession:
         else:
             images = self._inner.image({}, replace(request, groups=1)).images
         values = np.asarray(parameters[RESPONSE])
-        power, shoulder = (self._renderer.array(values[:, None, None, :, k]) for k in range(2))
-        return curve(power, shoulder, images).values
+        contrast, brightness = (self._renderer.array(values[:, None, None, :, k]) for k in range(2))
+        return curve(contrast, brightness, images).values
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """See `RenderSession.image_pair`."""
@@ -194,7 +198,7 @@ class RespondingSession:
         """See `RenderSession.tangent_moment`, and `RespondingRenderer` for what is left out."""
         at = _of(parameters, paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0])
         tangent = tangents[RESPONSE]
-        along = at.by_power * tangent[:, 0] + at.by_shoulder * tangent[:, 1]
+        along = at.by_contrast * tangent[:, 0] + at.by_brightness * tangent[:, 1]
         moment = along * along
         if scene := _scene(parameters):
             moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents)) * at.slopes * at.slopes
@@ -222,7 +226,7 @@ class RespondingSession:
     def _ordered(self, parameters: Tree, found: Tree, at: Curve, weights: Array) -> Tree:
         """With the derivative by the response: of each channel, over all pixels, the mean over groups."""
         columns = []
-        for by in (at.by_power, at.by_shoulder):
+        for by in (at.by_contrast, at.by_brightness):
             parts = arrays.mean_over_first(weights * by)
             flat = arrays.reshape(parts, (int(np.prod(arrays.shape(parts)[:-1])), 3))
             columns.append(arrays.reshape(arrays.sum_over_rows(flat), (3, 1)))
