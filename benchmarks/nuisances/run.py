@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import unrender as ur
@@ -24,11 +25,14 @@ from benchmarks.nuisances import capture
 
 COLOUR, LIGHTS = "asset.bsdf.base_color.data", ("light.data", "light.map.data")
 BAND = 4
+KNOWN = "known light"
+"""In place of an unknown one; no nuisance."""
 CASES = {"none": (), **{name: (name,) for name in capture.NUISANCES}, "all": capture.NUISANCES}
 CASES |= {
     "response": (capture.RESPONSE,),
     "turntable": (capture.TURNTABLE,),
     "response, turntable": (capture.RESPONSE, capture.TURNTABLE),
+    "response, turntable, known light": (capture.RESPONSE, capture.TURNTABLE, KNOWN),
 }
 MERGE = ("faults.*",)
 QUICK = {"steps": 3, "size": 24, "spp": 1, "pixels": 512, "fault": ("none", "all")}
@@ -39,7 +43,7 @@ def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], 
     made = capture.make(folder / "photographs", nuisances, size, spp, "distortion" in models)
     unknowns = (
         "colour",
-        "light",
+        *(() if KNOWN in nuisances else ("light",)),
         *(name for name in ("exposure", "vignetting", "response", "poses") if name in models),
     )
     options = ur.ImportOptions(
@@ -53,6 +57,8 @@ def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], 
         turntable=capture.TURNTABLE in nuisances,
     )
     ur.import_capture(folder / "photographs", folder / "problem", options)
+    if KNOWN in nuisances:
+        mi.Bitmap(made.sky.astype(np.float32)).write(str(folder / "problem" / "textures" / "light.exr"))
     return ur.Problem.from_file(folder / "problem" / "problem.toml"), made
 
 
@@ -62,10 +68,11 @@ def errors(problem: ur.Problem, found: dict[str, np.ndarray], made: capture.Made
     # Rows of texels of a bitmap run downwards, as those of the truth do.
     own, true = found[COLOUR][seen], colour[seen]
     scale = (own * true).sum(0) / np.square(own).sum(0)
-    lit = next(found[key] for key in LIGHTS if key in found)
-    light = np.log(np.maximum(lit[:, 1:-1], 1e-6)) - np.log(sky)
-    light = (light - light.mean((0, 1)))[1:-1]
-    result = {"colour": _rms(scale * own - true), "light": _rms(light)}
+    result = {"colour": _rms(scale * own - true)}
+    if lit := [found[key] for key in LIGHTS if key in found]:
+        # Mitsuba repeats a column at either end.
+        light = np.log(np.maximum(lit[0][:, 1:-1], 1e-6)) - np.log(sky)
+        result["light"] = _rms((light - light.mean((0, 1)))[1:-1])
     if "exposure" in found:
         result["exposure"] = _rms(found["exposure"] - found["exposure"].mean(0) - made.drift)
     if "vignetting" in found:

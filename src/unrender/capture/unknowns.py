@@ -38,7 +38,7 @@ _OF_PICTURES = ("exposure", "vignetting", "response")
 """Unknowns that move in all stages."""
 _POSE_RATE = 0.05
 """First step of poses, in degrees and units like them."""
-_RESPONSE_RATE = 0.02
+_RESPONSE_RATE = 0.2
 """First step of the response's contrast and brightness."""
 
 

@@ -59,7 +59,7 @@ def curve(contrast: Array, brightness: Array, x: Array) -> Curve:
 
     a power after a shoulder (b > 0) or a toe (b < 0): f(0) = 0 and f(1) = 1, strictly increasing for all c and d. Below 2⁻¹⁰ and above 1 it
     goes on straight, towards 0 and with the slope γ e^-b that it has at 1. A power alone, x^γ, has d = -1.6 c. Powers and shoulders do
-    nearly the opposite to middle radiances; c and d, contrast and brightness, do different things, so that a descent need not follow a valley.
+    nearly the opposite to middle radiances; contrast c and brightness d do different things, so a descent has no valley to follow.
 
     Args:
         contrast, brightness: c and d, of each channel, or of a shape that broadcasts to the images'.
