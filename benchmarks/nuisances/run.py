@@ -109,7 +109,7 @@ def run(
     steps: int = 60,
     size: int = 32,
     spp: int = 8,
-    pixels: int = 4096,
+    pixels: int | None = None,
     seeds: int = 1,
 ) -> Iterator[dict[str, Any]]:
     """A part for each nuisance, without and with its models.
@@ -118,7 +118,7 @@ def run(
         fault: of the cases; the others' figures stay
         size: pixels along a side of a photograph
         spp: samples in each of the 16 parts of a photograph's pixel
-        pixels: of a step, from all photographs
+        pixels: of a step, from all photographs; as many as `auto` takes where it is not given
     """
     with tempfile.TemporaryDirectory() as scratch:
         problem, _ = imported(Path(scratch), (), (), size, 1)
@@ -134,7 +134,7 @@ def run(
                 problem, made = imported(Path(scratch), CASES[name], models, size, spp)
                 rows = []
                 for seed in range(seeds):
-                    choice = method("auto").configure({"pixels": pixels}).choose(problem)
+                    choice = method("auto").configure({} if pixels is None else {"pixels": pixels}).choose(problem)
                     result = ur.optimize(problem, choice.estimator, choice.optimizer, steps=steps, seed=seed)
                     rows.append(errors(problem, result.parameters, made, seen))
             part[way] = {key: [row[key] for row in rows] for key in rows[0]}

@@ -150,8 +150,9 @@ def test_a_response_is_fitted_or_named(unrender: Unrender, capture: Path, mesh: 
     assert unrender("run", "asset/problem.toml", *words, "--method", "plain").status == 0
     psnr = []
     for response in ([[0.0, 0.0]] * 3, [[0.0, -1.0]] * 3):
-        values = dict(np.load("run/parameters.npz"))
-        np.savez("run/parameters.npz", **(values | {"response": np.array(response, np.float32)}))
+        values: dict[str, Any] = dict(np.load("run/parameters.npz"))
+        values["response"] = np.array(response, np.float32)
+        np.savez("run/parameters.npz", **values)
         answer = unrender("judge", "run", "--spp", 4, "--overwrite")
         assert answer.status == 0, answer.error
         psnr.append(json.loads(Path("run/judge/judge.json").read_text())["mean"]["psnr"])
