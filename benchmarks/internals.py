@@ -15,6 +15,7 @@ import numpy as np
 import unrender as ur
 from unrender.capture.mesh import Mesh as CapturedMesh
 from unrender.capture.mesh import ply
+from unrender.capture.turntable import light_turns
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -35,8 +36,10 @@ from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
+from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.rendering.response import curve
 from unrender.rendering.vignetting import falloff
 from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
@@ -77,6 +80,7 @@ __all__ = [
     "black_box",
     "build_problem",
     "coupled_gradients",
+    "curve",
     "dr",
     "element_scales",
     "falloff",
@@ -86,6 +90,7 @@ __all__ = [
     "hardware",
     "image_step",
     "leave_one_out_groups",
+    "light_turns",
     "loss_derivative",
     "method",
     "method_parts",
@@ -103,6 +108,7 @@ __all__ = [
     "stock_scene",
     "time_run_folder",
     "trees",
+    "turntable_turns",
     "vectors",
     "versions",
     "volumes",
@@ -157,6 +163,12 @@ def allocated() -> Callable[[], int]:
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
     return lambda: int(dr.detail.malloc_watermark(backend))
+
+
+def turntable_turns(scene: Any) -> np.ndarray | None:
+    """How a turntable's light is turned before each camera, (V, 3, 3), of a live scene; None where no light turns."""
+    found = [light for light in scene.emitters() if turntable_light.is_turntable(light)]
+    return turntable_light.turns(found[0]) if found else None
 
 
 def from_tensor(value: Any, like: Any) -> Any:

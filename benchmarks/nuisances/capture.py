@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from benchmarks.internals import MITSUBA_TO_OPENGL, Camera, CapturedMesh, Corrections, falloff, ply
+from benchmarks.internals import MITSUBA_TO_OPENGL, Camera, CapturedMesh, Corrections, falloff, light_turns, ply
 
-__all__ = ["NUISANCES", "Made", "make", "truth"]
+__all__ = ["NUISANCES", "RESPONSE", "TURNTABLE", "Made", "make", "responded", "truth"]
 
 VIEWS, TEXELS, FIELD_OF_VIEW, DISTANCE = 8, 32, 32.0, 4.0
 DRIFT, ERROR, SHIFT, QUALITY = 0.3, 0.5, 2, 90
@@ -23,6 +23,9 @@ DISTORTION = {"k1": -0.25, "k2": 0.08}
 LENS_FALLOFF = np.array([-0.8, 0.2, -0.2])
 """Stops: 0.8 at the corners, that is a factor of 0.57."""
 NUISANCES = ("distortion", "exposure", "vignetting", "poses", "masks", "jpeg")
+RESPONSE, TURNTABLE = "response", "turntable"
+"""Another curve than sRGB; light that stands still before the camera: of captures of their own, as unknown exposures hide a response."""
+CONTRAST, _HEADROOM = 0.6, 0.85
 _FINE = 4
 _WIDER = 1.25
 _WALL = 0.05
@@ -37,12 +40,16 @@ class Made:
         vignetting: at the corners, in stops.
         rows: corrections of the poses that would undo their errors, as `Corrections` has them, (V, 6); to first order.
         cameras: the poses of the folder, (V, 4, 4).
+        responded: whether the camera's curve is `responded`.
+        sky: the light as the photographs' values have it, (16, 32, 3).
     """
 
     drift: np.ndarray
     vignetting: float
     rows: np.ndarray
     cameras: np.ndarray
+    responded: bool
+    sky: np.ndarray
 
 
 def body() -> CapturedMesh:
@@ -65,6 +72,13 @@ def truth() -> tuple[np.ndarray, np.ndarray]:
     colour = np.interp(smooth, (smooth.min(), smooth.max()), (0.15, 0.8)).astype(np.float32)
     sky = 0.3 + 2 * ndimage.gaussian_filter(rng.exponential(1.0, (16, 32, 3)), (1.5, 1.5, 0), mode="wrap")
     return colour, sky.astype(np.float32)
+
+
+def responded(x: np.ndarray) -> np.ndarray:
+    """Radiance in [0, 1] through a camera whose curve has more contrast than sRGB, decoded as sRGB; none that `response` can be exactly."""
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    encoded = encoded + CONTRAST * encoded * (1 - encoded) * (2 * encoded - 1)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def poses() -> np.ndarray:
@@ -105,7 +119,7 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
 
     Args:
         folder: a new one.
-        given: of `NUISANCES`.
+        given: of `NUISANCES`, `RESPONSE` and `TURNTABLE`.
         told: whether transforms.json tells the lens's distortion.
     """
     rng = np.random.default_rng(1)
@@ -127,23 +141,26 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     (folder / "body.ply").write_bytes(ply(body()))
-    scene = mi.load_dict({
+    turns = light_turns(true) if TURNTABLE in given else np.eye(3)[None]
+    scenes = [mi.load_dict({
         "type": "scene",
         "body": {"type": "ply", "filename": str(folder / "body.ply"), "bsdf": {
             "type": "principled", "roughness": 0.6,
             "base_color": {"type": "bitmap", "bitmap": mi.Bitmap(colour), "raw": True, "wrap_mode": "clamp"},
         }},
-        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-    })  # fmt: skip
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": _turned(turn)},
+    }) for turn in turns]  # fmt: skip
     distortion = DISTORTION if "distortion" in given else {}
-    pictures = [photograph(scene, pose, size, distortion, spp) for pose in true]
+    pictures = [photograph(scenes[v % len(scenes)], pose, size, distortion, spp) for v, pose in enumerate(true)]
     white = np.quantile(np.stack([p[..., :3][p[..., 3] > 0.99].max() for p in pictures]), 0.5)
+    scale = (_HEADROOM if RESPONSE in given else 1.0) / white
     frames = []
     for v, picture in enumerate(pictures):
         values = picture[..., :3] + (1 - picture[..., 3:]) * _WALL * white
         if "vignetting" in given:
             values = values * falloff(LENS_FALLOFF, size, size)
-        values = values * 2.0 ** drift[v] / white
+        values = values * 2.0 ** drift[v] * scale
+        values = responded(np.clip(values, 0, 1)) if RESPONSE in given else values
         mask = picture[..., 3]
         mask = np.roll(mask, (SHIFT, -SHIFT), (0, 1)) if "masks" in given else mask
         Image.fromarray(np.uint8(np.round(255 * mask))).save(folder / "masks" / f"{v}.png")
@@ -160,7 +177,13 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
     lens |= distortion if told else {}
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}), encoding="utf-8")
     vignetting = float(LENS_FALLOFF.sum()) if "vignetting" in given else 0.0
-    return Made(drift, vignetting, -errors, wrong)
+    return Made(drift, vignetting, -errors, wrong, RESPONSE in given, scale * sky)
+
+
+def _turned(rotation: np.ndarray) -> Any:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return mi.ScalarTransform4f(matrix.tolist())
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:

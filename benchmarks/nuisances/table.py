@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
-_KEYS = ("colour", "light", "exposure", "vignetting", "poses")
+_KEYS = ("colour", "light", "exposure", "vignetting", "response", "poses")
 
 
 def table(record: Record) -> str:
@@ -15,7 +15,16 @@ def table(record: Record) -> str:
         for way, entry in ways.items():
             cells = [_cell(entry[key], 2 if key == "poses" else 4) if key in entry else "" for key in _KEYS]
             rows.append([name, way, *cells])
-    head = ["nuisance", "models", "base colour", "light (log)", "exposure (stops)", "vignetting (stops)", "poses (°)"]
+    head = [
+        "nuisance",
+        "models",
+        "base colour",
+        "light (log)",
+        "exposure (stops)",
+        "vignetting (stops)",
+        "response",
+        "poses (°)",
+    ]
     seeds = record["settings"]["seeds"]
     said = f"{seeds} seeds, mean ± spread" if seeds > 1 else "1 seed"
     return f"{record['steps']} steps, photographs of {record['size']}², {said}.\n\n{markdown.table(head, rows)}"

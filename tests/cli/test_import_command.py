@@ -148,6 +148,36 @@ def test_saturated_photographs_are_censored(unrender: Unrender, capture: Path, m
     assert ur.Problem.from_file("asset/problem.toml").loss == ur.losses.Censored(ur.losses.L1(), 0.95)
 
 
+def test_a_response_is_fitted_or_named(unrender: Unrender, capture: Path, mesh: Path) -> None:
+    given = ("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4, "--overwrite")
+    answer = unrender(*given, "--response", "linear")
+    assert answer.status == 0, answer.error
+    linear = np.asarray(ur.Problem.from_file("asset/problem.toml").views[0].reference)
+    answer = unrender(*given, "--response", "fit")
+    assert answer.status == 0, answer.error
+    assert "note: response: the light stands still" in answer.out
+    problem = ur.Problem.from_file("asset/problem.toml")
+    assert problem.initial_values()["response"].shape == (3, 2)
+    assert "response" not in ur.Problem.from_file("asset/held-out.toml").initial_values()
+    inside = np.asarray(problem.views[0].mask) > 0
+    assert (np.asarray(problem.views[0].reference)[inside] < linear[inside]).mean() > 0.9
+    for wrong in (("--response", "film"), ("--response", "fit", "--unknowns", "colour,exposure")):
+        answer = unrender(*given, *wrong)
+        assert (answer.status, answer.error.count("\n")) == (2, 1)
+    # Held-out photographs are judged through the curve that was found.
+    words = ("--steps", 1, "--final-spp", 1, "--out", "run")
+    assert unrender("run", "asset/problem.toml", *words, "--method", "plain").status == 0
+    psnr = []
+    for response in ([[0.0, 0.0]] * 3, [[0.0, -1.0]] * 3):
+        values: dict[str, Any] = dict(np.load("run/parameters.npz"))
+        values["response"] = np.array(response, np.float32)
+        np.savez("run/parameters.npz", **values)
+        answer = unrender("judge", "run", "--spp", 4, "--overwrite")
+        assert answer.status == 0, answer.error
+        psnr.append(json.loads(Path("run/judge/judge.json").read_text())["mean"]["psnr"])
+    assert abs(psnr[0] - psnr[1]) > 0.1
+
+
 @pytest.mark.slow
 def test_what_is_written_runs(unrender: Unrender, capture: Path) -> None:
     folder = Path("asset")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.rendering.mitsuba import turntable_light
+from kernels import recorded
+from unrender.judging import scenes
+from unrender.rendering.mitsuba import film, turntable_light
 
 ANGLE = 60.0
 MAP = (np.random.default_rng(0).uniform(0, 1, (8, 16, 3)) ** 4 * 5).astype(np.float32)
@@ -55,6 +58,55 @@ def test_images_and_gradients_are_those_of_a_map_that_is_turned() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3 * np.abs(expected).max())
     unturned = problem(lambda: on_turntable() | {"camera": turned()["camera"]}, "light.map.data")  # a planted fault
     assert np.abs(np.asarray(ur.render(unturned, spp=16)) - np.asarray(ur.render(plain, spp=16))).mean() > 0.01
+
+
+def three_views() -> ur.Problem:
+    """A turntable's: too few views for all of them to be rendered as one table of sensors."""
+
+    def description() -> dict[str, Any]:
+        turns = turntable_light.text(np.stack([np.eye(3), turn(), turn() @ turn()]))
+        light = {"type": "turntable", "turns": turns, "map": {"type": "envmap", "bitmap": mi.Bitmap(MAP)}}
+        base = scene(light)
+        camera = base.pop("camera")
+        times = ({"shutter_open": float(i), "shutter_close": float(i)} for i in range(3))
+        return base | {f"camera-{i}": camera | time for i, time in enumerate(times)}
+
+    views = [ur.View(np.zeros((8, 8, 3)), sensor=i) for i in range(3)]
+    return ur.Problem(description, [ur.Parameter("light.map.data")], views, max_depth=3)
+
+
+def test_views_of_a_turntable_share_their_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = three_views()
+    pictures = [ur.render(given, view=0, spp=4)]
+    with recorded() as new:
+        pictures += [ur.render(given, view=view, spp=4) for view in (1, 2)]
+    assert new
+    assert not any(new)
+    assert np.abs(pictures[1] - pictures[0]).mean() > 0.01  # the light has turned
+    monkeypatch.setattr(film, "open_at_different_times", lambda sensors: False)  # as if time were a constant
+    fresh = three_views()
+    ur.render(fresh, view=0, spp=4)
+    with recorded() as new:
+        again = ur.render(fresh, view=1, spp=4)
+    assert any(new)
+    np.testing.assert_array_equal(again, pictures[1])
+
+
+def test_under_another_light_they_share_them_too(tmp_path: Path) -> None:
+    given = three_views()
+    path = scenes.export_scene(given, given.initial_values(), tmp_path / "scene")
+
+    def later(lit: Any) -> list[bool]:
+        scenes.render(lit, lit.sensors()[0], 4, 3)
+        with recorded() as new:
+            for sensor in lit.sensors()[1:]:
+                scenes.render(lit, sensor, 4, 3)
+        return new
+
+    new = later(scenes.load_scene(path, np.ones((8, 16, 3), np.float32)))
+    assert new
+    assert not any(new)
+    assert any(later(scenes.load_scene(path)))  # Mitsuba's own cameras hold the time as a constant
 
 
 def test_rotations_survive_the_plugin() -> None:

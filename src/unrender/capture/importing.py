@@ -12,6 +12,7 @@ from PIL import Image
 from unrender.backend import variant
 from unrender.capture import (
     atlas,
+    decoding,
     field_folder,
     flips,
     formats,
@@ -49,6 +50,10 @@ MOST_VOXELS = 256
 TURNTABLE = (
     "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
 )
+STILL_LIGHT = (
+    "response: the light stands still with the object, so a matt point has one radiance in all photographs, and any curve can be "
+    "its colour's; highlights and vignetting alone tell it"
+)
 LIT_DEFAULT = ("colour", "normal")
 _OF_CHECK = {CHECK, SHEET}
 _OF_IMPORT = {*problem_folder.OWN, *field_folder.OWN, SHEET}
@@ -74,6 +79,8 @@ class ImportOptions:
             colour and normals under known lights, radiance and light of a field.
         band: pixels along the border of masks that count little.
         turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
+        response: of files of 8 or 16 bits: "srgb", "linear", an exponent such as "2.2", or "fit", which is sRGB with `response` among the
+            unknowns.
         field: voxels along a side of a radiance field, which needs neither masks nor a mesh; None for an asset.
     """
 
@@ -92,13 +99,15 @@ class ImportOptions:
     band: int = 0
     turntable: bool | None = None
     field: int | None = None
+    response: str = decoding.SRGB
 
     def __post_init__(self) -> None:
         for name in ("mesh", "masks"):
             given = getattr(self, name)
             object.__setattr__(self, name, None if given is None else Path(given))
+        decoding.check(self.response)
         if self.unknowns is not None:
-            object.__setattr__(self, "unknowns", parse(",".join(self.unknowns)))
+            object.__setattr__(self, "unknowns", self.chosen(()))
         for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
             checks.integer("import", name, getattr(self, name), at_least=least)
         if self.field is not None:
@@ -107,6 +116,11 @@ class ImportOptions:
                 raise InputError(f"--field: expected 2 to {MOST_VOXELS} voxels a side, and no --mesh")
         if self.voxels > MOST_VOXELS:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
+
+    def chosen(self, default: tuple[str, ...]) -> tuple[str, ...]:
+        """The unknowns: those given, else these, and `response` where it is to be fitted."""
+        fitted = ("response",) if self.response == decoding.FIT else ()
+        return parse(",".join((*(default if self.unknowns is None else self.unknowns), *fitted)))
 
 
 @dataclass(frozen=True)
@@ -172,6 +186,10 @@ def import_capture(
         raise InputError(f"import_capture: {out}: not empty; give overwrite=True to replace an earlier import")
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
     if formats.is_lit(folder, options.kind):
+        if options.response != decoding.SRGB:
+            raise InputError(
+                "--response: of one camera under known lights, sRGB or linear is chosen by what explains the photographs"
+            )
         return _import_lit(folder, out, options)
     if options.field is not None:
         return _import_field(folder, out, options)
@@ -193,7 +211,7 @@ def import_capture(
                 mesh,
                 found.silhouettes,
                 options.texture,
-                options.unknowns or (OF_HULL if options.mesh is None else DEFAULT),
+                options.chosen(OF_HULL if options.mesh is None else DEFAULT),
                 options.band,
                 found.turntable,
             )
@@ -227,6 +245,8 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """What has no surface."""
     assert options.field is not None
+    if options.response == decoding.FIT:
+        raise InputError("--response fit: of a radiance field, any curve can be its own; expected srgb, linear or an exponent")
     voxels, chosen = options.field, options.unknowns or field_folder.NAMES[:2]
     if others := [one for one in chosen if one not in field_folder.NAMES]:
         raise InputError(f"--unknowns {others[0]}: of a radiance field, expected some of light, exposure")
@@ -239,6 +259,7 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
             options.scale,
             options.hold_out,
             lambda done, count: advance(done / count),
+            options.response,
         )
     name = folder.resolve().name
     _write_folder(out, lambda place: field_folder.write(place, name, views, voxels, chosen))
@@ -313,7 +334,12 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
     with phases.phase("photographs") as advance:
         views, notices = prepare(
-            capture, options.resolution, options.scale, options.hold_out, lambda done, count: advance(done / count)
+            capture,
+            options.resolution,
+            options.scale,
+            options.hold_out,
+            lambda done, count: advance(done / count),
+            options.response,
         )
     masked = all(views.masked)
     if given is None and not masked:
@@ -333,6 +359,8 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     turned = turntable.stands_still(views) if options.turntable is None else options.turntable
     if turned and options.turntable is None:
         notices.append(TURNTABLE)
+    if "response" in options.chosen(DEFAULT) and not turned:
+        notices.append(STILL_LIGHT)
     return _Read(capture, views, mesh, silhouettes, overlaps, turned, (*capture.notices, *notices), refusal)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from unrender.capture import decoding
 from unrender.capture.cameras import Lens, opencv
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
@@ -87,12 +88,13 @@ def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]
     return (height, width) if orientation in _QUARTER_TURNS else (width, height)
 
 
-def read(path: Path, orientation: int = 1) -> Pixels:
-    """The photograph in a file. 8- and 16-bit integers are taken as sRGB, floating-point numbers as linear; CMYK becomes RGB.
+def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pixels:
+    """The photograph in a file. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
 
     Args:
         path: the file.
         orientation: EXIF's, to turn the pixels by; 1 for as stored.
+        response: of integers, see `decoding.linear`.
 
     Raises:
         InputError: the file cannot be read, or not all of it.
@@ -103,7 +105,7 @@ def read(path: Path, orientation: int = 1) -> Pixels:
     array = _turn(array, orientation)
     if array.dtype in (np.uint8, np.uint16):
         largest = np.iinfo(array.dtype).max
-        curve = images.srgb_to_linear(np.arange(largest + 1) / largest).astype(np.float32)
+        curve = decoding.linear(np.arange(largest + 1) / largest, response).astype(np.float32)
         values = curve[array[..., :3]]
         alpha = array[..., 3].astype(np.float32) / largest if array.shape[2] == 4 else None
     else:

@@ -13,12 +13,14 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.photographs import check_response
+from unrender.rendering.response import RESPONSE
 from unrender.rendering.vignetting import VIGNETTING
 from unrender.stages.stages_file import Stage, Stages
 
 __all__ = ["DEFAULT", "NAMES", "OF_HULL", "keys", "parameters", "parse", "stages", "textures"]
 
-NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "poses")
+NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "response", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")
 OF_HULL = ("colour", "roughness", "metallic", "normal", "light")
 """Likewise, of a hull, whose own normals know no hollows."""
@@ -34,12 +36,14 @@ _FLAT = (0.5, 0.5, 1.0)
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
 """Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
 _COARSER = 4
-_OF_PICTURES = ("exposure", "vignetting")
+_OF_PICTURES = ("exposure", "vignetting", "response")
 """Unknowns that move in all stages."""
 _NORMALS_RATE, _LATE = 0.01, {"learning_rate": 0.02}
 """First steps of a normal map; and the rate of `auto` for the others from then on, a fifth of that of the first stages: they settle."""
 _POSE_RATE = 0.05
 """First step of poses, in degrees and units like them."""
+_RESPONSE_RATE = 0.2
+"""First step of the response's contrast and brightness."""
 
 
 def parse(text: str) -> tuple[str, ...]:
@@ -51,6 +55,7 @@ def parse(text: str) -> tuple[str, ...]:
         if name not in NAMES:
             expected = did_you_mean(name, NAMES) or f"; expected some of {', '.join(NAMES)}"
             raise InputError(f"--unknowns: no {name}{expected}")
+    check_response(given)
     return tuple(name for name in NAMES if name in given)
 
 
@@ -66,6 +71,7 @@ def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
         "light": "light.map.data" if turntable else "light.data",
         "exposure": EXPOSURE,
         "vignetting": VIGNETTING,
+        "response": RESPONSE,
         "poses": POSES,
     }
 
@@ -86,6 +92,7 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
         },
         "exposure": {},
         "vignetting": {},
+        "response": {"learning_rate": _RESPONSE_RATE},
         "poses": {"learning_rate": _POSE_RATE},
     }
     return [{"key": of[name], **more[name]} for name in NAMES if name in unknowns]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.capture import pictures
+from unrender.capture import decoding, pictures
 from unrender.capture.cameras import Lens
 from unrender.capture.capture import Capture, Photograph
 from unrender.capture.captured_view import CapturedView
@@ -28,6 +28,7 @@ def prepare(
     scale: float | None,
     hold_out: int | None,
     progress: Callable[[int, int], None] = lambda done, count: None,
+    response: str = decoding.SRGB,
 ) -> tuple[StoredViews, list[str]]:
     """Read, undistort and check all photographs, one by one; results of the chosen resolution wait in a temporary file.
 
@@ -37,6 +38,7 @@ def prepare(
         scale: in place of `resolution`, a factor of each photograph's own, at most 1.
         hold_out: every so many photographs one is held out, the first among them; 0 for none; None for the capture's own split, or 8.
         progress: called with how many are done, and how many there are.
+        response: of files of 8 or 16 bits, see `decoding.linear`.
 
     Returns:
         The views in the capture's order, and notices.
@@ -51,7 +53,7 @@ def prepare(
     views, looks = StoredViews(), []
     turned: list[str] = []
     for index, photograph in enumerate(capture.photographs):
-        view, was_turned = _view(photograph, resolution, scale, held_out[index])
+        view, was_turned = _view(photograph, resolution, scale, held_out[index], response)
         views.append(view)
         looks += [] if view.mask is None else [_Mask.of(view.name, view.mask)]
         turned += [photograph.name] if was_turned else []
@@ -78,7 +80,9 @@ def _split(photographs: Sequence[Photograph], every: int | None) -> list[bool]:
     return [every > 0 and len(photographs) > every and index % every == 0 for index in range(len(photographs))]
 
 
-def _view(photograph: Photograph, resolution: int, scale: float | None, held_out: bool) -> tuple[CapturedView, bool]:
+def _view(
+    photograph: Photograph, resolution: int, scale: float | None, held_out: bool, response: str
+) -> tuple[CapturedView, bool]:
     width, height, orientation = pictures.upright(photograph.file, photograph.lens)
     try:
         lens = photograph.lens or Lens.of_field_of_view(photograph.field_of_view, width, height)
@@ -86,7 +90,7 @@ def _view(photograph: Photograph, resolution: int, scale: float | None, held_out
         target = pinhole(lens, min(1.0, resolution / max(width, height)) if scale is None else scale)
     except InputError as error:
         raise InputError(f"{photograph.file}: {error}") from error
-    read = pictures.read(photograph.file, orientation)
+    read = pictures.read(photograph.file, orientation, response)
     if read.values.shape[:2] != (height, width):
         have = f"{read.values.shape[1]} x {read.values.shape[0]}"
         raise InputError(f"{photograph.file}: holds {have} pixels where its header says {width} x {height}")

@@ -52,14 +52,21 @@ _Unknowns = Annotated[
     str | None,
     typer.Option(
         metavar="NAMES",
-        help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,poses. Default: colour,roughness,metallic,light, "
-        "and normal of a carved shape.",
+        help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,response,poses. "
+        "Default: colour,roughness,metallic,light, and normal of a carved shape.",
     ),
 ]
 _Band = Annotated[
     int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
 ]
 
+_Response = Annotated[
+    str,
+    typer.Option(
+        metavar="CURVE",
+        help="Of files of 8 or 16 bits: srgb, linear, an exponent such as 2.2, or fit to find what differs from sRGB.",
+    ),
+]
 _Turntable = Annotated[
     bool | None,
     typer.Option(
@@ -90,6 +97,7 @@ def import_(
     texture: _Texture = 512,
     unknowns: _Unknowns = None,
     band: _Band = 0,
+    response: _Response = "srgb",
     turntable: _Turntable = None,
     field: _Field = None,
     overwrite: Overwrite = False,
@@ -108,7 +116,8 @@ def import_(
     names = None if unknowns is None else parse(unknowns)
     # fmt: off
     options = importing.ImportOptions(
-        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field,
+        response,
     )
     # fmt: on
     marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)

@@ -66,6 +66,9 @@ class SceneGraph:
         except Exception as error:
             raise InputError(f"scene: its description cannot be read: {' '.join(str(error).split())[:400]}") from error
         self.nodes: Any = self._state.nodes
+        for emitter in self._scene.emitters():  # of plugins in Python, the parser does not know of what kind they are
+            if (label := _LABEL.fullmatch(emitter.id())) and self.nodes[int(label[1])].type == mi.ObjectType.Unknown:
+                self.nodes[int(label[1])].type = mi.ObjectType.Emitter
         self.names = [node.props.id() for node in self.nodes]
         self.live = mi.traverse(self._scene)
 

@@ -32,6 +32,7 @@ from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
+from unrender.rendering.response import RESPONSE, curve
 from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
@@ -103,7 +104,7 @@ def judge(
     problem, found = reopen.problem_of(run), folders.read(run)
     given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _found(Path(run), problem, found)
-    vignetting = values.get(VIGNETTING)
+    of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
     judged, values, notices = _problem(problem, given, values, found)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
@@ -115,7 +116,7 @@ def judge(
         if measured and light is not None:
             images, relit = relit, []
         if measured:
-            images = _photographed(judged, images, vignetting, exposed)
+            images = _photographed(judged, images, of_camera, exposed)
         measures = _measure(judged, images) if measured else []
         pictures.write(folder, judged, images, relit, measures)
         record = _record(judged, measures, albedo, given, environment, spp, notices)
@@ -208,8 +209,9 @@ def _render(
         ready_made.write_bitmap(ready_made.as_bitmap(own), folder / f"{LIGHT}.exr")
     relit = []
     if light is not None:
-        sensors = scenes.sensors(problem)
-        scene = scenes.load_scene(path, light, scenes.turned_up(scenes.up_axis(sensors)) if upright else None)
+        up = scenes.turned_up(scenes.up_axis(scenes.sensors(problem))) if upright else None
+        scene = scenes.load_scene(path, light, up)
+        sensors = scene.sensors()
         with phases.phase("other light") as advance:
             for index, view in enumerate(problem.views):
                 relit.append(scenes.render(scene, sensors[view.sensor], spp, problem.max_depth)[..., :3])
@@ -247,13 +249,16 @@ def _unknown_of_photographs(problem: Problem) -> list[str]:
 
 
 def _photographed(
-    problem: Problem, images: list[np.ndarray], vignetting: np.ndarray | None, exposed: bool
+    problem: Problem, images: list[np.ndarray], of_camera: Mapping[str, np.ndarray], exposed: bool
 ) -> list[np.ndarray]:
-    """Renderings as the photographs' lens and exposures would have them."""
-    if vignetting is not None:
-        images = [image * falloff(vignetting, *image.shape[:2]) for image in images]
+    """Renderings as the photographs' lens, exposures and response would have them."""
+    if VIGNETTING in of_camera:
+        images = [image * falloff(of_camera[VIGNETTING], *image.shape[:2]) for image in images]
     if exposed:
         images = [_exposed(image, view) for image, view in zip(images, problem.views, strict=True)]
+    if RESPONSE in of_camera:
+        contrast, brightness = of_camera[RESPONSE].T
+        images = [curve(contrast, brightness, image).values for image in images]
     return images
 
 

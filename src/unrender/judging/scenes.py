@@ -43,7 +43,8 @@ def read_light(path: Path) -> np.ndarray:
 
 
 def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray | None = None) -> Any:
-    """The scene of a file, live.
+    """The scene of a file, live. Under another light, the sensors' shutters are as if never set: their times are the turntable's, and
+    Mitsuba compiles a kernel for each.
 
     Args:
         path: of a scene that `export_scene` wrote.
@@ -55,6 +56,10 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
     root = Xml.parse(path).getroot()
     for emitter in root.findall("emitter"):
         root.remove(emitter)
+    for sensor in root.findall("sensor"):
+        for name in ("shutter_open", "shutter_close"):
+            for value in sensor.findall(f"float[@name='{name}']"):
+                sensor.remove(value)
     file = path.parent / "other-light.exr"
     ready_made.write_bitmap(ready_made.as_bitmap(light), file)
     emitter = Xml.SubElement(root, "emitter", type="envmap", id=LIGHT)

@@ -52,7 +52,6 @@ from unrender.problem.validation import (
 )
 from unrender.problem.view import View
 from unrender.problem.view_checks import check_view, stored
-from unrender.rendering.camera_poses import POSES
 from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
@@ -137,7 +136,8 @@ class Problem:
         try:
             self.renderer = with_photographs(self.renderer, keys, sensors)
         except InputError as error:
-            raise FieldError(("parameters", keys.index(POSES), "key"), str(error)) from error
+            named = str(error).partition(":")[0]
+            raise FieldError(("parameters", keys.index(named), "key"), str(error)) from error
 
         known = self.renderer.parameters()
         checked: dict[str, CheckedParameter] = {}

@@ -1,4 +1,4 @@
-"""What photographs have beside a scene: exposure, vignetting and corrections of their cameras' poses, as parameters around a renderer."""
+"""What photographs have beside a scene: response, exposure, vignetting and corrections of their cameras' poses, around a renderer."""
 
 from __future__ import annotations
 
@@ -6,16 +6,33 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.rendering.camera_poses import POSES, PosedCameras
 from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import Renderer
+from unrender.rendering.response import RESPONSE, RespondingRenderer
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
 
-__all__ = ["OF_PHOTOGRAPHS", "scene_renderer", "scene_values", "sensors_with_rows", "with_photographs"]
+__all__ = [
+    "OF_PHOTOGRAPHS",
+    "check_response",
+    "scene_renderer",
+    "scene_values",
+    "sensors_with_rows",
+    "with_photographs",
+]
 
-OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE)
+OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE, RESPONSE)
 """Keys of parameters that no scene has, from the inside out."""
+
+
+def check_response(names: Collection[str]) -> None:
+    """Raise `InputError` where exposures are unknown beside a response."""
+    if RESPONSE in names and EXPOSURE in names:
+        raise InputError(
+            f"{RESPONSE}: with {EXPOSURE} unknown, too, a response is undetermined up to a power of radiance; leave out one of them"
+        )
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
@@ -44,8 +61,9 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
         sensors: of the views.
 
     Raises:
-        InputError: poses are among the keys, and the sensors cannot be moved.
+        InputError: poses are among the keys, and the sensors cannot be moved; or both response and exposure are.
     """
+    check_response(keys)
     wanted = [key for key in OF_PHOTOGRAPHS if key in keys]
     if not wanted:
         return renderer
@@ -57,11 +75,13 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
         found = PosedCameras(found, list(sensors))
     if VIGNETTING in wanted:
         found = VignettedRenderer(found)
-    return ExposedRenderer(found, sensors) if EXPOSURE in wanted else found
+    if EXPOSURE in wanted:
+        found = ExposedRenderer(found, sensors)
+    return RespondingRenderer(found) if RESPONSE in wanted else found
 
 
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The values that a scene can hold: without exposures and vignetting, and with the poses of its cameras."""
+    """The values that a scene can hold: without response, exposures and vignetting, and with the poses of its cameras."""
     found = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, PosedCameras) and POSES in values:

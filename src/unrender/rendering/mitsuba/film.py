@@ -21,6 +21,7 @@ __all__ = [
     "develop",
     "film_adjoint",
     "independent",
+    "open_at_different_times",
     "per_sample",
     "rays",
     "sampler_at",
@@ -96,7 +97,7 @@ class CameraSamples:
 
 
 def camera_samples(
-    sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1
+    sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1, timed: bool = False
 ) -> CameraSamples:
     """Samples of one sensor's film; copies * count * spp lanes.
 
@@ -108,6 +109,8 @@ def camera_samples(
         pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
         count: how many pixels.
         copies: of the whole image, one behind the other.
+        timed: whether sensors open at different times (`open_at_different_times`): the time is then an input of the kernel, which all of
+            them share, and no constant in it.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
@@ -120,11 +123,17 @@ def camera_samples(
         index = dr.gather(mi.UInt32, pixels, index)
     y = index // width
     position = mi.Point2f(index - y * width, y) + sampler.next_2d()
-    time = sensor.shutter_open() + (
+    opening = float(sensor.shutter_open())
+    time = (dr.opaque(mi.Float, opening) if timed else opening) + (
         sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0
     )
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     return CameraSamples(sensor, mi.Float(time), mi.Point2f(position.x / width, position.y / height), aperture, spp)
+
+
+def open_at_different_times(sensors: Any) -> bool:
+    """Whether a list of `mitsuba.Sensor` has shutters that open at different times, such as those of a turntable."""
+    return len({float(sensor.shutter_open()) for sensor in sensors}) > 1
 
 
 def camera_samples_of_many(

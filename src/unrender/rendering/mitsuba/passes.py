@@ -332,8 +332,11 @@ class PosesPass(Pass):
             assembly = self.posed.at(scenes, numbers, batch)
             repeating = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
-                camera = assembly.static.sensors()[size.sensor]
-                samples = film.camera_samples(camera, repeating, seed, size.spp, pixels, size.pixels, self.copies)
+                cameras = assembly.static.sensors()
+                camera, timed = cameras[size.sensor], film.open_at_different_times(cameras)
+                samples = film.camera_samples(
+                    camera, repeating, seed, size.spp, pixels, size.pixels, self.copies, timed
+                )
                 ray, ray_weight = film.rays(samples) if rays is None else _repeated(rays[0], lanes, self.copies)
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
@@ -356,7 +359,9 @@ def _camera_samples(
     sensors: tuple[film.Films, mi.UInt32] | None,
 ) -> film.CameraSamples:
     if sensors is None:
-        return film.camera_samples(scene.sensors()[size.sensor], sampler, seed, size.spp, pixels, size.pixels)
+        cameras = scene.sensors()
+        timed = film.open_at_different_times(cameras)
+        return film.camera_samples(cameras[size.sensor], sampler, seed, size.spp, pixels, size.pixels, timed=timed)
     films, which = sensors
     return film.camera_samples_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
 

@@ -1,0 +1,46 @@
+"""From the levels of a photograph's file to linear values: the response curve that `--response` names."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.io import images
+
+__all__ = ["FIT", "LINEAR", "SRGB", "check", "linear"]
+
+SRGB, LINEAR, FIT = "srgb", "linear", "fit"
+_LEAST, _MOST = 1.0, 4.0
+"""Exponents of cameras and screens lie between 1 and 2.6."""
+
+
+def check(response: str) -> str:
+    """The name of a response, as it was given. Raises `InputError`."""
+    if response not in (SRGB, LINEAR, FIT):
+        _exponent(response)
+    return response
+
+
+def linear(levels: np.ndarray, response: str) -> np.ndarray:
+    """Linear values of levels in [0, 1], any shape, by a response: 0 and 1 are themselves, and a brighter level is brighter.
+
+    "srgb" and "fit" take the sRGB curve, a number γ the power levels ** γ, "linear" the levels as they are.
+    """
+    if response in (SRGB, FIT):
+        return images.srgb_to_linear(levels)
+    return levels if response == LINEAR else levels ** _exponent(response)
+
+
+def _exponent(text: str) -> float:
+    names = f"{SRGB}, {LINEAR}, {FIT} or an exponent from {_LEAST:g} to {_MOST:g}, such as 2.2"
+    expected = f"--response {printable(text[:40])}: expected {names}"
+    try:
+        found = float(text)
+    except ValueError as error:
+        raise InputError(expected) from error
+    if not math.isfinite(found) or not _LEAST <= found <= _MOST:
+        raise InputError(expected)
+    return found
