@@ -322,9 +322,8 @@ class SmoothedDerivatives:
 
 def _diagonal(kept: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
     """The diagonal (n,) after the draws of a step, of which each tells rows[b] · diagonal = values[b]."""
-    if kept is None:
-        kept = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values))
-    return diagonal_curvature.corrected(kept, rows, values, rate)
+    before = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values)) if kept is None else kept
+    return diagonal_curvature.corrected(before, rows, values, rate)
 
 
 def _convergence(losses: np.ndarray, center: float) -> float:

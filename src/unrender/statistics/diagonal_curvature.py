@@ -39,6 +39,8 @@ def corrected(diagonal: np.ndarray, rows: np.ndarray, values: np.ndarray, rate: 
 
 
 def positive(diagonal: np.ndarray) -> np.ndarray:
-    """The diagonal (n,) with no element below `LEAST` times their mean magnitude: a positive definite matrix to divide by. Elements that noise
-    or one step's renders made small or negative would make the longest steps."""
+    """The diagonal (n,) with no element below `LEAST` times their mean magnitude: a positive definite matrix to divide by.
+
+    Elements that noise or one step's renders made small or negative would make the longest steps.
+    """
     return np.maximum(diagonal, LEAST * float(np.mean(np.abs(diagonal))))
