@@ -194,7 +194,7 @@ OTHER_GRIDS: dict[tuple[str, str], Grid | tuple[Grid, ...]] = {
     ("QUAD", "OurG"): {"half_life": (25.0, 60.0), "rate": (0.5, 1.0, 2.0)},
     ("TEXTURE", "Mitsuba"): {"rate": (0.03, 0.1)},
     ("TEXTURE", "FR22"): {"half_life": (30.0, 60.0), "rate": (0.25, 0.5), "spp": (4.0, 16.0)},
-    ("TEXTURE", "CMA-ES"): {"deviation": (0.25, 0.5), "population": (16, 32)},
+    ("TEXTURE", "CMA-ES"): {"deviation": (0.25, 0.5), "population": (16, 32), "spp": (4.0,)},
     ("TEXTURE", "OurG"): {"half_life": (60.0,), "rate": (0.2,)},
     ("TEXTURE", "OurHVP"): _WIDE,
     ("TEXTURE", "OurHVPA"): {"samples": (12.0, 16.0), **_ONE_BY_ONE},

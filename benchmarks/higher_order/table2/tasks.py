@@ -117,6 +117,6 @@ TASKS = {
     "MUG": Task("mug", _hidden, 0.6, 2.5),
     "SHADOW": Task("shadow", _around(0.2), 0.4, 1.5),
     "BUNNY": Task("bunny", _bunny, 0.2, 3.0, spp=4, scales={"bunny.rotation.y": 2.5}),
-    "TEXTURE": Task("poster", _grey, 0.1, 42.0, spp=4, tuned=0.5, options={"reference_spp": 16384}),
+    "TEXTURE": Task("poster", _grey, 0.1, 42.0, spp=2, tuned=0.5, options={"reference_spp": 16384}),
 }
 """By the paper's names."""
