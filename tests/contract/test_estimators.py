@@ -71,6 +71,12 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "smoothed products": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hvp", joint=False),
     "smoothed Hessian, joint": lambda: ur.SmoothedDerivatives(0.03, samples=64, order="hessian"),
     "smoothed products, joint": lambda: ur.SmoothedDerivatives({"colour": 0.03, "*": 0.02}, samples=64, order="hvp"),
+    "smoothed products, diagonal": lambda: ur.SmoothedDerivatives(
+        0.03, 32, "hvp", joint=False, hessian_rate=0.5, hessian_form="diagonal", orthogonal=True
+    ),
+    "smoothed products, joint diagonal": lambda: ur.SmoothedDerivatives(
+        0.03, 32, "hvp", hessian_rate=0.5, hessian_form="diagonal", orthogonal=True
+    ),
     "loss values": lambda: ur.LossValues(spp=4),
     "Gauss-Newton": lambda: ur.GaussNewton(spp=8, derivative_spp=4),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),

@@ -222,6 +222,26 @@ def test_newton_cg_steps_along_the_gradient_where_the_loss_is_linear(torch: Any)
     np.testing.assert_allclose(w.detach(), -0.1 / np.sqrt(2), rtol=1e-6)
 
 
+def test_newton_cg_in_the_metric_of_its_scales(torch: Any) -> None:
+    """Of ½ Σ h w² in the scales 1 / √h one product tells the whole step; without them it does not. The radius is in the metric, too."""
+    bend = torch.tensor([0.1, 1.0, 10.0])
+
+    def after(scales: Any, radius: float = 100.0) -> np.ndarray:
+        w = torch.ones(3, requires_grad=True)
+        ur.grey_box.newton_cg_step(lambda: 0.5 * (bend * w * w).sum(), [w], radius, iterations=1, scales=scales)
+        return w.detach().numpy()
+
+    np.testing.assert_allclose(after([bend**-0.5]), 0, atol=1e-6)
+    assert np.abs(after(None)).max() > 0.5
+    np.testing.assert_allclose(after([torch.ones(3)]), after(None), rtol=1e-6)
+    moved = (after([bend**-0.5], 0.3) - 1) * np.sqrt(bend.numpy())
+    assert np.linalg.norm(moved) == pytest.approx(0.3, rel=1e-5)
+    w = torch.ones(3, requires_grad=True)
+    for scales, message in (([torch.ones(2)], "scales must have the shapes"), ([torch.zeros(3)], "finite and above 0")):
+        with pytest.raises(ur.InputError, match=message):
+            ur.grey_box.newton_cg_step(lambda: w.sum(), [w], scales=scales)
+
+
 def test_newton_cg_refuses_what_is_no_loss(torch: Any) -> None:
     line = Line(torch)
     step = ur.grey_box.newton_cg_step

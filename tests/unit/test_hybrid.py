@@ -121,6 +121,24 @@ def test_a_debiased_loss_is_unbiased_for_any_number_of_samples(first: int) -> No
     assert worst(np.array(found[1])[:, None], np.array([expected])) > 3.3
 
 
+def test_halves_that_are_the_same_render_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A planted fault: with one seed for both halves, the product of their errors is a square, and biased like one."""
+    from unrender.estimators import loss_values
+
+    asked = problem(noise=0.9, views=1)
+    at = asked.initial()
+    renderer = asked.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    expected = np.array([float(asked.loss_value(0, renderer.exact(at)))])
+
+    def found() -> np.ndarray:
+        return np.array([[loss_values.BlackBox(asked, at, 2, Key(seed), True).center()] for seed in range(300)])
+
+    assert worst(found(), expected) < 3.3
+    monkeypatch.setattr(loss_values, "_other", lambda seed: seed)
+    assert worst(found(), expected) > 3.3
+
+
 def test_a_snapshot_s_image_of_a_state_in_between_is_unbiased() -> None:
     """What the gradient's memory needs of a control variate with mini-batches: the image of the last step, not of the snapshot's."""
     asked = problem(keys=("map",), views=1)

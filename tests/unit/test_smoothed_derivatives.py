@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tracemalloc
 from typing import Any
 
@@ -12,6 +13,7 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.schedules.functions import Exponential
+from unrender.statistics import diagonal_curvature
 
 
 def problem(n: int = 3, **more: Any) -> ur.Problem:
@@ -37,6 +39,11 @@ def problem(n: int = 3, **more: Any) -> ur.Problem:
         ({"sigma": 0.1, "epsilon": 0}, "epsilon must be a finite number > 0, got 0"),
         ({"sigma": 0.1, "order": "hvp", "hessian_rate": 1.5}, "hessian_rate must be at most 1, got 1.5"),
         ({"sigma": 0.1, "hessian_rate": 0.5}, 'hessian_rate goes with order="hvp", got'),
+        ({"sigma": 0.1, "hessian_form": "banded"}, 'hessian_form must be "full" or "diagonal"'),
+        ({"sigma": 0.1, "order": "hvp", "hessian_form": "diagonal"}, 'hessian_form="diagonal" goes with hessian_rate'),
+        ({"sigma": 0.1, "orthogonal": True, "low_discrepancy": True}, "orthogonal draws need aggregate"),
+        ({"sigma": 0.1, "orthogonal": True, "aggregate": False}, "orthogonal draws need aggregate"),
+        ({"sigma": 0.1, "orthogonal": True, "product": True}, "orthogonal draws need aggregate"),
     ],
 )
 def test_arguments_that_make_no_sense(arguments: dict[str, Any], message: str) -> None:
@@ -85,8 +92,8 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
     assert samples(products, optimizers.NewtonCG(iterations=3)) == 1 + 16
     products = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", spp=2, joint=False)
     assert samples(products, optimizers.NewtonCG(iterations=1)) == 1 + 16 + 32
-    for joint in (True, False):
-        kept = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", joint=joint, hessian_rate=0.5)
+    for joint, form in itertools.product((True, False), ("full", "diagonal")):
+        kept = ur.SmoothedDerivatives(0.1, samples=16, order="hvp", joint=joint, hessian_rate=0.5, hessian_form=form)
         assert samples(kept, optimizers.NewtonCG(iterations=3)) == 1 + 16
     whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, joint=False)
     assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16
@@ -215,6 +222,36 @@ def test_a_hessian_that_is_kept_is_that_of_the_loss_and_so_is_the_gradient(joint
     assert state.hessian is not None
     assert one.hvp is not None
     np.testing.assert_allclose(one.hvp({"x": np.array([1.0, 0, 0])})["x"], state.hessian[:, 0] / sigma**2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("orthogonal", [True, False])
+@pytest.mark.parametrize("joint", [True, False], ids=["joint", "differences"])
+def test_a_diagonal_that_is_kept_is_that_of_the_loss(joint: bool, orthogonal: bool) -> None:
+    """A quadratic whose curvatures differ by a factor of 10: after 60 steps the diagonal is its, and so are products."""
+    n, sigma = 12, 0.1
+    bend, at = np.geomspace(0.3, 3.0, n), np.ones(n)
+    estimator = ur.SmoothedDerivatives(
+        sigma, 16, "hvp", joint=joint, hessian_rate=0.8, hessian_form="diagonal", orthogonal=orthogonal
+    )
+    kept, gradients = None, []
+    for step in range(60):
+        gradient, _, kept = estimator._kept(
+            lambda x: 0.5 * (x * x) @ bend, at, np.full(n, sigma), step, kept, estimator.hessian_rate or 0.0
+        )
+        gradients.append(gradient)
+    assert kept is not None
+    np.testing.assert_allclose(kept / sigma**2, bend, rtol=0.02)
+    error = np.std(gradients, axis=0, ddof=1) / np.sqrt(len(gradients))
+    assert (np.abs(np.mean(gradients, axis=0) - bend) < 5 * error).all()
+    asked, x = problem(5000), {"x": np.full(5000, 0.4)}  # more than a matrix is kept of
+    one, state = estimator.estimate(asked, x, estimator.init(asked, x), Key(0))
+    assert state.hessian is not None
+    assert state.hessian.shape == (5000,)
+    assert one.hvp is not None
+    v = np.random.default_rng(0).normal(size=5000)
+    np.testing.assert_allclose(
+        one.hvp({"x": v})["x"], diagonal_curvature.positive(state.hessian) * v / sigma**2, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_a_hessian_of_too_many_parameters_is_not_kept() -> None:

@@ -63,11 +63,11 @@ class _Track(ur.Callback):
         self.resumed = work_time()
 
 
-def one(problem: ur.Problem, method: str, seconds: float, seed: int) -> dict[str, Any]:
+def one(problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: float, seed: int) -> dict[str, Any]:
     """One run: the images' loss at some steps."""
     start = vectors.ravel(problem.initial())
     track = _Track(start, seconds)
-    estimator, optimizer = METHODS[method](start.size)
+    estimator, optimizer = make(start.size)
     ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[track])
     chosen = np.unique(np.linspace(0, len(track.points) - 1, _POINTS).round().astype(int))
     evaluate = black_box(problem, problem.initial(), _EXACT_SPP, Key(99))
@@ -90,7 +90,7 @@ def run(seconds: float = 40.0, runs: int = 1, subdivisions: int = 2, resolution:
     problem = ur.gallery.problem("sphere-to-mesh", subdivisions=subdivisions, resolution=resolution)
     found: dict[str, Any] = {method: [] for method in METHODS}
     for number in range(runs):
-        for method in METHODS:
-            found[method].append(one(problem, method, seconds, number))
+        for method, make in METHODS.items():
+            found[method].append(one(problem, make, seconds, number))
             print(method, found[method][-1], flush=True)
     return {"numbers": vectors.ravel(problem.initial()).size, "methods": found}

@@ -22,6 +22,9 @@ WINDOW = 10
 _PATIENCE = 20.0
 """Wall-clock seconds that a run may take for each of the processor's."""
 
+_LONGEST = 1000.0
+"""Seconds of a run that its samples end."""
+
 _IMAGES = 48
 _IMAGE_SPP = 16
 
@@ -35,13 +38,15 @@ class Descent:
         seconds: (T,), the start (0) first.
         parameter: (T,), root mean square error of all parameters.
         image: (T,), loss less that of the truth at the same random numbers; NaN where it was not measured.
-        evaluations: renders per view in all.
+        evaluations: samples per pixel of all renders, per view.
+        end: where it ended, (n,), all parameters flattened in key order.
     """
 
     seconds: np.ndarray
     parameter: np.ndarray
     image: np.ndarray
     evaluations: float
+    end: np.ndarray
 
     def reached(self, which: str) -> list[float]:
         """Seconds to each goal, inf where it was not met."""
@@ -62,9 +67,9 @@ class _Track(ur.Callback):
     that has nothing else to do.
     """
 
-    def __init__(self, truth: np.ndarray, start: np.ndarray, budget: float):
+    def __init__(self, truth: np.ndarray, start: np.ndarray, budget: float, most: float):
         self.truth, self.points, self.seconds, self.samples = truth, [start], [0.0], 0.0
-        self.budget, self.clock, self.resumed = budget, 0.0, 0.0
+        self.budget, self.most, self.clock, self.resumed = budget, most, 0.0, 0.0
         self.scale = float(np.sqrt(np.mean((start - truth) ** 2)))
         self.errors = [1.0]
 
@@ -79,6 +84,8 @@ class _Track(ur.Callback):
             run.stop("goal")
         if self.clock >= self.budget:
             run.stop("seconds")
+        if self.samples >= self.most:
+            run.stop("samples")
         self.resumed = work_time()
 
     def add(self, point: np.ndarray, seconds: float) -> None:
@@ -87,12 +94,15 @@ class _Track(ur.Callback):
         self.errors.append(float(np.sqrt(np.mean((point - self.truth) ** 2))) / self.scale)
 
 
-def descend(problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int) -> Descent:
-    """One run of the library's."""
+def descend(
+    problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int, evaluations: float = math.inf
+) -> Descent:
+    """One run of the library's, of so many seconds and `Descent.evaluations` at most."""
     truth, start = truth_of(problem), vectors.ravel(problem.initial())
-    track = _Track(truth, start, seconds)
-    ur.optimize(problem, estimator, optimizer, seconds=_PATIENCE * seconds, seed=seed, callbacks=[track])
     size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
+    track = _Track(truth, start, seconds, evaluations * size)
+    longest = _PATIENCE * min(seconds, _LONGEST)
+    ur.optimize(problem, estimator, optimizer, seconds=longest, seed=seed, callbacks=[track])
     return measured(problem, track.points, track.seconds, track.errors, track.samples / size)
 
 
@@ -107,7 +117,7 @@ def measured(
     losses = np.concatenate([evaluate(part) for part in np.array_split(stack, max(len(stack) // 8, 1))])
     image = np.full(len(points), np.nan)
     image[chosen] = np.abs(losses[1:] - losses[0])
-    return Descent(np.array(seconds), np.array(errors), image / image[0], work)
+    return Descent(np.array(seconds), np.array(errors), image / image[0], work, np.asarray(points[-1]))
 
 
 def _stack(problem: ur.Problem, points: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:

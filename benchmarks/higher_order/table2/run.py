@@ -49,6 +49,7 @@ def descend_by(name: str, task: Task, method: str, problem: ur.Problem, config: 
 def tune(name: str, task: Task, method: str, problem: ur.Problem) -> tuple[Config, list[dict[str, Any]]]:
     """The configuration of the least mean logarithm of times to the goals, and all that were tried."""
     configs, tried = configurations(name, method), []
+    task = replace(task, seconds=task.tuned * task.seconds)
     if len(configs) == 1:
         return configs[0], tried
     for config in configs:

@@ -37,6 +37,7 @@ from unrender.smoothing.function import (
     estimate_hvp,
 )
 from unrender.smoothing.options import SamplingOptions
+from unrender.statistics import diagonal_curvature
 
 __all__ = ["SmoothedDerivatives", "SmoothedState"]
 
@@ -53,7 +54,8 @@ class SmoothedState:
 
     Attributes:
         age: the argument of the schedule of σ: the steps made or, with `adaptive_annealing`, the sum of their convergence measures.
-        hessian: with `hessian_rate`, the Hessian kept between steps, in units of σ, (n, n); None before the first step.
+        hessian: with `hessian_rate`, the Hessian kept between steps, in units of σ, (n, n), or its diagonal, (n,); None before the
+            first step.
     """
 
     age: float = 0.0
@@ -112,6 +114,12 @@ class SmoothedDerivatives:
             nearest symmetric matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random directions).
             The first B is vᵀh times the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature is a bias of
             products, not of the gradient.
+        hessian_form: "full", or "diagonal": with `hessian_rate`, the diagonal alone is kept, (n,), for many parameters that hardly touch
+            one another. Each draw tells one sum of its elements: zᵀ B z joint, zᵀ B v otherwise. A step moves the diagonal by ω toward the
+            nearest one with all of its sums; the first is a multiple of the identity (`statistics/diagonal_curvature.py`). Products are
+            of that diagonal with no element below 0.15 of their mean magnitude, so that it is positive definite.
+        orthogonal: see `smoothed.gradient`: with `aggregate` or `joint`, directions of draws that are orthogonal. For many parameters and
+            samples: 2 n of them (4 n for products that are not joint) tell the whole gradient of a linear loss.
     """
 
     sigma: float | Mapping[str, float]
@@ -129,6 +137,8 @@ class SmoothedDerivatives:
     adaptive_annealing: bool = False
     debiased: bool = False
     hessian_rate: float | None = None
+    hessian_form: Literal["full", "diagonal"] = "full"
+    orthogonal: bool = False
 
     def __post_init__(self):
         if self.order not in ("gradient", "hessian", "hvp"):
@@ -140,6 +150,15 @@ class SmoothedDerivatives:
         checks.integer("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
         checks.integer("SmoothedDerivatives", "spp", self.spp, at_least=2 if self.debiased else 1)
         checks.number("SmoothedDerivatives", "epsilon", self.epsilon, above=0.0)
+        if self.hessian_form not in ("full", "diagonal"):
+            raise InputError(
+                f'SmoothedDerivatives: hessian_form must be "full" or "diagonal", got {self.hessian_form!r}'
+            )
+        if self.hessian_form == "diagonal" and self.hessian_rate is None:
+            raise InputError('SmoothedDerivatives: hessian_form="diagonal" goes with hessian_rate')
+        joint = self.joint and self.order != "gradient"
+        if self.orthogonal and (self.low_discrepancy or not (joint or self.aggregate) or self.product):
+            raise InputError("SmoothedDerivatives: orthogonal draws need aggregate, and no sequence or product")
         if self.hessian_rate is not None:
             if checks.number("SmoothedDerivatives", "hessian_rate", self.hessian_rate, above=0.0) > 1.0:
                 raise InputError(f"SmoothedDerivatives: hessian_rate must be at most 1, got {self.hessian_rate!r}")
@@ -169,10 +188,10 @@ class SmoothedDerivatives:
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._sigma_per_parameter(parameters)
         size = vectors.ravel(parameters).size
-        if self.hessian_rate is not None and size > _MOST_KEPT:
+        if self.hessian_rate is not None and self.hessian_form == "full" and size > _MOST_KEPT:
             raise InputError(
                 f"SmoothedDerivatives: hessian_rate keeps a matrix of {size} × {size} elements, too many: "
-                f"leave it out above {_MOST_KEPT} parameters"
+                f'leave it out above {_MOST_KEPT} parameters, or keep hessian_form="diagonal"'
             )
         return SmoothedState()
 
@@ -194,8 +213,12 @@ class SmoothedDerivatives:
         seed, hessian = key.fold(1).uint32(), state.hessian
         if self.hessian_rate is not None:
             gradient, error, hessian = self._kept(record_losses, *point, seed, hessian, self.hessian_rate)
-            kept, width = hessian, point[1]
-            curvature = self._curvature(lambda: kept, lambda v: (kept @ (v / width)) / width, parameters)
+            width = point[1]
+            if self.hessian_form == "diagonal":
+                used, multiply = diagonal_curvature.positive(hessian), np.multiply
+            else:
+                used, multiply = hessian, np.matmul
+            curvature = self._curvature(lambda: used, lambda v: multiply(used, v / width) / width, parameters)
         else:
             derive = self._joint if self.joint and self.order != "gradient" else self._separate
             gradient, error, curvature = derive(record_losses, *point, seed, parameters)
@@ -214,7 +237,7 @@ class SmoothedDerivatives:
         self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
     ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
         """The gradient (n,), its standard error (n,), and the curvature that `order` asks for: all from the same renders."""
-        found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy)
+        found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
         return *found.gradient(), self._curvature(lambda: found.hessian()[0], lambda v: found.hvp(v)[0], like)
 
     def _separate(
@@ -239,15 +262,20 @@ class SmoothedDerivatives:
         kept: np.ndarray | None,
         rate: float,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The gradient (n,), its standard error (n,), and the Hessian kept between steps after this one, in units of σ (n, n)."""
+        """The gradient (n,), its standard error (n,), and the Hessian kept between steps after this one, in units of σ: (n, n), or its
+        diagonal (n,)."""
         if self.joint:
-            found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy)
+            found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
+            if self.hessian_form == "diagonal":
+                return *found.gradient(), _diagonal(kept, found.draws * found.draws, found.curvatures, rate)
             hessian = found.hessian()[0] * np.outer(sigma, sigma)
             return *found.gradient(), hessian if kept is None else kept + rate * (hessian - kept)
         v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
         v /= np.linalg.norm(v)
-        gradient, error, product = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
-        product = sigma * product
+        both = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
+        gradient, error, product = both.gradient, both.error, sigma * both.product
+        if self.hessian_form == "diagonal":
+            return gradient, error, _diagonal(kept, both.draws * v, both.changes, rate)
         if kept is None:
             kept, rate = float(v @ product) * np.eye(theta.size), 1.0
         missing = product - kept @ v
@@ -263,6 +291,7 @@ class SmoothedDerivatives:
             self.baseline,
             self.low_discrepancy,
             self.product,
+            self.orthogonal,
             self.epsilon,
         )
 
@@ -289,6 +318,12 @@ class SmoothedDerivatives:
         if missing:
             raise InputError(f"SmoothedDerivatives: sigma has no entry for parameter {missing[0]}")
         return {key: float(self.sigma[key] if key in self.sigma else self.sigma["*"]) for key in parameters}
+
+
+def _diagonal(kept: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """The diagonal (n,) after the draws of a step, of which each tells rows[b] · diagonal = values[b]."""
+    before = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values)) if kept is None else kept
+    return diagonal_curvature.corrected(before, rows, values, rate)
 
 
 def _convergence(losses: np.ndarray, center: float) -> float:

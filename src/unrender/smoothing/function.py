@@ -10,6 +10,7 @@ and its standard error. See `statistics/gaussian.py` for the kernels and how the
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from unrender.smoothing.sampling import Function, SmoothedFunction
 from unrender.statistics import gaussian
 
 __all__ = [
+    "GradientAndProduct",
     "estimate_gradient",
     "estimate_gradient_and_product",
     "estimate_hessian",
@@ -41,6 +43,7 @@ def gradient(
     baseline: bool = True,
     low_discrepancy: bool = False,
     product: bool = False,
+    orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """∇ S f(θ) and its standard error, (n,) each.
 
@@ -59,11 +62,14 @@ def gradient(
             ("Plateau-reduced differentiable path tracing") do: one draw serves all elements, each with a constant magnitude of
             weight. Biased for n > 1: element i is smoothed by the Gaussian along i, and by |z| φ(z), which has two humps, along
             the other dimensions.
+        orthogonal: draw directions that are orthogonal, in blocks of n, each a standard normal; in place of the mixture, with `aggregate`.
+            For many dimensions and about as many draws: n of them tell the whole gradient of a linear f, up to their lengths. The standard
+            error then is too large, since draws count as independent.
 
     Raises:
         InputError: σ not positive, shapes that do not fit, values that are not finite.
     """
-    options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, product)
+    options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, product, orthogonal)
     return estimate_gradient(f, theta, sigma, options)
 
 
@@ -77,13 +83,14 @@ def hessian(
     antithetic: bool = True,
     baseline: bool = True,
     low_discrepancy: bool = False,
+    orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """∇² S f(θ) and its standard error, (n, n) each, symmetric.
 
     The arguments are those of `gradient`. The kernels are even, so `baseline` helps antithetic draws as well: without it the value of f
     itself is noise.
     """
-    options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy)
+    options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, orthogonal=orthogonal)
     return estimate_hessian(f, theta, sigma, options)
 
 
@@ -98,6 +105,7 @@ def hvp(
     antithetic: bool = True,
     low_discrepancy: bool = False,
     epsilon: float = 0.1,
+    orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """∇² S f(θ) v and its standard error, (n,) each, without a Hessian: the central difference of two gradients (Eq. 23).
 
@@ -111,7 +119,9 @@ def hvp(
 
     The other arguments are those of `gradient`; `samples` counts evaluations of both gradients.
     """
-    options = SamplingOptions(samples, seed, aggregate, antithetic, low_discrepancy=low_discrepancy, epsilon=epsilon)
+    options = SamplingOptions(
+        samples, seed, aggregate, antithetic, low_discrepancy=low_discrepancy, orthogonal=orthogonal, epsilon=epsilon
+    )
     return estimate_hvp(f, theta, v, sigma, options)
 
 
@@ -132,8 +142,8 @@ def estimate_hessian(f: Function, theta: Any, sigma: Any, options: SamplingOptio
     function = SmoothedFunction("hessian", f, theta, sigma, options)
     offset = function.value_at_theta() if options.baseline else 0.0
     if options.aggregate:
-        z = function.draw(gaussian.hessian_mixture)
-        weight = gaussian.hessian_kernel(z, function.sigma) / gaussian.hessian_ratio(z)[:, None, None]
+        z, ratio = function.draw_aggregate(gaussian.hessian_mixture, gaussian.hessian_ratio)
+        weight = gaussian.hessian_kernel(z, function.sigma) / ratio[:, None, None]
         return function.mean_and_error(function.even(z, offset)[:, None, None] * weight)
     values, errors = np.empty((function.n, function.n)), np.empty((function.n, function.n))
     for i in range(function.n):
@@ -178,10 +188,29 @@ def estimate_hvp(
     return _first_order(function, options.aggregate, difference)
 
 
+@dataclass(frozen=True)
+class GradientAndProduct:
+    """Of `estimate_gradient_and_product`, with u the direction v scaled to one σ.
+
+    Attributes:
+        gradient: ∇ S f(θ), (n,), smoothed along v by ε σ more.
+        error: its standard error, (n,).
+        product: ∇² S f(θ) v, (n,).
+        draws: z, (B, n), in units of σ.
+        changes: of each, half the change of f(θ + σ z) − f(θ − σ z) as θ moves by u, (B,): zᵀ σ H u where f is a quadratic.
+    """
+
+    gradient: np.ndarray
+    error: np.ndarray
+    product: np.ndarray
+    draws: np.ndarray
+    changes: np.ndarray
+
+
 def estimate_gradient_and_product(
     f: Function, theta: Any, v: Any, sigma: Any, options: SamplingOptions
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """∇ S f(θ), its standard error, and ∇² S f(θ) v, (n,) each, from the same evaluations, in one call of f.
+) -> GradientAndProduct:
+    """∇ S f(θ) and ∇² S f(θ) v from the same evaluations, in one call of f.
 
     They are the mean and the difference (Eq. 23) of the gradients at θ ± ε u, u being v scaled to one σ, by the same draws. So the
     gradient is of f smoothed along v by ε σ more. Draws are of the aggregate, and antithetic; `options.samples`, at least 4, counts
@@ -190,13 +219,16 @@ def estimate_gradient_and_product(
     function = SmoothedFunction("gradient", f, theta, sigma, options)
     function.draws = max(options.samples // 4, 1)
     direction = function.vector("v", v)
-    step = options.epsilon / float(np.sqrt(np.sum((direction / function.sigma) ** 2)))
-    z = function.draw(gaussian.gradient_mixture)
-    ahead, behind = function.odd_at(z, [function.theta + side * step * direction for side in (1, -1)])
-    kernel = gaussian.gradient_kernel(z, function.sigma) / gaussian.gradient_ratio(z)[:, None]
+    length = float(np.sqrt(np.sum((direction / function.sigma) ** 2)))
+    z, ratio = function.draw_aggregate(gaussian.gradient_mixture, gaussian.gradient_ratio)
+    moved = options.epsilon / length * direction
+    ahead, behind = function.odd_at(z, [function.theta + side * moved for side in (1, -1)])
+    kernel = gaussian.gradient_kernel(z, function.sigma) / ratio[:, None]
     draws = (0.5 * (ahead + behind))[:, None] * kernel
     found, error = function.mean_and_error(draws) if len(z) > 1 else (draws[0], np.abs(draws[0]))
-    return found, error, np.mean(((ahead - behind) / (2 * step))[:, None] * kernel, axis=0)
+    difference = (ahead - behind) / (2 * options.epsilon)
+    product = np.mean((difference * length)[:, None] * kernel, axis=0)
+    return GradientAndProduct(found, error, product, z, -difference)
 
 
 def _first_order(
@@ -204,8 +236,8 @@ def _first_order(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The gradient kernel's mean of `values_at(z)` over its draws, (n,), and its standard error."""
     if aggregate:
-        z = function.draw(gaussian.gradient_mixture)
-        weight = gaussian.gradient_kernel(z, function.sigma) / gaussian.gradient_ratio(z)[:, None]
+        z, ratio = function.draw_aggregate(gaussian.gradient_mixture, gaussian.gradient_ratio)
+        weight = gaussian.gradient_kernel(z, function.sigma) / ratio[:, None]
         return function.mean_and_error(values_at(z)[:, None] * weight)
     values, errors = np.empty(function.n), np.empty(function.n)
     for i in range(function.n):

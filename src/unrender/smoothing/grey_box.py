@@ -106,6 +106,7 @@ def newton_cg_step(
     trust_radius: float = 0.1,
     iterations: int = 4,
     optimizer: torch.optim.Optimizer | None = None,
+    scales: Sequence[torch.Tensor] | None = None,
 ) -> float:
     """One step of Newton's method by conjugate gradients on a network's weights, in place; see `optimizers.NewtonCG` (Eqs 4 to 7).
 
@@ -118,6 +119,8 @@ def newton_cg_step(
         iterations: products with the Hessian at most, >= 1.
         optimizer: one of torch's over the same weights, say `torch.optim.Adam`, which takes the step's opposite as its gradient and
             moves as it sees fit; None to move by the step itself.
+        scales: of each weight that requires a gradient a tensor of its shape, > 0: directions, and the trust radius, are those of the
+            weights over their scales. With the fourth root of 1 / v, v Adam's mean square of the gradient, the first direction is Adam's.
 
     Returns:
         The loss before the step.
@@ -134,21 +137,33 @@ def newton_cg_step(
         raise InputError(f"grey_box.newton_cg_step: loss_fn must return a scalar tensor, say a mean, got {given}")
     if not weights or not value.requires_grad:
         raise InputError("grey_box.newton_cg_step: the loss depends on no weight that requires a gradient")
+    scale = _scale(scales, weights)
     gradient = _ravel(torch.autograd.grad(value, weights, create_graph=True, materialize_grads=True))
     _check_finite("gradient", gradient)
 
     def product(v: np.ndarray) -> np.ndarray:
         if not gradient.requires_grad:  # a loss that is linear in the weights
             return np.zeros(gradient.numel())
-        found = _ravel(
-            torch.autograd.grad(gradient, weights, torch.from_numpy(v), retain_graph=True, materialize_grads=True)
-        )
+        direction = torch.from_numpy(scale * v)
+        found = _ravel(torch.autograd.grad(gradient, weights, direction, retain_graph=True, materialize_grads=True))
         _check_finite("product with the Hessian", found)
-        return found.numpy()
+        return scale * found.numpy()
 
-    step = conjugate_gradients.solve(gradient.detach().numpy(), product, trust_radius, iterations)
-    _apply_step(torch.from_numpy(step), weights, optimizer)
+    step = conjugate_gradients.solve(scale * gradient.detach().numpy(), product, trust_radius, iterations)
+    _apply_step(torch.from_numpy(scale * step), weights, optimizer)
     return value.item()
+
+
+def _scale(scales: Sequence[torch.Tensor] | None, weights: Sequence[torch.Tensor]) -> np.ndarray:
+    """All scales in one vector, or ones. Raises `InputError` for other shapes than the weights', and for what is not above 0."""
+    if scales is None:
+        return np.ones(sum(weight.numel() for weight in weights))
+    if [tuple(scale.shape) for scale in scales] != [tuple(weight.shape) for weight in weights]:
+        raise InputError("grey_box.newton_cg_step: scales must have the shapes of the weights that require a gradient")
+    found = _ravel([scale.detach() for scale in scales]).numpy()
+    if not (np.isfinite(found) & (found > 0.0)).all():
+        raise InputError("grey_box.newton_cg_step: scales must be finite and above 0")
+    return found
 
 
 def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: torch.optim.Optimizer | None) -> None:

@@ -20,6 +20,7 @@ def joint(
     samples: int,
     seed: int = 0,
     low_discrepancy: bool = False,
+    orthogonal: bool = False,
 ) -> JointDerivatives:
     """Gradient, Hessian and its products from the same evaluations of f, at f(θ) and at `samples` points in antithetic pairs.
 
@@ -34,17 +35,16 @@ def joint(
     The arguments are those of `smoothed.gradient`.
     """
     function = SmoothedFunction(
-        "joint", f, theta, sigma, SamplingOptions(samples, seed, low_discrepancy=low_discrepancy)
+        "joint", f, theta, sigma, SamplingOptions(samples, seed, low_discrepancy=low_discrepancy, orthogonal=orthogonal)
     )
-    z = function.draw(gaussian.joint_mixture)
+    z, ratio = function.draw_aggregate(gaussian.joint_mixture, gaussian.joint_ratio)
     behind, ahead = function.pairs(z)
     center = function.value_at_theta()
-    ratio = gaussian.joint_ratio(z)
     second_difference, square = 0.5 * (behind + ahead) - center, np.sum(z * z, axis=1)
     # Of the other draws; the n in the denominator counts one more draw of no curvature, which keeps it finite.
     curvature = 2 * function.leave_one_out_sum(second_difference) / (function.leave_one_out_sum(square) + function.n)
     odd, even = 0.5 * (behind - ahead) / ratio, (second_difference - 0.5 * curvature * square) / ratio
-    return JointDerivatives(function, z, center, odd, even, curvature)
+    return JointDerivatives(function, z, center, odd, even, curvature, 2 * second_difference)
 
 
 class JointDerivatives:
@@ -52,6 +52,8 @@ class JointDerivatives:
 
     Attributes:
         value: f(θ), not smoothed.
+        draws: z, (B, n), in units of σ.
+        curvatures: of each, f(θ + σ z) + f(θ − σ z) − 2 f(θ), (B,): zᵀ (σ H σ) z where f is a quadratic.
     """
 
     def __init__(
@@ -62,9 +64,10 @@ class JointDerivatives:
         odd: np.ndarray,
         even: np.ndarray,
         curvature: np.ndarray,
+        curvatures: np.ndarray,
     ):
         """`odd` and `even` (B,) weigh the gradient and the Hessian kernel; `curvature` (B,) is the control variate's."""
-        self.value = value
+        self.value, self.draws, self.curvatures = value, z, curvatures
         self._function, self._z, self._odd, self._even, self._curvature = function, z, odd, even, curvature
 
     def gradient(self) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ class SamplingOptions:
         baseline: f(θ) is subtracted where that reduces variance.
         low_discrepancy: draws from scrambled Sobol sequences.
         product: every dimension from its own gradient kernel at once, in place of `aggregate`; gradients only.
+        orthogonal: draws of standard normals whose directions are orthogonal, as many as there are dimensions, in place of the mixtures.
         epsilon: half the distance of a central difference in units of σ, > 0; products only.
     """
 
@@ -29,4 +30,5 @@ class SamplingOptions:
     baseline: bool = True
     low_discrepancy: bool = False
     product: bool = False
+    orthogonal: bool = False
     epsilon: float = 0.1

@@ -19,6 +19,8 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 _REPLICATES = 8
 """Independent scramblings of a low-discrepancy sequence, over which its standard error is measured."""
+_ORTHOGONAL = 1 << 20
+"""The stream of random numbers of orthogonal draws."""
 
 
 class SmoothedFunction:
@@ -46,6 +48,9 @@ class SmoothedFunction:
         if not (self.sigma > 0).all():
             raise InputError(f"{self.owner}: sigma must be above 0, got {sigma!r}")
         self.antithetic, self.low_discrepancy = options.antithetic, options.low_discrepancy
+        self.orthogonal = options.orthogonal
+        if self.orthogonal and (self.low_discrepancy or options.product or not options.aggregate):
+            raise InputError(f"{self.owner}: orthogonal draws are of the aggregate, and of no sequence")
         least = 16 if self.low_discrepancy else 4
         per_draw = (2 if self.antithetic else 1) * sides
         self.draws = checks.integer(self.owner, "samples", options.samples, at_least=least * sides) // per_draw
@@ -79,6 +84,29 @@ class SmoothedFunction:
             parts.append(sampler(points[:, 0], u, special.ndtri(u)))
         return np.concatenate(parts)
 
+    def draw_aggregate(
+        self, mixture: Callable[..., np.ndarray], ratio: Callable[[np.ndarray], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draws z (B, n) that serve all elements, and their density over that of a standard normal, (B,).
+
+        Of a mixture, or with `orthogonal` standard normals in blocks of n draws at most, whose directions are those of a uniformly random
+        orthogonal matrix, each with a length of its own. Blocks are independent, draws within one are not: standard errors that take them
+        for independent are too large.
+        """
+        if not self.orthogonal:
+            z = self.draw(mixture)
+            return z, ratio(z)
+        rng = np.random.default_rng([self.seed, _ORTHOGONAL])
+        blocks = []
+        for first in range(0, self.draws, self.n):
+            count = min(self.n, self.draws - first)
+            basis, triangle = np.linalg.qr(rng.standard_normal((self.n, count)))
+            # The signs of Householder's reflections are not random.
+            signs = np.where(np.diagonal(triangle) < 0.0, -1.0, 1.0)
+            lengths = np.sqrt(rng.chisquare(self.n, count))
+            blocks.append((basis * (signs * lengths)).T)
+        return np.concatenate(blocks), np.ones(self.draws)
+
     def odd(self, z: np.ndarray, offset: float) -> np.ndarray:
         """The factor of an odd kernel, (B,): f(θ − σ z), with antithetic draws half its difference to f(θ + σ z)."""
         return self.odd_at(z, [self.theta])[0] - (0.0 if self.antithetic else offset)
@@ -104,6 +132,10 @@ class SmoothedFunction:
 
     def leave_one_out_sum(self, values: np.ndarray) -> np.ndarray:
         """Per draw, the sum of `values` (B,) over all draws that are independent of it."""
+        if self.orthogonal:
+            starts = np.arange(0, len(values), self.n)
+            own = np.add.reduceat(values, starts)
+            return np.repeat(values.sum() - own, np.diff(np.append(starts, len(values))))
         if not self.low_discrepancy:
             return values.sum() - values
         own = values.reshape(_REPLICATES, -1).sum(axis=1)

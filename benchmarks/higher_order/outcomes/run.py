@@ -1,0 +1,77 @@
+"""Starts and outcomes of the tasks of HO Table 2 (supplement): pictures of one run of FR22 and of OurHVPA on each.
+
+The configurations are those that `higher_order.table2` has on record; the start is that of its run number --number. QUAD has
+no picture. Also kept: the error of the parameters at the end, over that at the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.higher_order.table2.descents import WINDOW, descend
+from benchmarks.higher_order.table2.methods import METHODS, Config, configurations
+from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
+from benchmarks.internals import SampleRequest, arrays, dr, prepare, vectors
+from benchmarks.runner import records
+
+METHOD_NAMES = ("FR22", "OurHVPA")
+_TABLE_2 = Path(__file__).parents[1] / "table2"
+_SPP = 256
+QUICK = {"task": ("MUG",), "resolution": 8, "seconds": 0.02}
+
+
+def picture(problem: ur.Problem, point: np.ndarray) -> np.ndarray:
+    """The first view's image at parameters (n,), (H, W, 3)."""
+    initial = problem.initial()
+    session = prepare(problem, initial, None, derivatives=False)
+    stacked = {key: value[None] for key, value in vectors.unravel(point, initial).items()}
+    return arrays.numpy(session.image_batch(stacked, SampleRequest(problem.views[0].sensor, _SPP, 1)))[0]
+
+
+def outcome(
+    problem: ur.Problem, task: Task, method: str, config: Config, number: int
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """The final error, and pictures of start and outcome."""
+    started = begin(problem, task, number, config.get("rate"))
+    n = sum(value.size for value in problem.truth.values())
+    found = descend(started, *METHODS[method].make(task, n, config), task.seconds, number)
+    start = vectors.ravel(started.initial())
+    return float(found.parameter[-WINDOW:].mean()), picture(problem, start), picture(problem, found.end)
+
+
+def run(
+    task: tuple[str, ...] = tuple(name for name in TASKS if name != "QUAD"),
+    number: int = 0,
+    resolution: int = 32,
+    seconds: float = 0.5,
+) -> dict[str, Any]:
+    """All tasks.
+
+    Args:
+        number: of the run: of its start and its draws
+        seconds: factor of every task's budget in Table 2
+    """
+    dr.set_thread_count(1)
+    record = records.read(_TABLE_2)
+    known = {} if record is None else record["tasks"]
+    maps: dict[str, np.ndarray] = {}
+    errors: dict[str, dict[str, float]] = {}
+    for name in task:
+        usual = TASKS[name]
+        sized = replace(usual, options={**usual.options, "resolution": resolution}, seconds=seconds * usual.seconds)
+        problem = sized.problem()
+        maps[f"{name}|reference"] = np.asarray(problem.views[0].reference)
+        errors[name] = {}
+        for method in METHOD_NAMES:
+            entry = known.get(name, {}).get("methods", {}).get(method)
+            config = entry["config"] if entry else configurations(name, method)[0]
+            errors[name][method], maps[f"{name}|start"], maps[f"{name}|{method}"] = outcome(
+                problem, sized, method, config, number
+            )
+        print(name, errors[name], flush=True)
+    return {"errors": errors, "maps": maps}
