@@ -1,4 +1,5 @@
-"""Pixel mini-batches at equal time (Adaptive Figs 4, 5 and 8): `sun-glossy`, `plain-and-textured`, `two-planets`, `mirror-trio`.
+"""Pixel mini-batches at equal time (Adaptive Figs 1, 4, 5, 8 and 9): `sun-glossy`, `plain-and-textured`, `two-planets`, `mirror-trio`, and
+`three-textures`, `globe-and-mirror`, `sunlit-vase`.
 
 Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many
 pixels for all, Adam, the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have
@@ -25,6 +26,8 @@ from benchmarks.pixel_schemes import pixels
 from benchmarks.races import Entrant, Runs, over, race, reached, tenths
 
 FINE = {"resolution": 192, "texture_resolution": 192}
+MANY = {"resolution": 512, "texture_resolution": 192, "reference_spp": 8}
+"""As many pixels a picture as the paper's Fig. 9 has, where there are 16 or 32 of them."""
 TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "sun-glossy L2": ("sun-glossy", {"loss": "L2", **FINE}, 2048),
     "sun-glossy relative L2": ("sun-glossy", {"loss": "RelativeL2", **FINE}, 2048),
@@ -32,6 +35,14 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 2048),
     "mirror-trio": ("mirror-trio", {"resolution": 192}, 2048),
     "two-planets, memories": ("two-planets", {}, 2048),
+    "three-textures": ("three-textures", FINE, 2048),
+    "globe-and-mirror": (
+        "globe-and-mirror",
+        {"resolution": 4096, "texture_resolution": 256, "reference_spp": 4},
+        2048,
+    ),
+    "sunlit-vase": ("sunlit-vase", {**MANY, "views": 16, "loss": "L2"}, 2048),
+    "sun-glossy, 32 views": ("sun-glossy", {**MANY, "views": 32}, 2048),
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
