@@ -156,8 +156,8 @@ DESCENTS = {
     "plain-and-textured": ({}, 0.02, 8, 40),
     "two-planets": ({}, 0.02, 8, 30),
     "caustic": ({"resolution": 32, "texture_resolution": 32}, 0.01, 16, 60),
-    "three-textures": ({}, 0.02, 8, 30),
-    "globe-and-mirror": ({}, 0.02, 8, 30),
+    "three-textures": ({"resolution": 64}, 0.02, 8, 80),
+    "globe-and-mirror": ({"resolution": 64}, 0.01, 8, 80),
 }
 
 

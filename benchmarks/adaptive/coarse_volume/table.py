@@ -32,7 +32,7 @@ def table(record: Record) -> str:
     ]
     doublings = ", ".join(map(str, c["changes"]))
     text = (
-        f"8³ to {c['grid_resolution']}³, doubled before steps {doublings}; {c['views'] - 4} views of {c['resolution']}², {c['count']} pixels "
-        f"and {c['steps']} steps; medians and ranges of {c['seeds']} seeds."
+        f"8³ to {c['grid_resolution']}³, doubled before steps {doublings}; {c['views'] - 4} views of {c['resolution']}², {c['count']} "
+        f"pixels and {c['steps']} steps; medians and ranges of {c['seeds']} seeds."
     )
     return markdown.blocks(text, markdown.table(head, rows))

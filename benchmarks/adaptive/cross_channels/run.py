@@ -7,14 +7,16 @@ A path's gradient is Σ_c ∂L/∂I_c ∂I_c/∂θ over the colours c, so its se
 where image and derivative are of independent paths. `Adaptive` has those with c = d alone ("summed"); "between colours" has all.
 Both products are estimated by signed derivatives along random ±1 tangents. All probabilities are judged by that whole second moment, from
 other paths than they are made of, as variances: less the squared gradient. "Many": maps of most of the paths, raw. "Few": of 8 paths a
-pixel, blurred over 1.5 pixels, whose products between colours may be negative in sum and then count as none. A tenth of the draws is
-uniform, or as many as the label says. Eq. 5 is p ∝ Σ_c E|∂L/∂I_c|. Problems at their start, in units of Adam's steps where there are several
-elements.
+pixel, blurred over 1.5 pixels; where the sum with the products between colours is negative, it counts as none. A tenth of the draws
+is uniform, or as many as the label says. Eq. 5 is p ∝ Σ_c E|∂L/∂I_c|. "Bound": p made of the very paths that
+judge it, which no probabilities can undercut, optimistic by the noise of these. Problems at their start, in units of Adam's steps where
+there are several elements.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +32,11 @@ PROBLEMS: dict[str, dict[str, Any]] = {
     "smoke": {"resolution": 32, "reference_spp": 256},
     "glossy-room": {"resolution": 48, "reference_spp": 256},
     "sun-glossy": {"resolution": 48, "reference_spp": 256},
+    "mirror-trio, roughness 0.08": {"reference_spp": 256},
+    "mirror-trio, roughness 0.25": {"reference_spp": 256},
+    "mirror-trio, 32²": {"resolution": 32, "reference_spp": 1024},
 }
+"""By label: the problem's name comes first. The roughness is the mirror's where the gradient is taken; 0.15 otherwise."""
 UNIFORM = 0.1
 PARTS = 8
 BLUR = 1.5
@@ -68,6 +74,7 @@ def candidates(
 ) -> dict[str, np.ndarray]:
     """Probabilities by name, (pixels,)."""
     exact = importance(*many)
+    smooth = importance(*(blurred(problem, x) for x in many))
     noisy = importance(*(blurred(problem, x) for x in few))
     return {
         "uniform": np.ones(len(magnitude)),
@@ -76,6 +83,7 @@ def candidates(
         **{f"{name}, few": shares(x) for name, x in noisy.items()},
         "summed, many, 0.02 uniform": shares(exact["summed"], 0.02),
         "between colours, many, 0.02 uniform": shares(exact["between colours"], 0.02),
+        **{f"summed, many, blurred, {share} uniform": shares(smooth["summed"], share) for share in (0.1, 0.03)},
     }
 
 
@@ -96,7 +104,8 @@ def measure(problem: ur.Problem, paths: int, runs: int, seed: int = 0) -> dict[s
         many = [np.mean([found[index][kind].mean(axis=0) for index in others], axis=0) for kind in (0, 1)]
         few = [found[others[0]][kind].mean(axis=0) for kind in (0, 1)]
         magnitude = np.mean([found[index][2] for index in others], axis=0)
-        for name, share in candidates(problem, few, many, magnitude).items():
+        made = candidates(problem, few, many, magnitude) | {"bound": shares(np.sqrt(np.maximum(true, 0)), 0.001)}
+        for name, share in made.items():
             table.setdefault(name, []).append(len(true) * float((true / share).sum()) - squared)
     base = np.array(table["uniform"])
     entry: dict[str, Any] = {"pixels": problem.pixels, "rounds": rounds, "variance": {}}
@@ -125,6 +134,11 @@ def run(
     """
     for name in problem:
         options = {**PROBLEMS[name], **({"resolution": resolution} if resolution else {})}
-        entry = measure(ur.gallery.problem(name, **options), paths, runs)
+        kind, _, special = name.partition(", ")
+        made = ur.gallery.problem(kind, **options)
+        if special.startswith("roughness"):
+            parameters = [replace(parameter, initial=float(special.split()[1])) for parameter in made.parameters]
+            made = ur.Problem(made.renderer, parameters, made.given_views, made.loss, made.max_depth, name=name)
+        entry = measure(made, paths, runs)
         print(name, entry, flush=True)
         yield {"problems": {name: {"options": options, **entry}}}

@@ -12,7 +12,7 @@ def table(record: Record) -> str:
     for name, entry in record["problems"].items():
         variance = entry["variance"]
         ratios = [entry[f"between over summed, {kind}"] for kind in ("many", "few")]
-        rows.append([name, *("{:.3f}".format(variance[form][0]) for form in FORMS)])
+        rows.append([name, *(f"{variance[form][0]:.3f}" for form in FORMS)])
         rows[-1] += ["{:.3f} ± {:.3f}".format(*ratio) for ratio in ratios]
         made = (form for form in variance if form not in ("uniform", "Eq. 5"))
         gains.append(

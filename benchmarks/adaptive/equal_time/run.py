@@ -24,6 +24,7 @@ import numpy as np
 import unrender as ur
 from benchmarks.pixel_schemes import pixels
 from benchmarks.races import Entrant, Runs, over, race, reached, tenths
+from benchmarks.runner.timing import work_time
 
 FINE = {"resolution": 192, "texture_resolution": 192}
 MANY = {"resolution": 512, "texture_resolution": 192, "reference_spp": 8}
@@ -94,16 +95,30 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
     return found
 
 
+class Clock(ur.Callback):
+    """(seconds of the processor, paths so far) of each step."""
+
+    def __init__(self) -> None:
+        self.found: list[tuple[float, float]] = []
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        del run
+        self.found.append((work_time(), float(record["samples"])))
+
+
 def costs(
     problem: ur.Problem, chosen: list[Entrant], rate: float, rounds: int = 5, steps: int = 60
 ) -> dict[str, float]:
-    """Seconds per path of short descents, in turns: medians."""
+    """Seconds per path of short descents, of the processor (`work_time`), in turns: medians."""
     found: dict[str, list[float]] = {entrant.name: [] for entrant in chosen}
     for turn in range(rounds):
         for entrant in chosen:
-            history = ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), steps=steps, seed=turn).history
-            first, last = history[steps // 3], history[-1]
-            found[entrant.name].append((last["seconds"] - first["seconds"]) / (last["samples"] - first["samples"]))
+            clock = Clock()
+            options: dict[str, Any] = {"steps": steps, "seed": turn, "callbacks": [clock]}
+            ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), **options)
+            (begun, before), (ended, after) = clock.found[steps // 3], clock.found[-1]
+            found[entrant.name].append((ended - begun) / (after - before))
     return {name: float(np.median(times)) for name, times in found.items()}
 
 
