@@ -5,9 +5,11 @@ Dr.Jit and Mitsuba stand here untyped (`dr`, `mi`): their stubs know less than t
 
 from __future__ import annotations
 
+import functools
 import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -286,6 +288,56 @@ def second_moments(
             found[:, part, first:last] = (a[::-1] * b).sum(axis=(1, 3))
             first = last
     return found
+
+
+def channel_moments(problem: ur.Problem, at: Tree, scales: np.ndarray, rounds: int, key: Key) -> list[np.ndarray]:
+    """E[∂L/∂I_c ∂L/∂I_c'] and Σ_k E[∂I_c/∂θ_k ∂I_c'/∂θ_k] of each pixel of all views by single paths, (2, pixels, 3, 3) each, the halves
+    from different paths, and E|∂L/∂I|, (pixels, 3): from 8 paths a pixel and round.
+
+    Args:
+        problem, at: what is rendered, by Mitsuba; nothing moves.
+        scales: factors of the elements' derivatives in the coordinates of the descent, (n,).
+        rounds: how many, each with signs of its own.
+        key: of the random numbers.
+    """
+    from unrender.pixels.pixel_statistics import random_tangents
+
+    each = 8
+    session: Any = prepare(problem, at)
+    factors = {name: problem.renderer.array(value) for name, value in _split(at, scales).items()}
+    found: list[list[np.ndarray]] = [[], [], []]
+    for index, view in enumerate(problem.views):
+        products, moments, magnitudes = [], [], []
+        for turn in range(rounds):
+            of_turn = key.fold(index).fold(turn)
+            rendering = session.image(at, SampleRequest(view.sensor, each, of_turn.uint32(), each))
+            derivative = arrays.numpy(problem.loss_derivative(index, rendering.images)).astype(np.float64)
+            session._pair.loaded().set_tangents(
+                at, random_tangents(problem, at, factors, of_turn.fold(1)), session._attached
+            )
+            signed = session._run(_signed_tangents(), rendering.paths.request, rendering.paths.radiance)
+            dr.eval(signed)
+            along = arrays.numpy(session._develop(signed, rendering.paths.request)).astype(np.float64)
+            for values, into in ((derivative, products), (along, moments)):
+                halves = values.reshape(2, each // 2, -1, 3)
+                into.append(np.einsum("hspc,hspd->hpcd", halves, halves) / (each // 2))
+            magnitudes.append(np.abs(derivative).reshape(each, -1, 3).mean(axis=0))
+        for values, into in zip((products, moments, magnitudes), found, strict=True):
+            into.append(np.mean(values, axis=0))
+    return [np.concatenate(values, axis=axis) for values, axis in zip(found, (1, 1, 0), strict=True)]
+
+
+@functools.cache
+def _signed_tangents() -> Any:
+    """The pass of `tangent_moment`, without the square. Made once: kernels are known by it."""
+    from unrender.rendering.mitsuba.passes import TangentPass
+
+    @dataclass(frozen=True)
+    class SignedTangents(TangentPass):
+        def trace(self, paths: Any, size: Any, *own: Any) -> Any:
+            return paths.forward(own[0])
+
+    return SignedTangents()
 
 
 def gradient_of(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,16 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 from resizable import KEY, FieldRenderer, upsampled
+from scipy import stats
 
 import unrender as ur
 from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.hosts import LocalHosts
+from unrender.dealing.share import ViewShare
 from unrender.estimators.filtered import FilteredGradientState
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
@@ -35,7 +40,13 @@ PAIRS: dict[str, tuple[Any, Any]] = {
     "rcv": (ur.PathGradient(image=rcv(), spp=2), ur.optimizers.Adam(0.02)),
     "meta": (ur.MetaEstimator(), ur.optimizers.MetaAdam(0.002)),
     "coupled": (ur.MetaEstimator(coupled=True, image=rcv()), ur.optimizers.MetaAdam(0.002)),
-    "adaptive": (ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=4, denoiser="none"), spp=2), ur.optimizers.Adam(0.02)),
+    "adaptive": (
+        ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=4, uniform=0.2, denoiser="none"), spp=2),
+        ur.optimizers.Adam(0.02),
+    ),
+    "uniform": (ur.PathGradient(pixels=ur.pixels.Uniform(16), spp=2), ur.optimizers.Adam(0.02)),
+    "loss": (ur.PathGradient(pixels=ur.pixels.LossProportional(16, refresh=4, denoiser="none"), spp=2), ur.optimizers.Adam(0.02)),
+    "views": (ur.PathGradient(image=rcv(), pixels=ur.pixels.Views(1), spp=2), ur.optimizers.Adam(0.02)),
     "filtered": (ur.FilteredGradient(ur.PathGradient(image=rcv(), spp=2)), ur.optimizers.Adam(0.02)),
     "momentum": (ur.PathGradient(spp=2), ur.optimizers.SGD(0.5, momentum=0.9)),
 }  # fmt: skip
@@ -185,14 +196,16 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         assert new.begun == 0
     old, new = innermost(before.estimator), innermost(memory.estimator)
     image, past = new.image, old.image
-    if name in ("rcv", "coupled", "filtered"):
+    if name in ("rcv", "coupled", "filtered", "views"):
         np.testing.assert_allclose(image.parameters[KEY], by_hand(past.parameters[KEY]), rtol=1e-12)
         assert image.views is past.views
+    if name in ("adaptive", "loss"):
+        assert new.pixels.maps is old.pixels.maps
+        assert new.pixels.shares is old.pixels.shares
     if name == "adaptive":
         np.testing.assert_allclose(
             new.pixels.second_moment[KEY], by_hand(old.pixels.second_moment[KEY], SQUARES), rtol=1e-10
         )
-        assert new.pixels.maps is old.pixels.maps
     if isinstance(new, MetaState):
         assert new.parameters is not None
         assert old.parameters is not None
@@ -236,6 +249,84 @@ def test_reset_states_know_nothing_but_the_step(name: str) -> None:
     if isinstance(memory.estimator, MetaState):
         assert memory.estimator.parameters is None
         assert not memory.estimator.elements
+
+
+@dataclass(frozen=True)
+class Unweighted:
+    """Another sampler's pixels, all of the mean weight: a planted fault."""
+
+    inner: Any
+
+    def init(self, problem: ur.Problem, parameters: Any) -> Any:
+        return self.inner.init(problem, parameters)
+
+    def draw(self, problem: ur.Problem, parameters: Any, state: Any, key: Key) -> Any:
+        batch, state = self.inner.draw(problem, parameters, state, key)
+        weights = np.full_like(batch.sample.weights, np.mean(batch.sample.weights))
+        return replace(batch, sample=replace(batch.sample, weights=weights)), state
+
+    def observe(self, problem: ur.Problem, state: Any, gradient: Any) -> Any:
+        return state
+
+
+def test_mini_batches_are_unbiased_after_a_change_whose_probabilities_were_carried() -> None:
+    _, _, run, memory = at_the_change("adaptive", "carry")
+    state = memory.estimator
+    assert np.ptp(state.pixels.shares) > 0.1
+    whole = ur.PathGradient(spp=2)
+
+    def mean(estimator: Any, state: Any, stream: int) -> tuple[np.ndarray, np.ndarray]:
+        rows = [
+            estimator.estimate(run.problem, run.parameters, state, Key(7, stream, number))[0].gradient[KEY].ravel()
+            for number in range(600)
+        ]
+        return np.mean(rows, axis=0), np.var(rows, axis=0, ddof=1) / len(rows)
+
+    exact, noise = mean(whole, whole.init(run.problem, run.parameters), 0)
+    carried = replace(PAIRS["adaptive"][0], pixels=replace(PAIRS["adaptive"][0].pixels, refresh=10**6))
+    scores = []
+    for stream, estimator in enumerate((carried, replace(carried, pixels=Unweighted(carried.pixels)))):
+        found, variance = mean(estimator, state, 1 + stream)
+        seen = noise + variance > 0
+        scores.append(np.abs((found - exact)[seen]) / np.sqrt((noise + variance)[seen]))
+    limit = stats.norm.isf((1 - (1 - 1e-4) ** (1 / len(scores[0]))) / 2)
+    assert len(scores[0]) > 100
+    assert scores[0].max() < limit
+    assert scores[1].max() > limit
+
+
+@pytest.mark.parametrize("name", ["uniform", "adaptive", "rcv"])
+@pytest.mark.parametrize("compress", [False, True])
+def test_dealt_views_become_finer_as_those_of_one_process(name: str, compress: bool) -> None:
+    renderer = FieldRenderer(TRUTH)
+    views = [ur.View(renderer.at(TRUTH.shape).exact({KEY: TRUTH}))] * 3
+    parameter = ur.Parameter(KEY, initial=0.5, bounds=(0, 1), coarse_to_fine=(3, 6))
+    alone = ur.Problem(renderer, [parameter], views)
+    shares = ((0, 2), (1,))
+    parts = tuple(ViewShare(ur.Problem(renderer, [parameter], [views[v] for v in part]), part) for part in shares)
+    dealt = alone.gathered_by(DealtViews(alone, shares, LocalHosts(parts), compress))
+    one, other, seeded = (
+        ur.optimize(each, *PAIRS[name], 9, seed=seed) for each, seed in ((alone, 0), (dealt, 0), (alone, 1))
+    )
+    assert other.warnings == []
+    assert [h["resolution"][KEY] for h in other.history if "resolution" in h] == [(4, 3), (8, 6), (16, 12)]
+    # Compressed differences are rounded to 11 bits of a step.
+    assert np.abs(one.parameters[KEY] - other.parameters[KEY]).max() < (1e-3 if compress else 1e-12)
+    assert np.abs(one.parameters[KEY] - seeded.parameters[KEY]).max() > 3e-3
+
+
+def test_auto_starts_a_grid_coarse_whoever_has_the_views() -> None:
+    field = np.random.default_rng(3).uniform(0.2, 0.8, (8, 8, 8, 1))
+    renderer = FieldRenderer(field)
+    views = [ur.View(renderer.at(field.shape).exact({KEY: field}))] * 2
+    parameter = ur.Parameter(KEY, initial=0.5)
+    alone = ur.Problem(renderer, [parameter], views)
+    parts = tuple(ViewShare(ur.Problem(renderer, [parameter], [views[v]]), (v,)) for v in (0, 1))
+    dealt = alone.gathered_by(DealtViews(alone, ((0,), (1,)), LocalHosts(parts)))
+    one, other = (ur.optimize(each, "auto", steps=16) for each in (alone, dealt))
+    for result in (one, other):
+        assert [h["resolution"][KEY] for h in result.history if "resolution" in h] == [(4, 4, 4), (8, 8, 8)]
+    assert np.abs(one.parameters[KEY] - other.parameters[KEY]).max() < 1e-12
 
 
 def test_by_default_the_estimator_remembers_and_the_optimizer_starts_anew() -> None:

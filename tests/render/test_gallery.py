@@ -60,7 +60,10 @@ POSES = {
 }
 PLATEAUS = ["box2", "box10", "mug", "shadow"]
 WITHOUT_RENDERER = ["exponential", "quad"]
-DRAWN = ["mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caustic"]  # see test_gallery_adaptive.py
+# See test_gallery_adaptive.py.
+DRAWN = [
+    "mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caustic", "three-textures", "globe-and-mirror",
+]  # fmt: skip
 MESHES = ["sphere-to-mesh", "sphere-to-bunny", "shadow-art", "statue"]  # see test_shapes.py, test_mesh_runs.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 

@@ -20,6 +20,8 @@ SMALL = {
     "plain-and-textured": {"resolution": 16, "texture_resolution": 8},
     "two-planets": {"resolution": 16, "texture_resolution": 8, "views": 4},
     "caustic": {"resolution": 16, "texture_resolution": 8},
+    "three-textures": {"resolution": 16, "texture_resolution": 8},
+    "globe-and-mirror": {"resolution": 16, "texture_resolution": 8},
 }
 UNKNOWN = {
     "mirror-trio": {"mirror.bsdf.alpha.value": ()},
@@ -30,8 +32,13 @@ UNKNOWN = {
     },
     "two-planets": {"free.bsdf.reflectance.data": (8, 8, 3), "enclosed.bsdf.reflectance.data": (8, 8, 3)},
     "caustic": {"floor.bsdf.reflectance.data": (8, 8, 3)},
+    "three-textures": {f"{name}.bsdf.reflectance.data": (8, 8, 3) for name in ("ball", "jar", "cone")},
+    "globe-and-mirror": {"globe.bsdf.reflectance.data": (8, 8, 3)},
 }
-VIEWS = {"mirror-trio": 1, "sun-glossy": 4, "plain-and-textured": 1, "two-planets": 16, "caustic": 1}
+VIEWS = {
+    "mirror-trio": 1, "sun-glossy": 4, "plain-and-textured": 1, "two-planets": 16, "caustic": 1, "three-textures": 4,
+    "globe-and-mirror": 1,
+}  # fmt: skip
 NAMES = list(UNKNOWN)
 
 
@@ -149,6 +156,8 @@ DESCENTS = {
     "plain-and-textured": ({}, 0.02, 8, 40),
     "two-planets": ({}, 0.02, 8, 30),
     "caustic": ({"resolution": 32, "texture_resolution": 32}, 0.01, 16, 60),
+    "three-textures": ({"resolution": 64}, 0.02, 8, 80),
+    "globe-and-mirror": ({"resolution": 64}, 0.01, 8, 80),
 }
 
 
@@ -188,10 +197,12 @@ def test_equal_calls_give_equal_problems(name):
     [
         ("mirror-trio", {"texture_resolution": 8}, "no option texture_resolution"),
         ("mirror-trio", {"max_depth": 2}, "max_depth must be a whole number of at least 3, got 2"),
-        ("sun-glossy", {"views": 17}, "views must be at most 16, got 17"),
+        ("sun-glossy", {"views": 33}, "views must be at most 32, got 33"),
         ("sun-glossy", {"loss": "relativel2"}, "did you mean RelativeL2?"),
         ("two-planets", {"max_depth": 5}, "max_depth must be a whole number of at least 6, got 5"),
         ("two-planets", {"views": 0}, "views must be a whole number of at least 1, got 0"),
+        ("three-textures", {"views": 33}, "views must be at most 32, got 33"),
+        ("globe-and-mirror", {"max_depth": 6}, "max_depth must be a whole number of at least 7, got 6"),
         ("caustic", {"max_depth": 3}, "max_depth must be a whole number of at least 4, got 3"),
     ],
 )
@@ -291,6 +302,26 @@ def test_a_planet_has_no_seam_and_is_of_real_paint(planet):
     assert 0.02 < picture.min() < picture.max() < 0.95
     across = np.abs(picture[:, 0] - picture[:, -1]).mean()
     assert across < 2 * np.abs(np.diff(picture, axis=1)).mean()
+
+
+@pytest.mark.slow
+def test_three_things_are_seen_from_all_around_beside_ground_that_tells_little():
+    problem = ur.gallery.problem("three-textures", reference_spp=1)
+    for sensor in range(4):
+        names = seen(problem, sensor)
+        assert all(np.mean(names == name) > 0.015 for name in ("ball", "jar", "cone"))
+        assert np.mean(names == "ground") > 0.5
+
+
+@pytest.mark.slow
+def test_the_mirror_shows_the_globe_by_paths_of_seven_segments():
+    problem = ur.gallery.problem("globe-and-mirror", resolution=32, texture_resolution=16, reference_spp=256)
+    names = seen(problem)
+    assert 0.05 < np.mean(names == "mirror") < 0.3
+    assert 0.15 < np.mean(names == "glass") < 0.5
+    reference, without = (x.mean(axis=-1) for x in (np.asarray(problem.views[0].reference), at_depth(problem, 6)))
+    mirrored = (names == "mirror") & (reference > 1.5 * without + 0.02)
+    assert mirrored.sum() > 0.15 * np.sum(names == "mirror")
 
 
 @pytest.mark.slow

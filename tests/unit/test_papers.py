@@ -239,7 +239,7 @@ def test_the_page_is_true(check: Any) -> None:
         (wrong_commands, "--steps 400 --seeds 3", "--step 400", "no option step"),
         (wrong_commands, "`adaptive.cost`", "`adaptive.costs`", "no benchmark adaptive.costs"),
         (wrong_verdicts, "| beyond |", "| fine |", "Fig. 8"),
-        (wrong_verdicts, "not run because the gallery has no such scene", "met, the gallery has no such scene", "Fig. 1"),
+        (wrong_verdicts, "not run because they are not in the paper", "met, not in the paper", "Suppl., animations"),
         (wrong_verdicts, "| met, on another scene |", "| not run because of time |", "Fig. 7"),
         (wrong_numbers, "over FR22 1.92 (1.56)", "over FR22 1.92 (0.55)", "Table 2, all: not in the results: ['0.55', '1.92 (0.55)']"),
         (wrong_numbers, "L1's derivative -47.1%", "L1's derivative +47.1%", "['+47.1']"),

@@ -23,7 +23,8 @@ RATE = 0.005
 """Length of a step along the line, in each element."""
 PROBLEMS = (
     "ajar", "spiral", "indirect-room", "caustic", "mirror-trio", "plain-and-textured", "glossy-room", "poster", "two-planets",
-    "sun-glossy", "lamp", "chalice", "sunlit-vase", "wall", "smoke", "tea", "three-bodies", "nerf-volume",
+    "sun-glossy", "lamp", "chalice", "sunlit-vase", "wall", "smoke", "tea", "three-bodies", "nerf-volume", "sphere-to-mesh",
+    "bunny",
 )  # fmt: skip
 
 

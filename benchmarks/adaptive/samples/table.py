@@ -8,6 +8,7 @@ KINDS = {"whole": "whole views", "drawn": "a quarter of the pixels", "rcv": "con
 
 def table(record: Record) -> str:
     """Products, relative to whole views at the most samples."""
+    numbers = sorted({int(n) for entry in record["problems"].values() for n in entry["whole"]})
     parts = []
     for index, about in enumerate(("plain", "in Adam's units")):
         rows = []
@@ -16,10 +17,10 @@ def table(record: Record) -> str:
             for kind, title in KINDS.items():
                 cells = [
                     f"{entry[kind][str(n)][index] / unit:.3g}" if str(n) in entry.get(kind, {}) else "-"
-                    for n in record["settings"]["spp"]
+                    for n in numbers
                 ]
                 rows.append([name, title, *cells])
-        head = ["problem", "", *(str(n) for n in record["settings"]["spp"])]
+        head = ["problem", "", *(str(n) for n in numbers)]
         parts += [
             f"Variance times paths, {about}, over that of whole views at the most samples.",
             markdown.table(head, rows),

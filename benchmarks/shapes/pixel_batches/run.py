@@ -20,6 +20,7 @@ from benchmarks.internals import Key, PixelSampler
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.timed_runs import Kept, blind, measured
 
+MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "resolution": 8, "subdivisions": 1, "views": 2, "pixels": 16, "rates": [0.01],
     "problems": ["sphere-to-bunny"], "repetitions": 2,
@@ -67,7 +68,7 @@ def descend(
 def run(
     seconds: float = 10.0,
     seeds: int = 3,
-    problems: tuple[str, ...] = ("sphere-to-bunny", "shadow-art"),
+    problems: tuple[str, ...] = ("sphere-to-bunny", "shadow-art", "sphere-to-mesh"),
     resolution: int = 64,
     subdivisions: int = 3,
     views: int = 6,

@@ -17,7 +17,7 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
-__all__ = ["TwoPlanets", "blue", "red"]
+__all__ = ["DUSK", "TwoPlanets", "blue", "red", "shell"]
 
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the planets and of the two sides of the glass."""
@@ -25,7 +25,7 @@ _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 _APART = 1.05
 """Distance of each planet from the middle."""
 
-_DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
+DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
 """Of zenith, horizon and nadir."""
 
 _SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
@@ -59,11 +59,11 @@ class TwoPlanets:
                 )
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
-            "sky": skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK)),
+            "sky": skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), DUSK)),
             "free": _ball("free", -_APART, blue(self.texture_resolution)),
             "enclosed": _ball("enclosed", _APART, red(self.texture_resolution)),
-            "glass": _shell(_OUTER, 1.5, 1.0),
-            "hollow": _shell(_INNER, 1.0, 1.5),
+            "glass": shell(_OUTER, 1.5, 1.0, _APART),
+            "hollow": shell(_INNER, 1.0, 1.5, _APART),
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -80,11 +80,11 @@ def _ball(name: str, x: float, texture: np.ndarray) -> Any:
     return meshes.sheet(name, points, {"type": "diffuse", "reflectance": textures.bitmap(texture)}, closed=True)
 
 
-def _shell(radius: float, inside: float, outside: float) -> dict[str, Any]:
-    """One side of the glass, with the indices of refraction there."""
+def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[str, Any]:
+    """One side of a glass ball around (x, 0, 0), with the indices of refraction there."""
     return {
         "type": "sphere",
-        "center": [_APART, 0.0, 0.0],
+        "center": [x, 0.0, 0.0],
         "radius": radius,
         "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside},
     }

@@ -286,12 +286,12 @@ class AutoMethod(Options):
 
 def _coarse(problem: Problem) -> dict[str, tuple[int, ...]]:
     """{key: steps before which the resolution doubles} of grids: a few cells find where there is something with less noise than many. Not
-    of textures, where smoothed gradients do the same; of grids that start with detail, which would be lost; nor of dealt views."""
+    of textures, where smoothed gradients do the same; nor of grids that start with detail, which would be lost."""
     known, start, found = problem.renderer.parameters(), problem.initial_values(), {}
     for key, shape in problem.shapes().items():
         ways = [steps for cells, steps in _COARSE if len(shape) == _GRID and min(shape[:-1]) >= cells]
         own = key in problem.coarse_to_fine or key in problem.preconditioners
-        if ways and not own and known[key].resizable and problem.gatherer is None and not _detail(start[key]):
+        if ways and not own and known[key].resizable and not _detail(start[key]):
             found[key] = ways[0]
     return found
 

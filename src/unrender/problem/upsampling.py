@@ -96,7 +96,9 @@ class Restartable(Protocol):
 
 
 def upsampled(state: Any, upsampler: Upsampler) -> Any:
-    """The state at the finer resolution. Raises `NotCarried` for one that is no `Upsamplable`."""
+    """The state at the finer resolution, None where there is none. Raises `NotCarried` for one that is no `Upsamplable`."""
+    if state is None:
+        return None
     if not isinstance(state, Upsamplable):
         raise NotCarried(type(state).__name__)
     return state.upsampled(upsampler)
