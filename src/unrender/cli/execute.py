@@ -87,8 +87,11 @@ def execute(
     return result
 
 
-def image_error(result: Result, which: str = "result") -> str:
-    """The mean over views of the root mean square error against the reference, in words: its noise taken out where it is known."""
+def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:
+    """The mean over views of the root mean square error against the reference, in words: its noise taken out where it is known.
+
+    `masks`: of the views, (H, W), by how much each pixel counts where the noise is not known; None for all pixels of all views.
+    """
     views = range(int(result.problem["views"]))
     known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
     if len(known) == len(views):
@@ -96,7 +99,8 @@ def image_error(result: Result, which: str = "result") -> str:
     errors = []
     for view in views:
         difference = result.pictures[f"view{view}/{which}"] - result.pictures[f"view{view}/reference"]
-        errors.append(float(np.sqrt(np.mean(np.square(difference, dtype=np.float64)))))
+        squares, mask = np.square(difference, dtype=np.float64).mean(-1), None if masks is None else masks[view]
+        errors.append(float(np.sqrt(np.average(squares, weights=mask if mask is not None and mask.any() else None))))
     return f"{formatting.number(float(np.mean(errors)))} with noise"
 
 
@@ -120,9 +124,11 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     if result.resumed:
         table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
     if result.pictures:
-        first, last = (image_error(result, which) for which in ("initial", "result"))
-        where = " where masks count" if any(view.mask is not None for view in problem.views) else ""
-        table.add_row("image error", f"{first} before, {last} after (root mean square{where}, noise removed)")
+        masks = [None if view.mask is None else np.asarray(view.mask) for view in problem.views]
+        first, last = (image_error(result, which, masks) for which in ("initial", "result"))
+        where = " where masks count" if any(mask is not None for mask in masks) else ""
+        removed = "" if last.endswith("noise") else ", noise removed"
+        table.add_row("image error", f"{first} before, {last} after (root mean square{where}{removed})")
     start = problem.parameter_error(result.initial)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():
