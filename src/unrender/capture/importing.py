@@ -246,7 +246,9 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """What has no surface."""
     assert options.field is not None
     if options.response == decoding.FIT:
-        raise InputError("--response fit: of a radiance field, any curve can be its own; expected srgb, linear or an exponent")
+        raise InputError(
+            "--response fit: of a radiance field, any curve can be its own; expected srgb, linear or an exponent"
+        )
     voxels, chosen = options.field, options.unknowns or field_folder.NAMES[:2]
     if others := [one for one in chosen if one not in field_folder.NAMES]:
         raise InputError(f"--unknowns {others[0]}: of a radiance field, expected some of light, exposure")
