@@ -186,10 +186,6 @@ def import_capture(
         raise InputError(f"import_capture: {out}: not empty; give overwrite=True to replace an earlier import")
     _check_place(out, folder, options, _OF_IMPORT | _OF_CHECK)
     if formats.is_lit(folder, options.kind):
-        if options.response != decoding.SRGB:
-            raise InputError(
-                "--response: of one camera under known lights, sRGB or linear is chosen by what explains the photographs"
-            )
         return _import_lit(folder, out, options)
     if options.field is not None:
         return _import_field(folder, out, options)
@@ -227,6 +223,10 @@ def import_capture(
 
 def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """One camera under known lights."""
+    if options.response != decoding.SRGB:
+        raise InputError(
+            "--response: of one camera under known lights, sRGB or linear is chosen by what explains the photographs"
+        )
     variant.ensure()
     capture = lights.read(folder, options.masks)
     with phases.phase("photographs"):
