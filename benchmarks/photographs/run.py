@@ -12,6 +12,7 @@ before the first step does not count. PSNR is as displayed, inside the masks, th
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -199,7 +200,7 @@ def run(
     dr.set_thread_count(1)
     own = photographs is None
     name = "vase" if photographs is None else photographs.resolve().name
-    folder = scratch(f"photographs/{name}-{resolution}-{'-'.join(entrant)}")
+    folder = scratch(f"photographs/{name}-{resolution}-{'-'.join(entrant)}-{os.getpid()}")
     shutil.rmtree(folder)
     given = photographs or ur.gallery.photographs(folder / "photographs", size=resolution, spp=64)
     imports: dict[str, tuple[ur.Problem, Judge]] = {}
@@ -249,6 +250,7 @@ def run(
             }
             part["maps"] = maps
         yield part
+    shutil.rmtree(folder)
 
 
 def tuned(
@@ -256,11 +258,14 @@ def tuned(
 ) -> dict[str, Any]:
     """The stock loop with each of the settings, samples and rate; then further seeds of the best."""
     tried: list[dict[str, Any]] = []
+    pictures = []
     for samples, rate in settings:
         values, steps = stock(problem, samples, rate, seconds, views, 0)
         tried.append({"spp": samples, "rate": rate, "steps": steps, "psnr": judge.of(values)})
+        pictures.append(judge.picture)
         print("stock", samples, rate, steps, np.mean(tried[-1]["psnr"]), flush=True)
     best = max(tried, key=lambda row: np.mean(row["psnr"]))
+    judge.picture = pictures[tried.index(best)]
     found: dict[str, Any] = {"psnr": [best["psnr"]], "steps": [best["steps"]], "tried": tried}
     found["settings"] = {key: best[key] for key in ("spp", "rate")}
     for seed in range(1, seeds):
