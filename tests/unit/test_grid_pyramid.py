@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unrender.core import arrays
+from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
-from unrender.optimizers import ScheduleFree, agreement
+from unrender.optimizers import ScheduleFree
 from unrender.optimizers.signal_share import signal_share
 from unrender.preconditioners import Sobolev, grid, grid_pyramid
 from unrender.preconditioners.grid_pyramid import GridPyramid
@@ -106,7 +106,7 @@ def test_a_pattern_of_noise_and_detail_is_recovered_as_with_transforms(monkeypat
 def test_sums_of_products_in_parts(monkeypatch: pytest.MonkeyPatch):
     drjit = pytest.importorskip("drjit")
     x, y = normal(0, (1001,)), normal(1, (1001,))
-    monkeypatch.setattr(agreement, "_LONG", 100)
+    monkeypatch.setattr(memory, "LARGE", 100)
     pairs = [tuple(drjit.llvm.Float(z) for z in pair) for pair in ((x, y), (x, x))]
-    found = [arrays.number(z) for z in agreement.inner_products(pairs)]
+    found = [arrays.number(z) for z in memory.inner_products(pairs)]
     np.testing.assert_allclose(found, [np.dot(x, y), np.dot(x, x)], rtol=1e-4)

@@ -18,6 +18,7 @@ __all__ = [
     "add_first_axis",
     "add_rows",
     "all_finite",
+    "all_true",
     "arange",
     "clip",
     "concatenate",
@@ -56,6 +57,7 @@ __all__ = [
     "sum_over_last",
     "sum_over_rows",
     "total",
+    "view",
     "where",
     "zeros_like",
 ]
@@ -124,6 +126,11 @@ def all_finite(x: Array) -> bool:
     return bool(np.all(np.isfinite(numpy(x)))) if not is_drjit(x) else bool(dr.all(dr.isfinite(x), axis=None))
 
 
+def all_true(mask: Array) -> bool:
+    """Whether every element of a mask holds. Waits for the device."""
+    return bool(dr.all(mask, axis=None)) if is_drjit(mask) else bool(np.all(mask))
+
+
 def zeros_like(x: Array) -> Array:
     """Zeros of the shape and kind of `x`."""
     return dr.zeros(type(x), dr.shape(x)) if is_drjit(x) else np.zeros_like(x)
@@ -187,6 +194,12 @@ def evaluate(*arrays: Any) -> None:
 def numpy(x: Array) -> np.ndarray:
     """A NumPy copy, whatever `x` was."""
     return np.array(x.numpy() if is_drjit(x) else x)
+
+
+def view(x: Array) -> np.ndarray:
+    """The elements as NumPy sees them, not to be written to: on a CPU the memory of a Dr.Jit array itself, which then lives as long; else a
+    copy."""
+    return x.numpy() if is_drjit(x) else np.array(x)
 
 
 def owned(values: Array, kind: type) -> Array:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from unrender.core import arrays, checks, trees
+from unrender.core import arrays, checks, memory, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -62,7 +62,7 @@ class MetaState:
         ratio = old / new if new > 0 else 1.0
 
         def moments(key: str, given: meta.Moments, factor: float) -> meta.Moments:
-            mean = upsampler.array(key, given.mean, 1.0, factor)
+            mean = upsampler.array(key, given.mean, 1.0, factor) if given.has_mean else given.mean
             return meta.Moments(mean, upsampler.array(key, given.square, SQUARES, factor * factor), given.weight)
 
         def element(key: str, given: meta.State) -> meta.State:
@@ -204,7 +204,8 @@ class MetaEstimator:
             elements, previous = state.elements, state.parameters
             of = problem.coordinates.of
             moved = trees.subtract(of(parameters), of(previous))
-            step_norm = arrays.sqrt(sum(arrays.total(x * x) for x in moved.values()))
+            step_norm = arrays.sqrt(sum(memory.square(x) for x in moved.values()))
+            del moved
         space = self._space(problem, parameters)
         pair_request = PairRequest(previous, space, state.step, state.batches)
         take = self._coupled if self.coupled else self._independent
@@ -234,6 +235,7 @@ class MetaEstimator:
         }
         gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
         elements = {name: parts[3] for name, parts in found.items()}
+        del first, second, observed, found
         steps = (state.step + 1, 0) if self._whole(parameters, state) else (state.step, state.batches + 1)
         after = MetaState(parameters, elements, step.image, pixels, *steps)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
@@ -279,6 +281,7 @@ class MetaEstimator:
         pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
         now, then = coordinates.pull_back(pair.gradient, slopes), coordinates.pull_back(pair.previous, before)
         difference = trees.subtract(now, then)
+        memory.evaluate_in_turn(difference)
         return F, difference, replace(step, samples=step.samples + pair.samples), pixels
 
     def _coupled(

@@ -6,12 +6,12 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -19,6 +19,7 @@ from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
 from unrender.estimators.damping import damping, smoothed_variance
 from unrender.estimators.emitter_selection import EmitterRequest
+from unrender.estimators.gradient_sum import GradientSum
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
@@ -186,7 +187,14 @@ def gather(
     likely = None if emitters is None else emitters.probabilities
     whole = sample is None
     frames = whole_views(problem, shares, spp, likely) if whole else [PixelBatch(problem, sample, likely)]
-    parts = [gather_frame(problem, request, frame, key.fold(index)) for index, frame in enumerate(frames)]
+    sums = {name: GradientSum() for name in ("gradient", "previous", "fresh")}
+    parts = []
+    for index, frame in enumerate(frames):
+        part = gather_frame(problem, request, frame, key.fold(index))
+        for name, total in sums.items():
+            total.add(getattr(part, name))
+        parts.append(replace(part, gradient={}, previous={}, fresh={}))
+        del part
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
     for frame, part in zip(frames, parts, strict=True):
@@ -196,9 +204,7 @@ def gather(
                 info.setdefault(name, {})[frame.view] = value
     told = [part.connections for part in parts if part.connections is not None]
     return GradientSample(
-        gradient=_sum([part.gradient for part in parts]),
-        previous=_sum([part.previous for part in parts]),
-        fresh=_sum([part.fresh for part in parts]),
+        **{name: total.result() for name, total in sums.items()},
         losses=[part.loss for part in parts],
         images=images,
         samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
@@ -230,11 +236,6 @@ def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:
 def prepared(problem: Problem, image: ImageEstimator, state: Any) -> Any:
     """`ImageEstimator.prepare`, by the workers where the problem's views are dealt to some."""
     return image.prepare(problem, state) if problem.gatherer is None else problem.gatherer.prepared(state)
-
-
-def _sum(parts: list[Tree]) -> Tree:
-    """In double precision: however the views are divided among workers, the result is the same but for its last bit, now and then."""
-    return trees.map(lambda *each: arrays.sum_in_double(each), *parts)
 
 
 @dataclass(frozen=True)
@@ -362,4 +363,5 @@ def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: 
 def _paths(session: RenderSession, parameters: Tree, request: SampleRequest, pair_request: PairRequest | None) -> Any:
     if pair_request is None:
         return session.image(parameters, request).paths
+    request = replace(request, both_gradients=True)
     return session.image_pair(parameters, pair_request.previous, request, pair_request.space).paths

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from unrender.core.random import Key
@@ -65,6 +65,7 @@ class Plain:
             rendering = problem.renderer.prepare(list(parameters), None).image(parameters, request)
         else:
             session = problem.renderer.prepare(list(parameters), pair_request.space)
+            request = replace(request, both_gradients=True)
             rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
         counts = frame.counts if isinstance(frame, WholeView) else None
         variance = variance_of_mean(rendering.images, counts)

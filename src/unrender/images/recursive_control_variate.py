@@ -239,7 +239,7 @@ class RecursiveControlVariate:
                 f"RecursiveControlVariate: its state is of step {state.step}, the pair requested of step {pair_request.step}"
             )
         previous = parameters if first or state.parameters is None else state.parameters
-        request = frame.request(spp, key.uint32(), groups)
+        request = replace(frame.request(spp, key.uint32(), groups), both_gradients=pair_request is not None)
         session = problem.renderer.prepare(list(parameters), self.space)
         rendering = session.image_pair(parameters, previous, request, self.space)
         asked = rendering

@@ -38,7 +38,7 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     if not np.isfinite(array).all():
         raise InputError("must be finite, got NaN or infinite values")
     if array.shape == shape:
-        return array.copy(), ""
+        return array, ""
     if len(shape) == 1 and array.size == shape[0] and array.ndim == 2:
         return array.reshape(shape), ""
     scalar = array.shape in ((), (1,))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
@@ -72,7 +72,7 @@ def coupled_gradient(
     previous, before, elements = state.parameters, state.derivative, state.elements
     if previous is None or before is None or trees.shapes(previous) != trees.shapes(parameters):
         previous, before, elements = parameters, derivative, {key: meta.init(x) for key, x in parameters.items()}
-    rendering = session.image_pair(parameters, previous, request, space)
+    rendering = session.image_pair(parameters, previous, replace(request, both_gradients=True), space)
     F, H = session.adjoint_pair(parameters, previous, rendering.paths, derivative, before)
     found = {key: meta.update_coupled(elements[key], F[key], H[key], 1.0, decouple=False) for key in parameters}
     gradient, variance, _, after = ({key: parts[n] for key, parts in found.items()} for n in range(4))

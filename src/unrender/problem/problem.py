@@ -101,6 +101,7 @@ class Problem:
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
         surfaces: as given.
+        first_values: {key: float32 array inside the bounds}, where parameters start. Read-only: may be the scene's own memory.
         faces: {key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh.
         remeshed_from: the problem with the meshes that it began with, where it has others now; else None.
         gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
@@ -153,7 +154,7 @@ class Problem:
         self.regularizers = {k: r for k, found in checked.items() if (r := found.regularizer) is not None}
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
         self.coordinates = Coordinates(transforms, self.preconditioners)
-        self._initial = {key: found.initial for key, found in checked.items()}
+        self.first_values = {key: found.initial for key, found in checked.items()}
         meshes = {key: mesh() for key in checked if (mesh := known[key].moving_mesh) is not None}
         self.faces = {key: np.asarray(faces).astype(np.int64).reshape(-1, 3) for key, (_, faces) in meshes.items()}
         self.notices = list(renderer_notices(self.renderer))
@@ -169,8 +170,7 @@ class Problem:
         self.self_intersections = check_self_intersections(self.parameters, self.faces)
         self.gatherer: Gatherer | None = None
         self.references = References(self.views, self.renderer.array)
-        self._references: dict[int, Array] = {}
-        self._masks: dict[int, Array | None] = {}
+        self._references, self._masks = dict[int, Array](), dict[int, Array | None]()
         self._as_given: Problem | None = None
 
     def _read_views(self) -> tuple[tuple[View, ...], list[str]]:
@@ -210,7 +210,7 @@ class Problem:
         Raises `InputError` where bounds do not suit.
         """
         missing = self._missing("parameterisation", given)
-        checked = {k: check_parameterisation(g, self.bounds[k], self._initial[k]) for k, g in missing.items()}
+        checked = {k: check_parameterisation(g, self.bounds[k], self.first_values[k]) for k, g in missing.items()}
         made = {key: one for key, (one, _) in checked.items()}
         found = self._completed("parameterisation", made)
         found.parameterisations = self.parameterisations | made
@@ -291,8 +291,8 @@ class Problem:
         return notebook.html(self)
 
     def initial_values(self) -> dict[str, np.ndarray]:
-        """`initial` as NumPy arrays."""
-        return {key: np.array(value) for key, value in self._initial.items()}
+        """`first_values`, copied."""
+        return {key: np.array(value) for key, value in self.first_values.items()}
 
     @property
     def pixels(self) -> int:
@@ -307,16 +307,16 @@ class Problem:
 
     def initial(self) -> Tree:
         """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""
-        return {key: self.renderer.array(value) for key, value in self._initial.items()}
+        return {key: self.renderer.array(value) for key, value in self.first_values.items()}
 
     def start(self, step: int = 0) -> Tree:
         """`initial()` at the resolutions that parameters have at a step."""
-        coarse = {key: way.coarsened(self._initial[key], step) for key, way in self.coarse_to_fine.items()}
-        return {key: self.renderer.array(coarse.get(key, value)) for key, value in self._initial.items()}
+        coarse = {key: way.coarsened(self.first_values[key], step) for key, way in self.coarse_to_fine.items()}
+        return {key: self.renderer.array(coarse.get(key, value)) for key, value in self.first_values.items()}
 
     def shapes(self, step: int | None = None) -> dict[str, tuple[int, ...]]:
         """Of each parameter at a step; None for the scene's own."""
-        found = {key: value.shape for key, value in self._initial.items()}
+        found = {key: value.shape for key, value in self.first_values.items()}
         if step is None:
             return found
         return found | {key: way.shape(found[key], step) for key, way in self.coarse_to_fine.items()}
@@ -325,8 +325,8 @@ class Problem:
         """The parameters as NumPy arrays, those that are still coarse interpolated at the scene's own resolution."""
         found = {key: arrays.numpy(value) for key, value in parameters.items()}
         for key, way in self.coarse_to_fine.items():
-            if key in found and found[key].shape in way.shapes(self._initial[key].shape):
-                found[key] = way.refined(found[key], self._initial[key].shape)
+            if key in found and found[key].shape in way.shapes(self.first_values[key].shape):
+                found[key] = way.refined(found[key], self.first_values[key].shape)
         return found
 
     def reference(self, view: int) -> Array:
@@ -379,7 +379,7 @@ class Problem:
         if name not in self.renderer.parameters():
             return None
         found = arrays.numpy(self.renderer.values([name])[name]).reshape(-1, 2)
-        return found if len(found) == self._initial[key].size // 3 else None
+        return found if len(found) == self.first_values[key].size // 3 else None
 
     @property
     def has_truth(self) -> bool:
@@ -395,6 +395,6 @@ class Problem:
             for key, truth in self.truth.items()
         }
         for key, surface in self.surfaces.items():
-            if found[key].size == self._initial[key].size:
+            if found[key].size == self.first_values[key].size:
                 errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)
         return errors

@@ -168,6 +168,7 @@ def check_parameter(
     with checking("initial"):
         start, notice = _initial(parameter, info, renderer)
     initial, clipped = _clip_to_bounds(start, bounds)
+    initial.flags.writeable = False
     with checking("parameterisation"):
         if parameter.parameterisation is not None:
             parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
@@ -273,7 +274,8 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
     """The initial value, float32, and what was changed to make it fit, "" for nothing."""
     if parameter.initial is not None:
         return parameter_values.fill(parameter.initial, info.shape)
-    start = arrays.numpy(renderer.values([parameter.key])[parameter.key]).astype(np.float32)
+    # On a CPU the scene's own memory, which nobody writes to: grids and textures can be as large as all else.
+    start = np.asarray(arrays.view(renderer.values([parameter.key])[parameter.key]), np.float32)
     if not np.isfinite(start).all():
         raise InputError("the scene's own value is not finite; give another")
     return start, ""
@@ -282,10 +284,15 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
 def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
     """`start` inside the bounds, and how many values changed, "" for none."""
     low, high = bounds
-    inside = np.clip(start, low, high) if (low, high) != (None, None) else start
-    moved = int(np.sum(inside != start))
-    notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]" if moved else ""
-    return inside.astype(np.float32), notice
+    moved = sum(
+        int(np.count_nonzero(outside(start, end)))
+        for outside, end in ((np.less, low), (np.greater, high))
+        if end is not None
+    )
+    if not moved:
+        return start, ""
+    notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
+    return np.clip(start, low, high).astype(np.float32, copy=False), notice
 
 
 def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> tuple[np.ndarray, str]:

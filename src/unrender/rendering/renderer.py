@@ -103,6 +103,7 @@ class SampleRequest:
         positions: of each chosen pixel among those that the seed is for, by which its random numbers are drawn: a part of a mini-batch
             is rendered as the whole would be. None where these are all.
         emitters: the probability with which a connection takes each emitter, (E,), sum 1, see `EmitterSession`; None for the scene's own.
+        both_gradients: of a pair, whether `adjoint_pair` will be asked for, and not `adjoint` alone. To know it saves memory and time.
     """
 
     sensor: int
@@ -113,6 +114,7 @@ class SampleRequest:
     sensors: Array | None = None
     positions: Array | None = None
     emitters: np.ndarray | None = None
+    both_gradients: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from unrender.core import arrays
+from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.runs.hooks import Hook
 
@@ -25,7 +25,7 @@ class InfluenceWatch(Hook):
         if not applied or run.step > _STEPS:
             return
         for key, gradient in estimate.gradient.items():
-            zero[key] = zero[key] and arrays.number(arrays.total(gradient * gradient)) == 0.0
+            zero[key] = zero[key] and arrays.number(memory.square(gradient)) == 0.0
             if zero[key] and run.step == _STEPS:
                 run.warnings.append(
                     f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, phases
+from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -69,12 +69,7 @@ class Descent:
         started = time.perf_counter()
         run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
         for _ in range(2):
-            key = Key(run.seed, 0, stream=1)
-            found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
-            found = regularized(found, run.problem, run.parameters)
-            update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
-            run.parameters, state.optimizer = update.parameters, update.state
-            state.noise.update(found.gradient, found.variance)
+            _discarded_step(run, state)
         return time.perf_counter() - started, snapshot(run, state)
 
 
@@ -120,12 +115,7 @@ def descend(descent: Descent) -> Result:
     """Take steps until a hook, a callback or Ctrl-C stops the run. See `Hook` for what happens when."""
     run, hooks = descent.run, descent.hooks
     try:
-        fresh = descent.snapshot()
-        with phases.phase(COMPILING):
-            seconds, warm = descent.warm_up()
-        descent.log.warmup_seconds += seconds
-        for hook in hooks:
-            hook.on_warm_up(descent, fresh, warm)
+        _warm_up(descent)
         with interruptible(run):
             for hook in hooks:
                 hook.on_start(descent)
@@ -136,6 +126,7 @@ def descend(descent: Descent) -> Result:
                 descent.log.history.append(record)
                 for hook in hooks:
                     hook.on_step(descent, record)
+        memory.trim_cache(run.parameters)
         result = descent.result(info=True)
         for hook in hooks:
             result = hook.on_result(descent, result)
@@ -146,6 +137,31 @@ def descend(descent: Descent) -> Result:
     for hook in hooks:
         hook.on_end(descent, result)
     return result
+
+
+def _warm_up(descent: Descent) -> None:
+    """Compile, and tell the hooks. The two snapshots hold as much as the run itself does: they end with this call."""
+    fresh = descent.snapshot()
+    with phases.phase(COMPILING):
+        seconds, warm = descent.warm_up()
+    descent.log.warmup_seconds += seconds
+    for hook in descent.hooks:
+        hook.on_warm_up(descent, fresh, warm)
+    del fresh, warm
+    memory.release_cache()
+
+
+def _discarded_step(run: Run, state: RunState) -> None:
+    """One step for its kernels alone."""
+    key = Key(run.seed, 0, stream=1)
+    found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
+    found = regularized(found, run.problem, run.parameters)
+    memory.trim_cache(run.parameters)
+    update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
+    run.parameters, state.optimizer = update.parameters, update.state
+    del update
+    memory.evaluate_in_turn(state.optimizer)
+    state.noise.update(found.gradient, found.variance)
 
 
 def _announce(descent: Descent, estimate: Estimate, applied: bool) -> None:
@@ -162,8 +178,11 @@ def _step(
     """
     problem = run.problem
     started = time.perf_counter()
+    run.estimate = None  # its gradient is as large as the one to come
+    memory.trim_cache(run.parameters)
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
     estimate = regularized(estimate, problem, run.parameters)
+    memory.trim_cache(run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:
         update = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
@@ -171,6 +190,8 @@ def _step(
         if not culprit:
             _warn_of_shortened(run, update.shortened)
             run.parameters, state.optimizer, state.estimator = update.parameters, update.state, after
+            del update
+            memory.evaluate_in_turn(state.optimizer)
     finite = not culprit
     if culprit:
         _warn_of_skipping(run, culprit)
@@ -228,8 +249,8 @@ class _Update:
     """What an optimizer makes of an estimate.
 
     Attributes:
+        parameters, state: after it; of the state, large arrays are still to be evaluated.
         shortened: meshes whose triangles would have turned over.
-        parameters, state: after it.
         not_finite: what of it is not finite, "" for nothing; it is then not to be applied.
     """
 
@@ -246,9 +267,11 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     steps, state = optimizer.update(found, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps)
     bounded = {k: project(x, *problem.bounds[k]) for k, x in reached.items()}
-    arrays.evaluate(moved, bounded, state)
     # Before they are bounded: the nearest point to what is no number may be a bound.
-    broken = next((key for key, value in moved.items() if not arrays.all_finite(value)), "")
+    finite = trees.map(arrays.is_finite, moved)
+    del steps, moved, reached
+    arrays.evaluate(bounded, finite, memory.small_parts(state))
+    broken = next((key for key, mask in finite.items() if not arrays.all_true(mask)), "")
     culprit = f"the optimizer's step for {broken} (from its own state, or the preconditioner)" if broken else ""
     if culprit:
         return _Update(bounded, state, culprit)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.evaluation.self_intersections import crossing_triangles
 from unrender.evaluation.surfaces import folds
@@ -36,7 +36,7 @@ class MeshWatch(Hook):
         for key, faces in run.problem.faces.items() if applied else ():
             # None of estimators that have losses alone, or directions in its place.
             gradient = estimate.gradient.get(key)
-            shown = gradient is not None and arrays.number(arrays.total(gradient * gradient)) > 0.0
+            shown = gradient is not None and arrays.number(memory.square(gradient)) > 0.0
             if shown:
                 self._seen.add(key)
             elif gradient is not None and key in self._seen:

@@ -16,7 +16,7 @@ from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 
-__all__ = ["RunAnnotations", "RunMetadata", "describe", "describe_run", "fingerprint_of", "to_numpy"]
+__all__ = ["RunAnnotations", "RunMetadata", "describe", "describe_run", "fingerprint_of", "first_values", "to_numpy"]
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -40,6 +40,13 @@ class RunAnnotations:
     command: str = ""
     final_spp: int | None = None
     phases: Mapping[str, float] = field(default_factory=dict)
+
+
+def first_values(run: Run) -> dict[str, np.ndarray]:
+    """{key: array} of a run that has not begun, at the scene's own resolution: the problem's own arrays where they are equal, in place of
+    copies of the run's."""
+    known = run.problem.first_values
+    return {k: known[k] if np.array_equal(known[k], x) else x for k, x in run.full().items()}
 
 
 @dataclass

@@ -28,7 +28,15 @@ from unrender.runs.hooks import CallbackHook, Hook
 from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
 from unrender.runs.mesh_watch import MeshWatch
-from unrender.runs.metadata import RunAnnotations, RunMetadata, describe, describe_run, fingerprint_of, to_numpy
+from unrender.runs.metadata import (
+    RunAnnotations,
+    RunMetadata,
+    describe,
+    describe_run,
+    fingerprint_of,
+    first_values,
+    to_numpy,
+)
 from unrender.runs.notebook_progress import NotebookProgress
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
@@ -97,7 +105,7 @@ def optimize(
         annotations = replace(annotations, method=named, choices=choice.reasons)
     run, state = prepare(problem, choice.estimator, choice.optimizer, steps, seconds, seed)
     run.warnings += advice.remarks(problem, choice.optimizer)
-    log = RunMetadata(describe_run(run, annotations), run.full())
+    log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown:
         return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)
 

@@ -28,7 +28,7 @@ from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import Hook
 from unrender.runs.loop import Descent, descend, initialize, prepare
-from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of
+from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of, first_values
 from unrender.runs.optimize import assemble_hooks, check, open_writer
 from unrender.runs.result import NON_FINITE, Result, deciding_versions
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
@@ -97,7 +97,7 @@ def resume_run(
     check(parts.estimator, parts.optimizer, method.steps, method.seconds)
     run, state = prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
     run.folder = folder
-    initial, fingerprint = run.full(), fingerprint_of(run)
+    initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
             changes = _changes(stored, source.checkpoint, fingerprint)

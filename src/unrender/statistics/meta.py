@@ -57,17 +57,23 @@ BETA_DIFFERENCE = 0.9
 
 @dataclass(frozen=True)
 class Moments:
-    """Exponentially weighted sums of a sample and of its square, and of their weights, 1 − βⁿ (a device number)."""
+    """Exponentially weighted sums of a sample and of its square, and of their weights, 1 − βⁿ (a device number). The mean is the number 0
+    where variances are not about it."""
 
     mean: Array
     square: Array
     weight: Array
 
+    @property
+    def has_mean(self) -> bool:
+        """Whether the mean is one of each element."""
+        return not isinstance(self.mean, float) and arrays.shape(self.mean) == arrays.shape(self.square)
+
 
 @dataclass(frozen=True)
 class State:
-    """State between steps. Every array has the shape given to `init`, but for the count of steps
-    and the moments' weights, which are numbers.
+    """State between steps. Every array has the shape given to `init`, but for the count of steps, the moments' weights and means that are
+    not asked for, which are numbers.
 
     Attributes:
         gradient: M.
@@ -89,7 +95,7 @@ class State:
 def init(like: Array) -> State:
     """Before the first sample. `like` gives shape and type of the samples."""
     zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
-    empty = Moments(zeros, zeros, zero)
+    empty = Moments(zero, zeros, zero)
     return State(zeros, zeros, zeros, empty, empty, zero)
 
 
@@ -211,18 +217,18 @@ def _observe(
     length = step_norm * step_norm if decouple else changed * 1.0
     # Numbers must be in memory before they meet arrays: Dr.Jit resizes an unevaluated number in place to the array's size.
     arrays.evaluate(started, unit, past, gain_f, gain_d, weight_f, weight_d, scale_f, scale_d, length)
-    proportional = _average(state.proportional, F, gain_f, weight_f)
-    changes = _average(state.difference, difference / unit, gain_d, weight_d)
+    proportional = _average(state.proportional, F, gain_f, weight_f, centred)
+    changes = _average(state.difference, difference / unit, gain_d, weight_d, centred)
     var_f = _variance(proportional, scale_f, centred)
     var_d = _variance(changes, scale_d, centred) * length
     var_m = arrays.where(only_zeros, arrays.maximum(var_f / past, state.variance), state.variance)
     return replace(state, proportional=proportional, difference=changes), var_f, var_d, var_m, started
 
 
-def _average(moments: Moments, sample: Array, gain: Array, weight: Array) -> Moments:
+def _average(moments: Moments, sample: Array, gain: Array, weight: Array, centred: bool) -> Moments:
     """The moments with one more sample; as they were where `gain` is 0."""
     return Moments(
-        moments.mean + gain * (sample - moments.mean),
+        moments.mean + gain * (sample - moments.mean) if centred else moments.mean,
         moments.square + gain * (sample * sample - moments.square),
         weight,
     )

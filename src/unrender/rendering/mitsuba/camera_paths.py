@@ -55,9 +55,10 @@ class CameraPaths:
 
         Args:
             states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, of the current
-                and, for a pair, of the previous state.
+                and, for a pair, of the previous state, whose derivative is None where its gradient is not wanted.
         """
-        self._sample(dr.ADMode.Backward, tuple(ReplayState(δ * self._weight, self._replayed(L)) for δ, L in states))
+        replay = [ReplayState(None if δ is None else δ * self._weight, self._replayed(L)) for δ, L in states]
+        self._sample(dr.ADMode.Backward, tuple(replay))
 
     def forward(self, radiance: Any) -> Any:
         """The derivative of the weighted radiance along the tangents, per lane; `radiance` is that of the primal pass."""

@@ -18,6 +18,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.core import arrays, memory
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.frozen import FrozenFunction
@@ -127,7 +128,7 @@ class LoadedScene:
 
     Attributes:
         scene: as Mitsuba has it.
-        source: what was loaded: the file's path, or the dictionary.
+        source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps that it holds.
         meshed: ids of spheres that have become meshes.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
@@ -164,6 +165,15 @@ class LoadedScene:
         """The scene's own value of a parameter, as loaded."""
         return to_tensor(self._own[key] if key in self._own else self.parameters[key])
 
+    def share_values(self, other: LoadedScene) -> None:
+        """Keep the large arrays that another load of the description has as its own values in place of equal ones."""
+        for key, value in self._own.items():
+            known = other._own.get(key)
+            if not memory.is_large(value) or type(known) is not type(value) or native_shape(known) != native_shape(value):
+                continue
+            if dr.all(arrays.flat(known) == arrays.flat(value), axis=None):
+                self._own[key] = known
+
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Of the parameters that are set."""
         return tuple(tuple(setting.value.shape) for setting in self._settings.values())
@@ -197,6 +207,7 @@ class LoadedScene:
         elif changed:
             with _without_warnings():
                 self.parameters.update()
+            self._hold({key: self.leaves.get(key, self._settings[key].value) for key in changed})
         if changed and self._shared:
             plain = [key for key in self._settings if key not in self.poses]
             self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
@@ -230,6 +241,19 @@ class LoadedScene:
         if normals:
             self.parameters.update()
 
+    def _hold(self, values: Mapping[str, Any]) -> None:
+        """Have bitmaps and grids hold these values, which they were set to, themselves. They keep two copies: one with channels padded to a
+        power of two, which kernels read, and one as it was given, which they make anew from the padded one whenever somebody asks."""
+        if self._shared:
+            return
+        for key, value in values.items():
+            held: Any = self.parameters[key]
+            if dr.is_tensor_v(value) and dr.is_tensor_v(held) and _index(held) != _index(value):
+                self.parameters[key] = type(held)(value)
+        # Nothing has changed.
+        self.parameters.nodes_to_update.clear()
+        self.parameters.update_candidates.clear()
+
     def detach(self) -> None:
         """Keep the values, and cut them from the derivative graph."""
         if self.leaves:
@@ -240,9 +264,12 @@ class LoadedScene:
         for leaf in self.leaves.values():
             dr.clear_grad(leaf)
 
-    def gradients(self) -> Tree:
-        """The gradients of all leaves, as tensors."""
-        return {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
+    def take_gradients(self) -> Tree:
+        """The gradients of all leaves, as tensors, evaluated. The leaves keep none: those of large arrays would wait for the next pass."""
+        found = {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
+        dr.eval(found)
+        self.clear_gradients()
+        return found
 
     def set_tangents(self, values: Tree, tangents: Tree, attached: AbstractSet[str]) -> None:
         """Give these parameters these values, and carry the tangents of those `attached` to all that the scene computes from them.

@@ -232,17 +232,23 @@ class AdjointPass(Pass):
 
 @dataclass(frozen=True)
 class AdjointPairPass(Pass):
-    """Both states' path replay backward, on the current state's paths."""
+    """Both states' path replay backward, on the current state's paths.
 
+    Attributes:
+        both: whether the previous state's leaves get gradients, too.
+    """
+
+    both: bool = True
     pair: ClassVar[bool] = True
 
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {**pair.tables(), "delta": delta}
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
-        """`own`: as for `AdjointPass`, of the current and then of the previous state."""
-        radiance, weights, radianceₚ, weightsₚ = own
-        δL, δLₚ = (film.film_adjoint(of_state, size.spp, size.pixels) for of_state in (weights, weightsₚ))
+        """`own`: as for `AdjointPass`, of the current and then of the previous state, whose weights are left out unless `both`."""
+        radiance, weights, radianceₚ, *rest = own
+        δL = film.film_adjoint(weights, size.spp, size.pixels)
+        δLₚ = film.film_adjoint(rest[0], size.spp, size.pixels) if self.both else None
         paths.backward((δL, radiance), (δLₚ, radianceₚ))
 
 

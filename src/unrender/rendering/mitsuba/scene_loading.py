@@ -7,7 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
@@ -37,7 +39,8 @@ def is_loaded(description: SceneDescription) -> bool:
 
 
 def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]:
-    """As `load`, and what was loaded: the file's path, or the dictionary; nothing in it for a scene that was loaded before."""
+    """As `load`, and what was loaded: the file's path, or the dictionary without data (`_outline`); nothing in it for a scene that was
+    loaded before."""
     variant.ensure()
     emissive.register()
     turntable_light.register()
@@ -63,7 +66,19 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
         raise InputError(f"scene {name}: Mitsuba could not load it: {_one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
-    return _with_sensor(scene), Path(description) if isinstance(description, str) else description
+    outline = _outline(description) if isinstance(description, dict) else Path(description)
+    return _with_sensor(scene), outline
+
+
+def _outline(description: dict[str, Any]) -> dict[str, Any]:
+    """A dictionary without the grids, bitmaps and arrays in memory that it hands to plugins: the scene has copies of them."""
+    found = {key: _outline(value) if isinstance(value, dict) else value for key, value in description.items()}
+    return {key: value for key, value in found.items() if not _is_data(value)}
+
+
+def _is_data(value: Any) -> bool:
+    large = isinstance(value, np.ndarray) and value.size > 16  # no transform
+    return large or isinstance(value, (mi.VolumeGrid, mi.Bitmap)) or dr.is_tensor_v(value)
 
 
 def _loaded_before(scene: Any) -> mi.Scene:

@@ -89,6 +89,7 @@ class ScenePair:
             raise InputError(SINGLE)
         if self._previous is None:
             self._previous = LoadedScene(self.description, self.moving, self.replaced)
+            self._previous.share_values(self._current)
         return self._previous
 
     def as_described(self) -> LoadedScene:

@@ -206,7 +206,8 @@ class MitsubaSession:
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
         self._set_parameters(current)
-        self._set_parameters(previous, previous=True)
+        # A call through a pointer reaches both scenes' objects, and its adjoint would accumulate gradients in all that are attached.
+        self._set_parameters(previous, previous=True, attach=request.both_gradients)
         if space == "primary" and not (self._geometric and self._related):
             radiance = self._run(ImagePass(), request)
             radiance_previous = self._run(ImagePass(previous=True), request)
@@ -226,8 +227,10 @@ class MitsubaSession:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `RenderSession.adjoint`."""
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: so does its replay.
-            nothing = tensor(np.zeros(weights.shape))
-            return self.adjoint_pair(parameters, paths.previous, paths, weights, nothing)[0]
+            self._set_parameters(parameters)
+            self._set_parameters(paths.previous, previous=True, attach=paths.request.both_gradients)
+            self._run(AdjointPairPass(both=False), paths.request, paths.radiance, weights, paths.radiance_previous)
+            return self._pair.loaded().take_gradients()
         self._set_parameters(parameters)
         if self._replays:
             self._run(AdjointPass(), paths.request, paths.radiance, weights)
@@ -256,9 +259,7 @@ class MitsubaSession:
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self._run(AdjointPairPass(), request, *states)
-        gradient = self._pair.loaded().gradients(), self._pair.loaded(previous=True).gradients()
-        dr.eval(gradient)
-        return gradient
+        return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
         """Path replay in forward mode: the squared derivative of each path along the tangents, and where shapes move the squared boundary
@@ -313,16 +314,14 @@ class MitsubaSession:
         for term in (self._boundary, self._camera):
             if term is not None:
                 term.accumulate(scene, request, weights)
-        found = scene.gradients()
-        dr.eval(found)
-        return found
+        return scene.take_gradients()
 
     # ------------------------------------------------------------------ launches
 
-    def _set_parameters(self, parameters: Tree, previous: bool = False) -> None:
+    def _set_parameters(self, parameters: Tree, previous: bool = False, attach: bool = True) -> None:
         self._check_keys(parameters)
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
-        self._pair.loaded(previous).set_parameters(rest, self._attached)
+        self._pair.loaded(previous).set_parameters(rest, self._attached if attach else frozenset())
         self._set_poses(parameters, previous)
 
     def _set_poses(self, parameters: Tree, previous: bool = False) -> None:

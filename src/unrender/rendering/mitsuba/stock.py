@@ -49,6 +49,6 @@ class StockSession:
         )
         seen = mi.TensorXf(dr.detach(image))
         dr.backward(dr.sum(image * weigh(seen), axis=None))
-        gradient = scene.gradients()
-        dr.eval(gradient, seen)
+        gradient = scene.take_gradients()
+        dr.eval(seen)
         return seen, gradient

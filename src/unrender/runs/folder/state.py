@@ -39,7 +39,7 @@ class Packed:
 
     Attributes:
         skeleton: JSON that says how it is put together; arrays are named by number.
-        tensors: {number as text: array}, on the host.
+        tensors: {number as text: array}, on the host; on a CPU the state's own memory.
     """
 
     skeleton: Any
@@ -173,7 +173,7 @@ class _Packer:
 
     def _array(self, original: Any, host: np.ndarray | None, kind: str) -> Any:
         if id(original) not in self._seen:
-            array = arrays.numpy(original) if host is None else host
+            array = arrays.view(original) if host is None else host
             if array.dtype.kind not in "fiub":
                 raise TypeError(f"a state's arrays are of real numbers, got {array.dtype}")
             number = len(self.tensors)

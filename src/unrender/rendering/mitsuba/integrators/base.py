@@ -39,7 +39,7 @@ class ReplayState:
     """What replaying the paths of one state needs of its primal pass.
 
     Attributes:
-        δL: adjoint radiance per lane; None in forward mode.
+        δL: adjoint radiance per lane; None in forward mode, and for the previous state of a pair where its gradient is not wanted.
         radiance: per lane, as the primal pass returned it (`state_in` of Mitsuba's `prb`).
     """
 
@@ -142,10 +142,11 @@ class PathContext:
         return [functools.reduce(combine, of_state) for of_state in zip(L, *parts, strict=True)]
 
     def adjoint_sum(self, contributions: Sequence[Spectrum]) -> Spectrum:
-        """Σ δL · contribution over the states; the contribution itself in forward mode."""
+        """Σ δL · contribution over the states whose gradient is wanted; the contribution itself in forward mode."""
         if self.forward:
             return contributions[0]
-        return total([replay.δL * part for replay, part in zip(self.replay, contributions, strict=True)])
+        pairs = zip(self.replay, contributions, strict=True)
+        return total([replay.δL * part for replay, part in pairs if replay.δL is not None])
 
 
 class ConnectionRecord:
