@@ -78,6 +78,7 @@ __all__ = [
     "available_denoiser",
     "black_box",
     "build_problem",
+    "channel_moments",
     "coupled_gradients",
     "dr",
     "element_scales",
