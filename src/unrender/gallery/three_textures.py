@@ -31,7 +31,8 @@ _APART = 0.72
 class ThreeTextures:
     """The paint of three things at once under a sky with a sun, seen from all around.
 
-    Several views; three unknown reflectances of texture_resolution² texels, from grey, with LargeSteps.
+    Several views; three unknown reflectances of texture_resolution² texels, from grey, with LargeSteps. Of the ball's lower end no
+    picture tells.
     """
 
     resolution: int = fields.resolution(64)
