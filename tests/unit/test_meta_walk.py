@@ -9,6 +9,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import PastWeight, Variance
 from unrender.optimizers import Adam, MetaAdam
+from unrender.optimizers.base import Optimizer
 from unrender.statistics import meta
 
 ELEMENTS, STEPS, RATE = 4000, 300, 0.1
@@ -22,7 +23,7 @@ def samples(mean: float = 0.0) -> np.ndarray:
     return rng.choice([-1.0, 1.0], (STEPS, ELEMENTS)) + mean
 
 
-def moved(optimizer: Adam | MetaAdam, F: np.ndarray, max_weight: float = 1.0) -> np.ndarray:
+def moved(optimizer: Optimizer, F: np.ndarray, max_weight: float = 1.0) -> np.ndarray:
     """By how much each element moves, in learning rates; the gradient is the meta-estimate of samples that never change."""
     state, steps = meta.init(F[0]), optimizer.init({"x": F[0]}, None)
     total = np.zeros(ELEMENTS)
