@@ -14,6 +14,7 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     HessianProduct,
     LossFunction,
+    PastWeight,
     Smoothing,
     Variance,
 )
@@ -47,6 +48,7 @@ __all__ = [
     "PairRequest",
     "ParameterInfo",
     "Parameterisation",
+    "PastWeight",
     "PixelSampler",
     "Preconditioner",
     "RenderSession",

@@ -100,6 +100,18 @@ def test_a_glowing_volume_takes_the_look_of_a_toy():
     assert error[1] < 0.3 * error[0], error
 
 
+def test_scattered_balls_are_fewer_in_a_picture_than_the_toy():
+    """Against the sky alone, which a reference without any of them shows, they change fewer pixels, all over the picture."""
+    options = {"resolution": 24, "grid_resolution": 8, "views": 1, "reference_spp": 64}
+    toy, balls = (
+        np.asarray(ur.gallery.problem("nerf-volume", **options, balls=count).views[0].reference) for count in (0, 12)
+    )
+    changed = [np.abs(picture - picture[0, 0]).max(-1) > 0.02 for picture in (toy, balls)]
+    assert 0 < 1.2 * changed[1].sum() < changed[0].sum()
+    spread = [np.argwhere(mask).std(axis=0).min() for mask in changed]
+    assert spread[1] > spread[0]
+
+
 def test_a_grid_s_values_lie_where_positions_say():
     x, y, z = volumes.positions(4)
     volume = mi.load_dict(volumes.grid(np.stack([x, y, z], -1)))

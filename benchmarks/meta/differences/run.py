@@ -3,7 +3,9 @@
 Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose
 length is varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with
 its log-log slope. Cost: an estimate by plain gradients, of the paper's meta-estimation and of the coupled form, and the
-parts of a meta step.
+parts of a meta step. Noise: the variance of plain gradients by samples per pixel, near the truth, summed over elements:
+where that of images and adjoints multiply, it falls with the square of the samples, and many in one step serve a descent
+better than as many over several.
 """
 
 from __future__ import annotations
@@ -21,8 +23,11 @@ from benchmarks.runner.timing import medians, turns
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
 STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 """Share of the way from the start to the truth."""
-MERGE = ("variance.problems", "cost")
-QUICK = {"problem": ("indirect-room",), "resolution": 8, "cost_resolution": (8,), "runs": 3, "spp": 2}
+NOISE_SPP = (2, 4, 8, 16, 64)
+NEAR = 0.9
+"""Share of the way at which the noise is measured."""
+MERGE = ("variance.problems", "cost", "noise.problems")
+QUICK = {"problem": ("indirect-room",), "resolution": 8, "cost_resolution": (8,), "runs": 3, "spp": 2, "noise_runs": 3}
 
 
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
@@ -90,13 +95,36 @@ def costs(problem: ur.Problem) -> dict[str, float]:
     return found
 
 
+def noise(problem: ur.Problem, runs: int) -> list[float]:
+    """The variance of a plain gradient at each of `NOISE_SPP`, summed over the elements."""
+    start, end = problem.initial(), truth(problem)
+    parameters = {k: x + (end[k] - x) * arrays.scalar(NEAR, x) for k, x in start.items()}
+    arrays.evaluate(parameters)
+    found = []
+    for spp in NOISE_SPP:
+        estimator, rows = ur.PathGradient(spp=spp), []
+        for seed in range(runs):
+            state = estimator.init(problem, parameters)
+            gradient = estimator.estimate(problem, parameters, state, Key(2, seed))[0].gradient
+            rows.append(np.concatenate([arrays.numpy(x).ravel() for x in gradient.values()]))
+        found.append(float(np.stack(rows).astype(np.float64).var(0, ddof=1).sum()))
+    print(
+        problem.name,
+        "Var F of equal paths",
+        [f"{v * n:.3g}" for v, n in zip(found, NOISE_SPP, strict=True)],
+        flush=True,
+    )
+    return found
+
+
 def run(
     problem: tuple[str, ...] = PROBLEMS,
-    part: tuple[str, ...] = ("variance", "cost"),
+    part: tuple[str, ...] = ("variance", "cost", "noise"),
     resolution: int = 32,
     cost_resolution: tuple[int, ...] = (96, 256),
     spp: int = 4,
     runs: int = 48,
+    noise_runs: int = 64,
 ) -> Iterator[dict[str, Any]]:
     """Costs at each size, then variances.
 
@@ -105,6 +133,7 @@ def run(
         resolution: of the variances
         spp: of the variances
         runs: of the variances
+        noise_runs: of the noise
     """
     loss = "RelativeL2"
     for size in cost_resolution if "cost" in part else ():
@@ -114,3 +143,10 @@ def run(
         options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
         found = {name: variances(ur.gallery.problem(name, **options), spp, runs) for name in problem}
         yield {"variance": {"resolution": resolution, "spp": spp, "runs": runs, "problems": found}}
+    if "noise" in part:
+        options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
+        found = {}
+        for name in problem:
+            size = {**options, "texture_resolution": 1} if name == "spiral" else options
+            found[name] = noise(ur.gallery.problem(name, **size), noise_runs)
+        yield {"noise": {"resolution": resolution, "runs": noise_runs, "spp": NOISE_SPP, "problems": found}}

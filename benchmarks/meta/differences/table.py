@@ -26,4 +26,15 @@ def table(record: Record) -> str:
                 ["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys]
             )
         )
+    if "noise" in record:
+        found = record["noise"]
+        blocks.append(
+            f"Var F of plain gradients times samples per pixel, over that at {found['spp'][0]}, near the truth: what equal paths in "
+            f"steps of so many leave of noise ({found['resolution']}², {found['runs']} runs):"
+        )
+        rows = []
+        for name, values in found["problems"].items():
+            of_paths = [v * n for v, n in zip(values, found["spp"], strict=True)]
+            rows.append([name, *(f"{v / of_paths[0]:.3f}" for v in of_paths)])
+        blocks.append(markdown.table(["problem", *(f"{n} spp" for n in found["spp"])], rows))
     return "\n\n".join(blocks)

@@ -5,16 +5,23 @@ equal steps (Fig. 3), or by steps that halve their distance (Fig. 4). Each metho
 that Adam keeps of plain gradients (decay 0.9) with the deviation that its two moments predict for it, the paper's
 meta-estimate, and the coupled one. Three texels are shown: the one with the noisiest gradient, the 75th percentile, the
 median.
+
+The paper's own figures are of forward derivatives of pixels by one colour, here the left wall's blue while it and those of
+floor and ceiling change, from one sample per pixel and step: `pixels.py` has them for all runs at once. Adam sees the
+proportional samples alone. Beside the deviations it compares the variances that single runs estimate, and their α, with the
+actual ones and the best α.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, Tree, arrays
+from benchmarks.meta.fig3_4_estimates import pixels
 from benchmarks.paths import geometric, straight
 
 BETA_1, BETA_2 = 0.9, 0.999
@@ -26,7 +33,10 @@ METHODS = {
 }
 HALF_LIFE = 8.0
 TRUTH_SEED = 1_000_000
-QUICK = {"runs": 3, "steps": 6, "resolution": 8}
+MERGE = ("sizes", "paths", "pixels")
+QUICK = {
+    "runs": 3, "steps": 6, "resolution": 8, "pixel_runs": 20, "pixel_steps": 30, "pixel_resolution": 4,
+}  # fmt: skip
 
 
 def estimates_along(
@@ -93,10 +103,32 @@ def measure(problem: ur.Problem, path: list[Tree], runs: int) -> dict[str, Any]:
     return found
 
 
-def run(runs: int = 200, steps: int = 40, resolution: int = 24) -> dict[str, Any]:
-    """Both paths."""
-    problem = ur.gallery.problem(
-        "indirect-room", resolution=resolution, texture_resolution=8, loss="RelativeL2", reference_spp=1024
-    )
-    paths = {"linear": straight(problem, steps), "decaying": geometric(problem, steps, HALF_LIFE)}
-    return {"paths": {name: measure(problem, path, runs) for name, path in paths.items()}}
+def run(
+    runs: int = 200,
+    steps: int = 40,
+    resolution: int = 24,
+    part: tuple[str, ...] = ("texels", "pixels"),
+    pixel_runs: int = 400,
+    pixel_steps: int = 100,
+    pixel_resolution: int = 12,
+) -> Iterator[dict[str, Any]]:
+    """Both paths, of texels' gradients and of pixels' derivatives.
+
+    Args:
+        part: measured; the other's figures stay
+        pixel_runs: of the pixels' derivatives, rendered at once
+        pixel_steps: of the pixels' derivatives
+        pixel_resolution: of the pixels' derivatives
+    """
+    if "texels" in part:
+        problem = ur.gallery.problem(
+            "indirect-room", resolution=resolution, texture_resolution=8, loss="RelativeL2", reference_spp=1024
+        )
+        paths = {"linear": straight(problem, steps), "decaying": geometric(problem, steps, HALF_LIFE)}
+        conditions = {"resolution": resolution, "steps": steps, "runs": runs}
+        yield {"sizes": conditions, "paths": {name: measure(problem, path, runs) for name, path in paths.items()}}
+    if "pixels" in part:
+        derivatives = pixels.Derivatives(pixel_resolution, pixel_runs)
+        found = {name: pixels.measure(derivatives, name, pixel_steps, HALF_LIFE) for name in ("linear", "decaying")}
+        sizes = {"resolution": pixel_resolution, "steps": pixel_steps, "runs": pixel_runs}
+        yield {"pixels": {**sizes, "paths": found}}

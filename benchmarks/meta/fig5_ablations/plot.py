@@ -17,12 +17,17 @@ COLOURS = {
 
 
 def plot(record: Record) -> Figure:
-    """Error over seconds, one panel per form."""
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.2), sharey=True, layout="constrained")
-    for axis, form in zip(axes, FORMS, strict=True):
-        for name, colour in COLOURS.items():
-            found = record["methods"][f"{form}, {name}"]
-            draw(axis, found, 0, colour, f"{name}, rate {found['rate']:g}: {found['final'][0]:.3f}")
-        axis.set(title=f"ajar, {form}", xlabel="seconds", ylabel="parameter error / initial", yscale="log")
-        axis.legend(fontsize=7)
+    """Rows: error over seconds of the race, over paths of the descents at length. A panel per form."""
+    parts = [("ajar", record["methods"], 0, "seconds")]
+    if "at length" in record:
+        parts.append(("indirect-room, at length", record["at length"]["methods"], 1, "paths"))
+    figure, axes = plt.subplots(len(parts), 2, figsize=(12, 4.2 * len(parts)), squeeze=False, layout="constrained")
+    for row, (title, methods, column, unit) in zip(axes, parts, strict=True):
+        for axis, form in zip(row, FORMS, strict=True):
+            for name, colour in COLOURS.items():
+                found = methods.get(f"{form}, {name}")
+                if found:
+                    draw(axis, found, column, colour, f"{name}, rate {found['rate']:g}: {found['final'][0]:.3f}")
+            axis.set(title=f"{title}, {form}", xlabel=unit, ylabel="parameter error / initial", yscale="log")
+            axis.legend(fontsize=7)
     return figure

@@ -21,6 +21,7 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     HessianProduct,
     LossFunction,
+    PastWeight,
     Smoothing,
     Variance,
 )
@@ -99,6 +100,8 @@ def as_numpy(estimate: Estimate) -> Estimate:
         match capability:
             case Variance(values):
                 return Variance(trees.numpy(values))
+            case PastWeight(values):
+                return PastWeight(trees.numpy(values))
             case FreshGradient(values):
                 return FreshGradient(trees.numpy(values))
             case Hessian(matrix):

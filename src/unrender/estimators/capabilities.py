@@ -20,6 +20,7 @@ __all__ = [
     "HessianNoise",
     "HessianProduct",
     "LossFunction",
+    "PastWeight",
     "Smoothing",
     "Variance",
 ]
@@ -52,6 +53,18 @@ class Variance(Capability):
     """
 
     name: ClassVar[str] = "variance"
+    values: Tree
+
+
+@dataclass(frozen=True)
+class PastWeight(Capability):
+    """The weight of earlier estimates in the gradient: its noise is correlated with the last step's by this factor.
+
+    Attributes:
+        values: {key: array}, of the gradient's keys and shapes, in [0, 1).
+    """
+
+    name: ClassVar[str] = "past_weight"
     values: Tree
 
 

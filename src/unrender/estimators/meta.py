@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Variance
+from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, draws_pixels, gather, prepared
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
@@ -185,8 +185,8 @@ class MetaEstimator:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient and its variance."""
-        return Capabilities(Gradient, Variance)
+        """A gradient, its variance, and the weight of earlier ones in it."""
+        return Capabilities(Gradient, Variance, PastWeight)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """See `Estimator.init`. Raises `InputError` for a parameter whose values share no paths, with `space="path"`."""
@@ -247,7 +247,7 @@ class MetaEstimator:
             **step.info,
         }
         loss = sum(arrays.number(value) for value in step.losses)
-        return Estimate(loss, gradient, (Variance(variance),), info, preconditioned=True), after
+        return Estimate(loss, gradient, (Variance(variance), PastWeight(alpha)), info, preconditioned=True), after
 
     def _space(self, problem: Problem, parameters: Tree) -> Space:
         if self.space != "auto":

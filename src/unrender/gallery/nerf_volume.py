@@ -1,4 +1,7 @@
-"""`nerf-volume`: a thing of surfaces, fitted by a volume that glows and absorbs. After Balint et al. 2023, Figs 7 and 8."""
+"""`nerf-volume`: a thing of surfaces, fitted by a volume that glows and absorbs. After Balint et al. 2023, Figs 7 and 8.
+
+The paper's Fig. 8 is of a sparser volume: `balls` has small balls far from each other.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +37,9 @@ class NerfVolume:
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
+    balls: int = fields.integer(
+        0, "small coloured balls all over the cube in place of the toy, whose volume is sparse; 0: the toy", 0, 512
+    )
 
     def scene(self) -> dict[str, Any]:
         """The volume, in the cube [-1, 1]³, as the descent starts with it."""
@@ -42,8 +48,10 @@ class NerfVolume:
         return self._stage() | {"volume": volumes.cube({"type": "emissive", "sigma_t": density, "emission": glow})}
 
     def target(self) -> dict[str, Any]:
-        """The toy in its place, in the sun."""
-        return self._stage() | _toy() | {"sun": staging.sun((0.5, 0.8, 0.4), 0.9)}
+        """The toy in its place, or the balls, in the sun."""
+        return (
+            self._stage() | (_balls(self.balls) if self.balls else _toy()) | {"sun": staging.sun((0.5, 0.8, 0.4), 0.9)}
+        )
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Both grids; extinction has the wider range, and the larger steps."""
@@ -76,3 +84,19 @@ def _toy() -> dict[str, Any]:
         "arm": {"type": "cube", "to_world": to.translate([-0.35, 0.05, 0.2]).rotate([0, 0, 1], 35).scale([0.3, 0.08, 0.08]),
                 "bsdf": parts.diffuse(*green)},
     }  # fmt: skip
+
+
+def _balls(count: int) -> dict[str, Any]:
+    """Balls that fill a hundredth of the cube, however many they are; the toy fills some thirteenth."""
+    random = np.random.default_rng(8)
+    centers, colours = random.uniform(-0.85, 0.85, (count, 3)), random.uniform(0.08, 0.8, (count, 3))
+    radius = float((0.01 * 8 / (count * np.pi * 4 / 3)) ** (1 / 3))
+    return {
+        f"ball_{n}": {
+            "type": "sphere",
+            "center": [float(x) for x in center],
+            "radius": radius,
+            "bsdf": parts.diffuse(*colour),
+        }
+        for n, (center, colour) in enumerate(zip(centers, colours.tolist(), strict=True))
+    }

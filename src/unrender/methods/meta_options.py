@@ -22,6 +22,11 @@ class MetaCommonOptions(Options):
         "meta-adam",
         description="what takes the steps; adam, which takes the gradients for independent, is for comparison",
     )
+    step_rule: Literal["deviation", "walk"] = Field(
+        "deviation",
+        description="of meta-adam: steps per deviation of the gradient, as in the paper; or such that noise moves a parameter as "
+        "far as adam does, with adam's learning rates",
+    )
     learning_rate: PositiveFloat = Field(0.002, description="step size of the parameters that have none of their own")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)
     space: Literal["auto", "path", "primary"] = Field(
@@ -42,8 +47,10 @@ class MetaCommonOptions(Options):
 
     def built_optimizer(self) -> Optimizer:
         """The optimizer with these options."""
-        kind = MetaAdam if self.optimizer == "meta-adam" else Adam
-        return kind(self.learning_rate, schedule=parse_schedule(self.schedule))
+        schedule = parse_schedule(self.schedule)
+        if self.optimizer == "adam":
+            return Adam(self.learning_rate, schedule=schedule)
+        return MetaAdam(self.learning_rate, schedule=schedule, rule=self.step_rule)
 
     def shared(self) -> dict[str, Any]:
         """The arguments that both forms of `MetaEstimator` take."""

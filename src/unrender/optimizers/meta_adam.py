@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from unrender.core import arrays, checks
+from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Variance
+from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
 from unrender.optimizers import rates
 from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
@@ -50,6 +52,13 @@ class MetaAdam:
     the mean square of a sample), and falls as soon as the gradient or the weight of the past becomes small. So learning rates are
     lower than Adam's, and the same rate serves the start and the end of a descent.
 
+    The noise of successive meta-estimates has one sign for as long as their memory lasts, so that the steps of an element in noise do not
+    average out: after n steps of a memory that does not forget it has moved by about 0.8 η n, where Adam's, of independent gradients, move
+    it by η √n: 14 times as far after 300 steps. `rule="walk"` multiplies each step by √((1 − α) / (1 + α)), the inverse root of that
+    correlation's time, so that noise moves the element by η √n, whatever the weight of the past α: learning rates are Adam's, and the
+    steps of a long memory fall as 1 / √n by themselves. What a gradient moves an element by, relative to what noise does, is about the
+    same by both rules, and Adam's: no factor of the step changes that.
+
     At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's.
 
     Args:
@@ -58,23 +67,27 @@ class MetaAdam:
             It is far below Adam's (whose ε is outside the root): a texel's gradient of a mean over pixels is small.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
         longest: the longest step of an element in units of η, > 0; None for no limit.
+        rule: "deviation", the paper's, or "walk", which requires the weight of the past.
     """
 
     learning_rate: float | Mapping[str, float] = 0.002
     epsilon: float = 1e-24
     schedule: Schedule | None = None
     longest: float | None = None
+    rule: Literal["deviation", "walk"] = "deviation"
 
     def __post_init__(self):
         rates.check("MetaAdam", self.learning_rate, self.schedule)
         checks.number("MetaAdam", "epsilon", self.epsilon, above=0.0)
         if self.longest is not None:
             checks.number("MetaAdam", "longest", self.longest, above=0.0)
+        if self.rule not in ("deviation", "walk"):
+            raise InputError(f"MetaAdam: rule must be one of deviation, walk, got {self.rule!r}")
 
     @property
     def requires(self) -> Capabilities:
-        """A gradient and its variance."""
-        return Capabilities(Gradient, Variance)
+        """A gradient and its variance; by the rule "walk" the weight of the past in it, too."""
+        return Capabilities(Gradient, Variance, *([PastWeight] if self.rule == "walk" else []))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> MetaAdamState:
         """See `Optimizer.init`."""
@@ -84,10 +97,13 @@ class MetaAdam:
         """See `Optimizer.update`. Lazy on Dr.Jit."""
         del parameters
         variance = estimate.require("MetaAdam", Variance).values
+        past = estimate.require("MetaAdam", PastWeight).values if self.rule == "walk" else {}
         factor = rates.factor("MetaAdam", self.schedule, state.step)
         steps: Tree = {}
         for key, gradient in estimate.gradient.items():
             rate = arrays.scalar(-state.learning_rates[key] * factor, gradient)
             step = gradient / arrays.sqrt(variance[key] + self.epsilon)
+            if past:
+                step = step * arrays.sqrt((1.0 - past[key]) / (1.0 + past[key]))
             steps[key] = rate * (step if self.longest is None else arrays.clip(step, -self.longest, self.longest))
         return steps, replace(state, step=state.step + 1)

@@ -1,0 +1,195 @@
+"""Meta-estimation at length (Meta Figs 1, 6 and 9): thousands of steps with falling rates, on `spiral`, `chalice` and `ajar`.
+
+Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
+says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
+steps of a run, for Adam and MetaAdam alike, and are the better of two on runs of a tenth of the time, on a seed of their own. β_F is
+0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per
+pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule
+"walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE
+relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+import unrender as ur
+from benchmarks.internals import Estimator, Optimizer
+from benchmarks.races import TUNING_SEED, median_and_range, reached, total_error
+from unrender.schedules import Cosine
+
+OPTIONS: dict[str, dict[str, Any]] = {"spiral": {}, "chalice": {"texture_resolution": 32}, "ajar": {}}
+BETA = 0.999
+FLOOR = 0.02
+POINTS = 60
+"""Measurements along a run."""
+TRIAL = 8
+"""Steps that tell the cost of one."""
+TUNING_SHARE = 0.1
+PAPER = "meta, 1 + 2"
+MERGE = ("entries.*.methods",)
+QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
+
+Points = list[tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A method; `optimizer` makes its optimizer from a learning rate and a schedule."""
+
+    group: str
+    estimator: Estimator
+    optimizer: Callable[..., Optimizer]
+    rates: tuple[float, ...]
+
+
+RATES: dict[str, dict[str, tuple[float, float]]] = {
+    "spiral": {
+        "meta, 1 + 2": (0.0003, 0.001), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.03, 0.06),
+        "coupled on rcv": (0.001, 0.003), "meta, 4 + 16": (0.001, 0.003), "meta, 1 + 2, walk": (0.005, 0.02),
+        "coupled": (0.0005, 0.0015), "meta, 12 + 4": (0.0005, 0.0015),
+    },
+    "chalice": {
+        "meta, 1 + 2": (0.0005, 0.0015), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.02, 0.06),
+        "coupled on rcv": (0.001, 0.003), "meta, 4 + 16": (0.001, 0.003), "meta, 1 + 2, walk": (0.005, 0.02),
+        "coupled": (0.0005, 0.0015), "meta, 12 + 4": (0.0005, 0.0015),
+    },
+    "ajar": {
+        "meta, 1 + 2": (0.0001, 0.0005), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.02, 0.06),
+        "coupled on rcv": (0.0005, 0.0015), "meta, 4 + 16": (0.0003, 0.001), "meta, 1 + 2, walk": (0.002, 0.008),
+        "coupled": (0.0003, 0.001), "meta, 12 + 4": (0.0003, 0.001),
+    },
+}  # fmt: skip
+"""Of each method, in the order of the race."""
+
+
+def entrants(problem: str) -> dict[str, Entrant]:
+    """Who races."""
+    adam, meta, control = ur.optimizers.Adam, ur.optimizers.MetaAdam, ur.images.RecursiveControlVariate()
+    walk = functools.partial(meta, rule="walk")
+    made: dict[str, tuple[str, Estimator, Callable[..., Optimizer]]] = {
+        "meta, 1 + 2": ("meta", ur.MetaEstimator(2, 1, beta_proportional=BETA), meta),
+        "meta, 12 + 4": ("meta", ur.MetaEstimator(4, 12, beta_proportional=BETA), meta),
+        "meta, 4 + 16": ("meta", ur.MetaEstimator(16, 4, beta_proportional=BETA), meta),
+        "meta, 1 + 2, walk": ("meta", ur.MetaEstimator(2, 1, beta_proportional=BETA), walk),
+        "Adam, 16 spp": ("Adam", ur.PathGradient(spp=16), adam),
+        "Adam, 64 spp": ("Adam", ur.PathGradient(spp=64), adam),
+        "coupled": ("coupled", ur.MetaEstimator(coupled=True, spp=3, beta_proportional=BETA), meta),
+        "coupled on rcv": (
+            "coupled", ur.MetaEstimator(coupled=True, spp=3, image=control, beta_proportional=BETA), meta
+        ),
+    }  # fmt: skip
+    return {name: Entrant(*made[name], rates) for name, rates in RATES[problem].items()}
+
+
+class Recorder(ur.Callback):
+    """Keeps (processor seconds, samples, error) at some steps of a run and at its last."""
+
+    def __init__(self, problem: ur.Problem, steps: int):
+        self.problem, self.steps, self.every = problem, steps, max(1, steps // POINTS)
+        self.start = problem.parameter_error(problem.initial())
+        self.points: Points = []
+        self.begun = self.spent = 0.0
+
+    def on_start(self, run: Any) -> None:
+        """See `Callback.on_start`."""
+        del run
+        self.begun = time.process_time()
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        if run.step % self.every and run.step != self.steps:
+            return
+        now = time.process_time()
+        self.spent += now - self.begun
+        error = total_error(self.problem.parameter_error(run.parameters), self.start)
+        self.points.append((round(self.spent, 3), float(record["samples"]), error))
+        self.begun = time.process_time()
+
+
+def descend(problem: ur.Problem, entrant: Entrant, rate: float, seed: int, steps: int) -> Points:
+    """One run with a falling rate."""
+    recorder = Recorder(problem, steps)
+    optimizer = entrant.optimizer(rate, schedule=Cosine(steps, FLOOR))
+    ur.optimize(problem, entrant.estimator, optimizer, steps=steps, seed=seed, callbacks=[recorder])
+    return recorder.points
+
+
+def cost(problem: ur.Problem, entrant: Entrant) -> float:
+    """Processor seconds of a step."""
+    recorder = Recorder(problem, TRIAL)  # the first steps compile
+    optimizer = entrant.optimizer(entrant.rates[0])
+    ur.optimize(problem, entrant.estimator, optimizer, steps=TRIAL, seed=TUNING_SEED, callbacks=[recorder])
+    halfway = TRIAL // 2
+    return (recorder.points[-1][0] - recorder.points[halfway - 1][0]) / (TRIAL - halfway)
+
+
+def measure(problem: ur.Problem, entrant: Entrant, name: str, steps: int, seeds: int) -> dict[str, Any]:
+    """One method, tuned, over seeds 0, 1, ..."""
+    short = max(2, round(steps * TUNING_SHARE))
+
+    def error(rate: float) -> float:
+        found = descend(problem, entrant, rate, TUNING_SEED, short)[-1][2]
+        print(f"{problem.name} {name} rate {rate:g}, {short} steps: {found:.4f}", flush=True)
+        return found
+
+    tried = {rate: error(rate) for rate in entrant.rates}
+    rate = min(tried, key=tried.__getitem__)
+    runs = [descend(problem, entrant, rate, seed, steps) for seed in range(seeds)]
+    final = median_and_range([run[-1][2] for run in runs])
+    print(f"{problem.name} {name} rate {rate:g}, {steps} steps, {runs[0][-1][0]:.0f} s: {final[0]:.4f}", flush=True)
+    return {
+        "group": entrant.group, "rate": rate, "tried": list(tried.items()), "steps": steps, "tuning_steps": short,
+        "runs": runs, "final": final,
+    }  # fmt: skip
+
+
+def ratios(found: dict[str, Any]) -> dict[str, Any]:
+    """When a form of meta-estimation reaches what Adam ends with, in time and samples, and the ratio of final errors."""
+    rows: dict[str, Any] = {}
+    for theirs in (name for name in found if found[name]["group"] == "Adam"):
+        target = found[theirs]["final"][0]
+        for ours in (name for name in found if found[name]["group"] != "Adam"):
+            row: dict[str, Any] = {"error_ratio": found[ours]["final"][0] / target}
+            for column, unit in ((0, "seconds"), (1, "samples")):
+                mine, its = reached(found[ours]["runs"], target, column), reached(found[theirs]["runs"], target, column)
+                row[f"{unit}_ratio"] = its / mine if mine and its else None
+            rows[f"{ours} / {theirs}"] = row
+    return rows
+
+
+def summarize(record: dict[str, Any]) -> dict[str, Any]:
+    """Each problem's ratios."""
+    return {"entries": {n: {**entry, "summary": ratios(entry["methods"])} for n, entry in record["entries"].items()}}
+
+
+def run(
+    problem: tuple[str, ...] = tuple(OPTIONS),
+    steps: int = 3000,
+    seeds: int = 1,
+    resolution: int = 64,
+    only: tuple[str, ...] = (),
+) -> Iterator[dict[str, Any]]:
+    """A part per problem and method.
+
+    Args:
+        steps: of the paper's form at 1 + 2 samples; the others have as much processor time
+        resolution: film size
+        only: methods to run; the others' figures stay
+    """
+    dr.set_thread_count(1)
+    for name in problem:
+        options = {"resolution": resolution, **OPTIONS[name]}
+        made, racing = ur.gallery.problem(name, **options), entrants(name)
+        seconds = steps * cost(made, racing[PAPER])
+        for method in (m for m in racing if not only or m in only):
+            own = steps if method == PAPER else max(2, round(seconds / cost(made, racing[method])))
+            found = measure(made, racing[method], method, own, seeds)
+            entry = {"options": options, "steps": steps, "seeds": seeds, "methods": {method: found}}
+            yield {"entries": {name: entry}}
