@@ -23,7 +23,9 @@ SIZE = 1 << 20
 def test_gradients_are_summed_in_double_precision(count: int, large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "LARGE", 100 if large else 1000)
     random = np.random.default_rng(count)
-    parts = [(random.normal(size=(20, 10, 3)) * 10.0 ** random.integers(-6, 6)).astype(np.float32) for _ in range(count)]
+    parts = [
+        (random.normal(size=(20, 10, 3)) * 10.0 ** random.integers(-6, 6)).astype(np.float32) for _ in range(count)
+    ]
     total = GradientSum()
     for part in parts:
         total.add({"x": kernels.on_device(part), "colour": kernels.on_device(part[0, 0])})

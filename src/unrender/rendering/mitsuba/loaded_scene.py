@@ -169,7 +169,11 @@ class LoadedScene:
         """Keep the large arrays that another load of the description has as its own values in place of equal ones."""
         for key, value in self._own.items():
             known = other._own.get(key)
-            if not memory.is_large(value) or type(known) is not type(value) or native_shape(known) != native_shape(value):
+            if (
+                not memory.is_large(value)
+                or type(known) is not type(value)
+                or native_shape(known) != native_shape(value)
+            ):
                 continue
             if dr.all(arrays.flat(known) == arrays.flat(value), axis=None):
                 self._own[key] = known
