@@ -39,6 +39,7 @@ PAIRS: dict[str, tuple[Any, Any]] = {
     "plain": (ur.PathGradient(spp=2), ur.optimizers.Adam(0.02)),
     "rcv": (ur.PathGradient(image=rcv(), spp=2), ur.optimizers.Adam(0.02)),
     "meta": (ur.MetaEstimator(), ur.optimizers.MetaAdam(0.002)),
+    "centred": (ur.MetaEstimator(centred=True), ur.optimizers.MetaAdam(0.002)),
     "coupled": (ur.MetaEstimator(coupled=True, image=rcv()), ur.optimizers.MetaAdam(0.002)),
     "adaptive": (
         ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=4, uniform=0.2, denoiser="none"), spp=2),
@@ -229,6 +230,9 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
             values = [a, b]
             for word in part.split("."):
                 values = [getattr(value, word) for value in values]
+            if part.endswith("mean") and name != "centred":
+                assert values == [0.0, 0.0]  # nobody asks for means
+                continue
             np.testing.assert_allclose(
                 values[0], factor * by_hand(values[1], power), rtol=1e-9, atol=1e-25, err_msg=part
             )

@@ -194,9 +194,9 @@ def test_other_responses_are_one_line(given: str) -> None:
 def test_a_fitted_response_is_an_unknown_and_not_beside_exposures() -> None:
     options = ur.ImportOptions(response="fit", unknowns=("light", "colour"))
     assert options.unknowns == ("colour", "light", "response")
-    names = unknowns.stages(options.unknowns, Path("problem.toml")).stages[0].unknowns
+    names = unknowns.stages(options.chosen(()), Path("problem.toml")).stages[0].unknowns
     assert RESPONSE in names
-    assert RESPONSE in [table["key"] for table in unknowns.parameters(options.unknowns, 1.0)]
+    assert RESPONSE in [table["key"] for table in unknowns.parameters(options.chosen(()), 1.0)]
     with pytest.raises(InputError, match="undetermined up to a power"):
         ur.ImportOptions(response="fit", unknowns=("colour", "exposure"))
 
