@@ -78,6 +78,9 @@ def below(memory: ViewMemory, unit: np.ndarray, relative: np.ndarray) -> float:
 def test_the_variance_is_the_greater_of_two_recurrences() -> None:
     memory, unit = along(0.05)
     assert below(memory, unit, np.asarray(memory.relative_variance)) == 0
+    assert np.mean(memory.relative_variance * unit > 1.001 * np.asarray(memory.variance)) > 0.1, (
+        "the relative one decides nowhere"
+    )
     # Relative to a variance that has been learnt to be a third of what it was: the absolute recurrence does not follow.
     assert below(memory, unit, np.asarray(memory.relative_variance) / 3) > 0.9
 

@@ -26,3 +26,5 @@ def test_pixels_that_masks_leave_out_do_not_count() -> None:
     assert image_error(result, masks=[mask, None]) != "0.5 with noise"
     assert image_error(result) == image_error(result, masks=[None, None]) != "0.5 with noise"
     assert image_error(result, masks=[0 * mask, mask]).endswith("with noise")
+    result.problem["views"] = 4  # of large problems some views alone have final pictures
+    assert image_error(result, masks=[mask] * 4) == "0.5 with noise"

@@ -6,9 +6,9 @@ start. Adam, its learning rate of the emission tuned per entrant on a seed of it
 20 times it. After the last doubling rates fall along half a cosine.
 
 The volume has no truth, so errors are of pictures, root mean square over a few of the views that the descent sees and over 4 between them
-that it does not, relative to the start's, free of rendering noise: products of two independent renders' differences. Seconds are of the
-processor, maps included. Equal time: when an entrant first reaches the worse of its own and uniform mini-batches' last error, over when
-these do.
+that it does not, relative to the start's: products of two independent renders' differences, free of the renders' noise, not of that of the
+references. Seconds are of the processor, maps included. Equal time: when an entrant first reaches the worse of its own and uniform
+mini-batches' last error, over when these do.
 """
 
 from __future__ import annotations

@@ -88,11 +88,12 @@ def execute(
 
 
 def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:
-    """The mean over views of the root mean square error against the reference, in words: its noise taken out where it is known.
+    """The mean over views with pictures of the root mean square error against the reference, in words: its noise taken out where it is
+    known.
 
     `masks`: of the views, (H, W), by how much each pixel counts where the noise is not known; None for all pixels of all views.
     """
-    views = range(int(result.problem["views"]))
+    views = [view for view in range(int(result.problem["views"])) if image_name(view, which) in result.pictures]
     known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
     if len(known) == len(views):
         return formatting.with_error(*debiased.mean(known))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, skies, textures, two_planets
+from unrender.gallery import fields, meshes, parts, textures, two_planets
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
@@ -23,8 +23,6 @@ _GLOBE, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the globe and of the two sides of the glass."""
 _EYE, _MIRROR = np.array([1.4, 0.8, 6.0]), np.array([-2.1, 0.1, -1.5])
 """Where the camera and the middle of the mirror are."""
-_SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
-"""Direction to the sun."""
 
 
 @register(name="globe-and-mirror", position=32)
@@ -52,7 +50,7 @@ class GlobeAndMirror:
         return {
             "type": "scene",
             "camera": parts.camera(_EYE, (-0.7, 0.0, -0.2), 34.0, self.resolution),
-            "sky": skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), two_planets.DUSK)),
+            "sky": two_planets.sky(),
             "globe": meshes.sheet("globe", globe, paint, closed=True),
             "glass": two_planets.shell(_OUTER, 1.5, 1.0),
             "hollow": two_planets.shell(_INNER, 1.0, 1.5),

@@ -89,8 +89,9 @@ def _toy() -> dict[str, Any]:
 def _balls(count: int) -> dict[str, Any]:
     """Balls that fill a hundredth of the cube, however many they are; the toy fills some thirteenth."""
     random = np.random.default_rng(8)
-    centers, colours = random.uniform(-0.85, 0.85, (count, 3)), random.uniform(0.08, 0.8, (count, 3))
     radius = float((0.01 * 8 / (count * np.pi * 4 / 3)) ** (1 / 3))
+    reach = min(0.85, 0.98 - radius)
+    centers, colours = random.uniform(-reach, reach, (count, 3)), random.uniform(0.08, 0.8, (count, 3))
     return {
         f"ball_{n}": {
             "type": "sphere",

@@ -17,7 +17,7 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.problem.parameter import Parameter
 
-__all__ = ["DUSK", "TwoPlanets", "blue", "red", "shell"]
+__all__ = ["TwoPlanets", "blue", "red", "shell", "sky"]
 
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the planets and of the two sides of the glass."""
@@ -25,7 +25,7 @@ _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 _APART = 1.05
 """Distance of each planet from the middle."""
 
-DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
+_DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
 """Of zenith, horizon and nadir."""
 
 _SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
@@ -59,7 +59,7 @@ class TwoPlanets:
                 )
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
-            "sky": skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), DUSK)),
+            "sky": sky(),
             "free": _ball("free", -_APART, blue(self.texture_resolution)),
             "enclosed": _ball("enclosed", _APART, red(self.texture_resolution)),
             "glass": shell(_OUTER, 1.5, 1.0, _APART),
@@ -78,6 +78,11 @@ class TwoPlanets:
 def _ball(name: str, x: float, texture: np.ndarray) -> Any:
     points = meshes.ellipsoid(_PLANET * np.eye(3), np.array([x, 0.0, 0.0]), 48, 96)
     return meshes.sheet(name, points, {"type": "diffuse", "reflectance": textures.bitmap(texture)}, closed=True)
+
+
+def sky() -> dict[str, Any]:
+    """A dusk with a large sun."""
+    return skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK))
 
 
 def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[str, Any]:

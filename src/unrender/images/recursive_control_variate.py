@@ -307,9 +307,10 @@ class RecursiveControlVariate:
             arrays.where(begun, memory.variance, past * var_previous),
         )
         moved = ((cov != var_previous) | (cov != var_current)) & (var_previous > 0)
+        variance = relative * var_current
+        variance = arrays.where(moved, arrays.maximum(variance, absolute), variance)
         of_absolute = absolute / arrays.where(moved, var_previous, 1.0)
         relative = arrays.where(moved, arrays.maximum(relative, of_absolute), relative)
-        variance = relative * var_current
         info = {"control_weight": weight, "variance": variance}
         previous = advance(image, asked.previous, rendering.previous, of_each)
         if (within := variance_of_mean(rendering.images, counts)) is not None:

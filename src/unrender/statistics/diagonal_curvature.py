@@ -39,7 +39,8 @@ def corrected(diagonal: np.ndarray, rows: np.ndarray, values: np.ndarray, rate: 
 
 
 def positive(diagonal: np.ndarray) -> np.ndarray:
-    """The diagonal (n,) with no element below `LEAST` times their mean magnitude: a positive definite matrix to divide by.
+    """The diagonal (n,) with no element below `LEAST` times their mean magnitude: a positive definite matrix to divide by,
+    unless all of them are 0.
 
     Elements that noise or one step's renders made small or negative would make the longest steps.
     """
