@@ -21,7 +21,7 @@ import drjit as dr
 
 import unrender as ur
 from benchmarks.internals import Estimator, Optimizer
-from benchmarks.races import TUNING_SEED, median_and_range, reached, total_error
+from benchmarks.races import TUNING_SEED, median_and_range, total_error
 from unrender.schedules import Cosine
 
 OPTIONS: dict[str, dict[str, Any]] = {"spiral": {}, "chalice": {"texture_resolution": 32}, "ajar": {}}
@@ -150,18 +150,11 @@ def measure(problem: ur.Problem, entrant: Entrant, name: str, steps: int, seeds:
     }  # fmt: skip
 
 
-def ratios(found: dict[str, Any]) -> dict[str, Any]:
-    """When a form of meta-estimation reaches what Adam ends with, in time and samples, and the ratio of final errors."""
-    rows: dict[str, Any] = {}
-    for theirs in (name for name in found if found[name]["group"] == "Adam"):
-        target = found[theirs]["final"][0]
-        for ours in (name for name in found if found[name]["group"] != "Adam"):
-            row: dict[str, Any] = {"error_ratio": found[ours]["final"][0] / target}
-            for column, unit in ((0, "seconds"), (1, "samples")):
-                mine, its = reached(found[ours]["runs"], target, column), reached(found[theirs]["runs"], target, column)
-                row[f"{unit}_ratio"] = its / mine if mine and its else None
-            rows[f"{ours} / {theirs}"] = row
-    return rows
+def ratios(found: dict[str, Any]) -> dict[str, float]:
+    """Final errors of each form of meta-estimation over Adam's."""
+    of_adam = [name for name in found if found[name]["group"] == "Adam"]
+    ours = [name for name in found if name not in of_adam]
+    return {f"{own} / {other}": found[own]["final"][0] / found[other]["final"][0] for other in of_adam for own in ours}
 
 
 def summarize(record: dict[str, Any]) -> dict[str, Any]:

@@ -23,9 +23,6 @@ def table(record: Record) -> str:
             ),
             "Final error over that of the other:",
         ]
-        reach = []
-        for pair, f in entry["summary"].items():
-            ours, theirs = pair.split(" / ")
-            reach.append([ours, theirs, f"{f['error_ratio']:.2f}"])
-        blocks.append(markdown.table(["method", "other", "error ratio"], reach))
+        over = [[*pair.split(" / "), f"{ratio:.2f}"] for pair, ratio in entry["summary"].items()]
+        blocks.append(markdown.table(["method", "other", "error ratio"], over))
     return "\n\n".join(blocks)
