@@ -144,10 +144,11 @@ def import_(
 def _tell_next(console: Console, place: Path) -> None:
     from unrender.capture import importing
 
+    staged = (place / importing.STAGES).is_file()
     names = (
         (importing.SHEET, "to look at", ""),
-        (importing.PROBLEM, "next", "60"),
-        (importing.STAGES, "in stages", "300"),
+        (importing.STAGES, "next", "60"),
+        (importing.PROBLEM, "all at once" if staged else "next", "60"),
     )
     for file, what, seconds in names:
         if (path := place / file).is_file():
