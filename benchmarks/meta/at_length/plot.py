@@ -1,9 +1,8 @@
 """Figure."""
 
-import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from benchmarks.race_plots import draw
+from benchmarks.race_plots import over_time_and_paths
 from benchmarks.runner.records import Record
 
 COLOURS = {
@@ -20,16 +19,6 @@ COLOURS = {
 
 def plot(record: Record) -> Figure:
     """Per problem: error over processor seconds and over samples."""
-    entries = record["entries"]
-    figure, axes = plt.subplots(len(entries), 2, figsize=(12, 4.2 * len(entries)), squeeze=False, layout="constrained")
-    for row, (name, entry) in zip(axes, entries.items(), strict=True):
-        for column, (axis, unit) in enumerate(zip(row, ("processor seconds", "paths"), strict=True)):
-            for method, found in entry["methods"].items():
-                label = f"{method}, rate {found['rate']:g}: {found['final'][0]:.3f}"
-                draw(axis, found, column, COLOURS.get(method, "#555555"), label)
-            axis.set(title=name, xlabel=unit, ylabel="parameter error / initial", yscale="log")
-            if column:
-                axis.set_xscale("log")
-            else:
-                axis.legend(fontsize=6)
-    return figure
+    return over_time_and_paths(
+        record["entries"], "processor seconds", lambda methods: {name: (COLOURS[name], "-") for name in methods}
+    )

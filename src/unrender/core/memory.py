@@ -22,7 +22,6 @@ __all__ = [
     "every",
     "inner_products",
     "is_large",
-    "release_cache",
     "small_parts",
     "square",
     "trim_cache",
@@ -34,16 +33,14 @@ LARGE = 1 << 20
 _PARTS = 16
 
 
-def release_cache() -> None:
-    """Give the system back what Dr.Jit keeps for arrays to come. Waits for the device; arrays after that take a little longer to make."""
-    dr.flush_malloc_cache()
-
-
 def trim_cache(*parts: Any) -> None:
-    """`release_cache` where there are large arrays in a nested structure, on a CPU: there memory is handed out by powers of two, and as
-    much of a piece as any array has ever used stays in the process. (To release memory stalls a GPU.)"""
+    """Give the system back what Dr.Jit keeps for arrays to come, where there are large ones in a nested structure, on a CPU.
+
+    There memory is handed out by powers of two, and as much of a piece as any array has ever used stays in the process. It waits for the
+    device, which would stall a GPU, and arrays after that take a little longer to make.
+    """
     if any(is_large(array) and dr.backend_v(array) == dr.JitBackend.LLVM for array in _arrays(parts)):
-        release_cache()
+        dr.flush_malloc_cache()
 
 
 def is_large(x: Array) -> bool:
@@ -59,9 +56,11 @@ def evaluate_in_turn(*parts: Any) -> None:
     arrays.evaluate(small_parts(*parts))
     large = [array for array in _arrays(parts) if is_large(array)]
     while large:
-        arrays.evaluate(large.pop(0))
-        # On a CPU memory is free once the kernel that reads it has ended.
-        dr.sync_thread()
+        array = large.pop(0)
+        arrays.evaluate(array)
+        if dr.backend_v(array) == dr.JitBackend.LLVM:
+            # There memory is free once the kernel that reads it has ended; on a GPU to wait would stall it.
+            dr.sync_thread()
 
 
 def small_parts(*parts: Any) -> list[Array]:

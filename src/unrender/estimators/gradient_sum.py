@@ -66,7 +66,4 @@ def _add(total: Array, x: Array) -> None:
     """In place."""
     index = dr.arange(dr.uint32_array_t(dr.array_t(x)), dr.width(total))
     dr.scatter_add(total, _wide(x), index, mode=dr.ReduceMode.NoConflicts)
-    arrays.evaluate(total)
-    if dr.backend_v(total) == dr.JitBackend.LLVM:
-        # There memory is free once the kernel that reads it has ended; on a GPU to wait would stall it.
-        dr.sync_thread()
+    memory.evaluate_in_turn(total)

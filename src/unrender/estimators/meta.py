@@ -81,7 +81,7 @@ class MetaState:
 
 def _distance(a: Tree, b: Tree) -> float:
     """The Euclidean distance of two trees."""
-    return math.sqrt(sum(arrays.number(arrays.total((a[key] - b[key]) * (a[key] - b[key]))) for key in a))
+    return math.sqrt(sum(arrays.number(memory.square(a[key] - b[key])) for key in a))
 
 
 @register

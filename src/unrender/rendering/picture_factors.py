@@ -1,4 +1,4 @@
-"""Renderers with one parameter more than the scene's: any such, and those whose parameter multiplies the pictures."""
+"""Renderers with one parameter more than the scene's: any such, those where it acts on each pixel, those where it multiplies."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from unrender.rendering.renderer import (
     with_differential_bsdf,
 )
 
-__all__ = ["FactorPaths", "FactorSession", "PictureFactors", "WithParameter"]
+__all__ = ["FactorSession", "PictureFactors", "PicturePaths", "PictureRenderer", "PictureSession", "WithParameter"]
 
 
 class WithParameter:
@@ -77,7 +77,130 @@ class WithParameter:
         return found
 
 
-class PictureFactors(WithParameter):
+class PictureRenderer(WithParameter):
+    """A renderer whose parameter acts on each pixel of the pictures by itself."""
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        """See `Renderer.prepare`."""
+        own = [key for key in keys if key != self.key]
+        inner = self.inner.prepare(own, space, differentiated(own, derivatives))
+        return inner if len(own) == len(keys) else self.session(inner)
+
+    def session(self, inner: RenderSession) -> RenderSession:
+        """Of both the parameter and those of a session."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class PicturePaths:
+    """What `adjoint` needs to walk the paths of a rendering again.
+
+    Attributes:
+        inner: of the inner renderer.
+        images, previous: of the inner renderer, as in `Rendering`.
+        places: what the parameter's effect on the pixels depends on beside images and parameter; None for nothing.
+    """
+
+    inner: object
+    images: Array
+    previous: Array | None = None
+    places: Any = None
+
+
+_Renderer = TypeVar("_Renderer", bound=PictureRenderer)
+
+
+class PictureSession(Generic[_Renderer]):
+    """Images and derivatives with respect to what acts on each pixel and to the parameters of a session. See `RenderSession`."""
+
+    def __init__(self, renderer: _Renderer, inner: RenderSession):
+        self._renderer, self._inner = renderer, inner
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `RenderSession.image`."""
+        found = self._inner.image(self._scene(parameters), request)
+        places = self._places(request)
+        images = self._shown(parameters, places, found.images)
+        return Rendering(images, None, PicturePaths(found.paths, found.images, None, places))
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `RenderSession.image_pair`."""
+        found = self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
+        if found.previous is None:
+            raise InputError(f"{self._renderer.key}: the renderer returned one image of the two")
+        places = self._places(request)
+        images = self._shown(current, places, found.images)
+        before = self._shown(previous, places, found.previous)
+        return Rendering(images, before, PicturePaths(found.paths, found.images, found.previous, places))
+
+    def adjoint(self, parameters: Tree, paths: PicturePaths, weights: Array) -> Tree:
+        """See `RenderSession.adjoint`."""
+        weighted, own = self._pulled_back(parameters, paths.places, paths.images, weights)
+        scene = self._scene(parameters)
+        found = self._inner.adjoint(scene, paths.inner, weighted) if scene else {}
+        return self._ordered(parameters, found, own)
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: PicturePaths, weights: Array, weights_previous: Array
+    ) -> tuple[Tree, Tree]:
+        """See `RenderSession.adjoint_pair`."""
+        now, own = self._pulled_back(current, paths.places, paths.images, weights)
+        before, own_before = self._pulled_back(previous, paths.places, paths.previous, weights_previous)
+        states = self._scene(current), self._scene(previous)
+        found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
+        return self._ordered(current, found[0], own), self._ordered(previous, found[1], own_before)
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `CountingSession.vertices`: ones where the inner session does not count."""
+        return counted_vertices(self._inner, self._scene(parameters), request)
+
+    def emitters(self) -> np.ndarray:
+        """See `EmitterSession.emitters`."""
+        return drawing_emitters(self._inner).emitters()
+
+    def emitter_moments(
+        self, parameters: Tree, paths: PicturePaths, tangents: Tree, weights: Array, noise: Array
+    ) -> EmitterMoments:
+        """See `EmitterSession.emitter_moments`, for the derivatives by the scene's parameters alone."""
+        inner, scene = drawing_emitters(self._inner), self._scene(parameters)
+        if not scene:
+            zeros = inner.emitters() * 0.0
+            return EmitterMoments(zeros, zeros)
+        slopes = self._slopes(parameters, paths.places, paths.images, weights)
+        return inner.emitter_moments(scene, paths.inner, self._scene(tangents), weights * slopes, noise * slopes)
+
+    def _places(self, request: SampleRequest) -> Any:
+        """See `PicturePaths.places`."""
+        del request
+
+    def _shown(self, parameters: Tree, places: Any, images: Array) -> Array:
+        """What the parameter makes of images."""
+        raise NotImplementedError
+
+    def _slopes(self, parameters: Tree, places: Any, images: Array, weights: Array) -> Array:
+        """The derivatives of what is shown by images, to multiply weights such as these."""
+        raise NotImplementedError
+
+    def _pulled_back(self, parameters: Tree, places: Any, images: Any, weights: Array) -> tuple[Array, Array]:
+        """The weights of the images, and the derivative by the parameter, of weights of what is shown."""
+        raise NotImplementedError
+
+    def _inner_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        """The images of the inner session's `image_batch`; one for all where it has no parameters."""
+        if scene := self._scene(parameters):
+            return self._inner.image_batch(scene, request)
+        return self._inner.image({}, replace(request, groups=1)).images
+
+    def _scene(self, parameters: Tree) -> Tree:
+        return {key: value for key, value in parameters.items() if key != self._renderer.key}
+
+    def _ordered(self, parameters: Tree, found: Tree, own: Array) -> Tree:
+        return {name: own if name == self._renderer.key else found[name] for name in parameters}
+
+
+class PictureFactors(PictureRenderer):
     """A renderer whose pictures are multiplied, pixel by pixel, by a function of its parameter.
 
     Images, pairs and batches are unbiased, adjoints the exact derivative of the images that are returned. `tangent_moment` leaves out the
@@ -85,13 +208,9 @@ class PictureFactors(WithParameter):
     each: exact for one sample.
     """
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
-        """See `Renderer.prepare`."""
-        own = [key for key in keys if key != self.key]
-        session = self.inner.prepare(own, space, differentiated(own, derivatives))
-        return session if len(own) == len(keys) else FactorSession(self, session)
+    def session(self, inner: RenderSession) -> RenderSession:
+        """See `PictureRenderer.session`."""
+        return FactorSession(self, inner)
 
     def places(self, request: SampleRequest) -> Array:
         """What the factors of the pixels of a rendering depend on, beside the parameter."""
@@ -114,76 +233,16 @@ class PictureFactors(WithParameter):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class FactorPaths:
-    """What `adjoint` needs to walk the paths of a rendering again.
-
-    Attributes:
-        inner: of the inner renderer.
-        places: of the pixels, see `PictureFactors.places`.
-        images, previous: before the factors, as in `Rendering`.
-    """
-
-    inner: object
-    places: Array
-    images: Array
-    previous: Array | None = None
-
-
-class FactorSession:
+class FactorSession(PictureSession[PictureFactors]):
     """Images and derivatives with respect to what multiplies them and to the parameters of a session. See `RenderSession`."""
-
-    def __init__(self, renderer: PictureFactors, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
-
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(self._scene(parameters), request)
-        places = self._renderer.places(request)
-        images = found.images * self._factors(parameters, places, found.images)
-        return Rendering(images, None, FactorPaths(found.paths, places, found.images))
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `RenderSession.image_batch`."""
         renderer = self._renderer
         factors = renderer.factors_of_batch(np.asarray(parameters[renderer.key]), request.sensor)
-        if scene := self._scene(parameters):
-            images = self._inner.image_batch(scene, request)
-        else:
-            images = self._inner.image({}, replace(request, groups=1)).images
-        return images * renderer.array(factors)
+        return self._inner_batch(parameters, request) * renderer.array(factors)
 
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
-        if found.previous is None:
-            raise InputError(f"{self._renderer.key}: the renderer returned one image of the two")
-        places = self._renderer.places(request)
-        images = found.images * self._factors(current, places, found.images)
-        before = found.previous * self._factors(previous, places, found.previous)
-        return Rendering(images, before, FactorPaths(found.paths, places, found.images, found.previous))
-
-    def adjoint(self, parameters: Tree, paths: FactorPaths, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        weighted = weights * self._factors(parameters, paths.places, weights)
-        scene = self._scene(parameters)
-        found = self._inner.adjoint(scene, paths.inner, weighted) if scene else {}
-        return self._ordered(parameters, found, paths.places, weighted * paths.images)
-
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: FactorPaths, weights: Array, weights_previous: Array
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        now = weights * self._factors(current, paths.places, weights)
-        before = weights_previous * self._factors(previous, paths.places, weights_previous)
-        states = self._scene(current), self._scene(previous)
-        found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
-        return (
-            self._ordered(current, found[0], paths.places, now * paths.images),
-            self._ordered(previous, found[1], paths.places, before * paths.previous),
-        )
-
-    def tangent_moment(self, parameters: Tree, paths: FactorPaths, tangents: Tree) -> Array:
+    def tangent_moment(self, parameters: Tree, paths: PicturePaths, tangents: Tree) -> Array:
         """See `RenderSession.tangent_moment`, and `PictureFactors` for what is left out."""
         renderer = self._renderer
         images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
@@ -194,32 +253,20 @@ class FactorSession:
         factors = self._factors(parameters, paths.places, images)
         return moment * (factors * factors)
 
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        return counted_vertices(self._inner, self._scene(parameters), request)
+    def _places(self, request: SampleRequest) -> Array:
+        return self._renderer.places(request)
 
-    def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
-        return drawing_emitters(self._inner).emitters()
+    def _shown(self, parameters: Tree, places: Array, images: Array) -> Array:
+        return images * self._factors(parameters, places, images)
 
-    def emitter_moments(
-        self, parameters: Tree, paths: FactorPaths, tangents: Tree, weights: Array, noise: Array
-    ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`, for the derivatives by the scene's parameters alone."""
-        inner, scene = drawing_emitters(self._inner), self._scene(parameters)
-        if not scene:
-            zeros = inner.emitters() * 0.0
-            return EmitterMoments(zeros, zeros)
-        factors = self._factors(parameters, paths.places, weights)
-        return inner.emitter_moments(scene, paths.inner, self._scene(tangents), weights * factors, noise * factors)
+    def _slopes(self, parameters: Tree, places: Array, images: Array, weights: Array) -> Array:
+        del images
+        return self._factors(parameters, places, weights)
+
+    def _pulled_back(self, parameters: Tree, places: Array, images: Array, weights: Array) -> tuple[Array, Array]:
+        weighted = weights * self._factors(parameters, places, weights)
+        own = self._renderer.gradient(parameters[self._renderer.key], places, weighted * images)
+        return weighted, own
 
     def _factors(self, parameters: Tree, places: Array, like: Array) -> Array:
         return self._renderer.factors(parameters[self._renderer.key], places, like)
-
-    def _scene(self, parameters: Tree) -> Tree:
-        return {key: value for key, value in parameters.items() if key != self._renderer.key}
-
-    def _ordered(self, parameters: Tree, found: Tree, places: Array, weighted: Array) -> Tree:
-        key = self._renderer.key
-        own = self._renderer.gradient(parameters[key], places, weighted)
-        return {name: own if name == key else found[name] for name in parameters}

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.picture_factors import WithParameter
-from unrender.rendering.renderer import (
-    EmitterMoments,
-    ParameterInfo,
-    Rendering,
-    RenderSession,
-    SampleRequest,
-    Space,
-    counted_vertices,
-    differentiated,
-    drawing_emitters,
-)
+from unrender.rendering.picture_factors import PicturePaths, PictureRenderer, PictureSession
+from unrender.rendering.renderer import ParameterInfo, RenderSession, SampleRequest
 
 __all__ = ["RESPONSE", "RESPONSE_BOUND", "Curve", "RespondingRenderer", "curve"]
 
@@ -91,7 +79,7 @@ def curve(contrast: Array, brightness: Array, x: Array) -> Curve:
     )
 
 
-class RespondingRenderer(WithParameter):
+class RespondingRenderer(PictureRenderer):
     """A renderer whose pictures are as photographs show them that were decoded with another curve than their camera's.
 
     A camera with the response R encodes radiance x as R(x), which is decoded by the sRGB curve S: the photograph's values are
@@ -119,131 +107,50 @@ class RespondingRenderer(WithParameter):
         """See `WithParameter.info`: (3, 2), within `RESPONSE_BOUND`."""
         return ParameterInfo((3, 2), lowest=-RESPONSE_BOUND, highest=RESPONSE_BOUND)
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
-        """See `Renderer.prepare`."""
-        own = [key for key in keys if key != self.key]
-        session = self.inner.prepare(own, space, differentiated(own, derivatives))
-        return session if len(own) == len(keys) else RespondingSession(self, session)
+    def session(self, inner: RenderSession) -> RenderSession:
+        """See `PictureRenderer.session`."""
+        return RespondingSession(self, inner)
 
 
-@dataclass(frozen=True)
-class RespondingPaths:
-    """What `adjoint` needs to walk the paths of a rendering again.
-
-    Attributes:
-        inner: of the inner renderer.
-        images, previous: radiance, as in `Rendering`.
-    """
-
-    inner: object
-    images: Array
-    previous: Array | None = None
-
-
-class RespondingSession:
+class RespondingSession(PictureSession[RespondingRenderer]):
     """Images and derivatives with respect to the response and to the parameters of a session. See `RenderSession`."""
-
-    def __init__(self, renderer: RespondingRenderer, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
-
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(_scene(parameters), request)
-        images = _of(parameters, found.images).values
-        return Rendering(images, None, RespondingPaths(found.paths, found.images))
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         """See `RenderSession.image_batch`."""
-        if scene := _scene(parameters):
-            images = self._inner.image_batch(scene, request)
-        else:
-            images = self._inner.image({}, replace(request, groups=1)).images
         values = np.asarray(parameters[RESPONSE])
         contrast, brightness = (self._renderer.array(values[:, None, None, :, k]) for k in range(2))
-        return curve(contrast, brightness, images).values
+        return curve(contrast, brightness, self._inner_batch(parameters, request)).values
 
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(_scene(current), _scene(previous), request, space)
-        if found.previous is None:
-            raise InputError(f"{RESPONSE}: the renderer returned one image of the two")
-        images, before = _of(current, found.images).values, _of(previous, found.previous).values
-        return Rendering(images, before, RespondingPaths(found.paths, found.images, found.previous))
-
-    def adjoint(self, parameters: Tree, paths: RespondingPaths, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        at = _of(parameters, paths.images)
-        scene = _scene(parameters)
-        found = self._inner.adjoint(scene, paths.inner, weights * at.slopes) if scene else {}
-        return self._ordered(parameters, found, at, weights)
-
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: RespondingPaths, weights: Array, weights_previous: Array
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        now, before = _of(current, paths.images), _of(previous, paths.previous)
-        states = _scene(current), _scene(previous)
-        found: tuple[Tree, Tree] = ({}, {})
-        if states[0]:
-            weighted = weights * now.slopes, weights_previous * before.slopes
-            found = self._inner.adjoint_pair(*states, paths.inner, *weighted)
-        return (
-            self._ordered(current, found[0], now, weights),
-            self._ordered(previous, found[1], before, weights_previous),
-        )
-
-    def tangent_moment(self, parameters: Tree, paths: RespondingPaths, tangents: Tree) -> Array:
+    def tangent_moment(self, parameters: Tree, paths: PicturePaths, tangents: Tree) -> Array:
         """See `RenderSession.tangent_moment`, and `RespondingRenderer` for what is left out."""
         at = _of(parameters, paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0])
         tangent = tangents[RESPONSE]
         along = at.by_contrast * tangent[:, 0] + at.by_brightness * tangent[:, 1]
         moment = along * along
-        if scene := _scene(parameters):
-            moment = moment + self._inner.tangent_moment(scene, paths.inner, _scene(tangents)) * at.slopes * at.slopes
+        if scene := self._scene(parameters):
+            of_scene = self._inner.tangent_moment(scene, paths.inner, self._scene(tangents))
+            moment = moment + of_scene * at.slopes * at.slopes
         return moment
 
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        return counted_vertices(self._inner, _scene(parameters), request)
+    def _shown(self, parameters: Tree, places: None, images: Array) -> Array:
+        del places
+        return _of(parameters, images).values
 
-    def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
-        return drawing_emitters(self._inner).emitters()
+    def _slopes(self, parameters: Tree, places: None, images: Array, weights: Array) -> Array:
+        del places, weights
+        return _of(parameters, images).slopes
 
-    def emitter_moments(
-        self, parameters: Tree, paths: RespondingPaths, tangents: Tree, weights: Array, noise: Array
-    ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`, for the derivatives by the scene's parameters alone."""
-        inner, scene = drawing_emitters(self._inner), _scene(parameters)
-        if not scene:
-            zeros = inner.emitters() * 0.0
-            return EmitterMoments(zeros, zeros)
-        slopes = _of(parameters, paths.images).slopes
-        return inner.emitter_moments(scene, paths.inner, _scene(tangents), weights * slopes, noise * slopes)
-
-    def _ordered(self, parameters: Tree, found: Tree, at: Curve, weights: Array) -> Tree:
-        """With the derivative by the response: of each channel, over all pixels, the mean over groups."""
+    def _pulled_back(self, parameters: Tree, places: None, images: Array, weights: Array) -> tuple[Array, Array]:
+        """By the response: of each channel, over all pixels, the mean over groups."""
+        del places
+        at = _of(parameters, images)
         columns = []
         for by in (at.by_contrast, at.by_brightness):
             parts = arrays.mean_over_first(weights * by)
             flat = arrays.reshape(parts, (int(np.prod(arrays.shape(parts)[:-1])), 3))
             columns.append(arrays.reshape(arrays.sum_over_rows(flat), (3, 1)))
-        own = columns[0] * self._first + columns[1] * self._second
-        return {name: own if name == RESPONSE else found[name] for name in parameters}
-
-    @property
-    def _first(self) -> Array:
-        return self._renderer.array(np.array([[1.0, 0.0]]))
-
-    @property
-    def _second(self) -> Array:
-        return self._renderer.array(np.array([[0.0, 1.0]]))
-
-
-def _scene(parameters: Tree) -> Tree:
-    return {key: value for key, value in parameters.items() if key != RESPONSE}
+        first, second = (self._renderer.array(np.eye(2)[[k]]) for k in range(2))
+        return weights * at.slopes, columns[0] * first + columns[1] * second
 
 
 def _of(parameters: Tree, images: Array) -> Curve:

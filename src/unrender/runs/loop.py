@@ -148,7 +148,7 @@ def _warm_up(descent: Descent) -> None:
     for hook in descent.hooks:
         hook.on_warm_up(descent, fresh, warm)
     del fresh, warm
-    memory.release_cache()
+    memory.trim_cache(descent.run.parameters)
 
 
 def _discarded_step(run: Run, state: RunState) -> None:
