@@ -83,6 +83,13 @@ _TASKS = {"QUAD": 2, "BOX2": 5, "BOX10": 8, "MUG": 5, "SHADOW": 6, "BUNNY": 8, "
 _META = ("'adam 4 spp' 'adam 16 spp' 'rcv 2 spp' meta", "'adam 32 spp' 'coupled 3 spp' 'coupled 3 spp, rcv'")
 _AJAR = ("'adam 1 spp' 'adam 16 spp' 'adam 64 spp' meta", "'adam 4 spp' 'rcv 2 spp' 'coupled 3 spp, rcv'")
 _NERF = ("'Adam, 2 spp' 'Adam, 4 spp'", "'Adam, 8 spp' meta", "'coupled, 3 spp' 'coupled on rcv, 3 spp'")
+_SHAPES = {"SUZANNE": 8, "BANANA": 8}
+_NETWORKS = ("CNN", "CNN5")
+_LARGE = (
+    ("three-textures", "Fig. 1", 5000, 1024),
+    ("globe-and-mirror", "Fig. 9, EARTH", 2000, 4096),
+    ("sun-glossy, 32 views", "Fig. 9, BOWL", 2000, 2048),
+)
 _ADAPTIVE = ("sun-glossy relative L2", "plain-and-textured", "two-planets")
 
 SLICES: tuple[Slice, ...] = (
@@ -120,6 +127,12 @@ SLICES: tuple[Slice, ...] = (
         "rcv-order",
         "RCV Fig. 4, at its 256 steps of 16 spp",
         (5, "rcv.fig4_order --resolution 256 --spp 16 --steps 256"),
+    ),
+    _one(
+        "rcv-moving",
+        "RCV Sec. 7 and Fig. 10",
+        (3, "rcv.heuristic_weights --resolution 128 --spp 16"),
+        (5, "rcv.fig10_perceptual --resolution 128 --spp 16"),
     ),
     _one("rcv-spaces", "RCV Fig. 8", (6, "rcv.fig8_spaces --resolution 256")),
     *(
@@ -189,6 +202,31 @@ SLICES: tuple[Slice, ...] = (
         "HO Fig. 5, with its 2562 vertices",
         (6, "higher_order.fig5_mesh --subdivisions 4 --resolution 128 --seconds 60"),
     ),
+    *(
+        _one(
+            f"ho-shapes-{task}",
+            f"HO Fig. 5: {task}, at its number of vertices",
+            (
+                minutes,
+                f"higher_order.fig5_shapes --task {task} --resolution 128 --seconds 60 --views 4",
+                "--task BANANA",
+            ),
+        )
+        for task, minutes in _SHAPES.items()
+    ),
+    *(
+        _one(
+            f"ho-network-{task}",
+            f"HO Table 2: {task}, over minutes",
+            (9, f"higher_order.networks --task {task} --runs 1 --seconds 120 --images 64 --size 64", f"--task {task}"),
+        )
+        for task in _NETWORKS
+    ),
+    _one(
+        "ho-noise",
+        "HO supplement: rendering noise",
+        (6, "higher_order.rendering_noise --resolution 128 --renders 1000"),
+    ),
     _one(
         "ho-speed",
         "HO: cost and variance by batch and detail",
@@ -212,6 +250,30 @@ SLICES: tuple[Slice, ...] = (
             ),
         )
         for number, name in enumerate(_ADAPTIVE, 1)
+    ),
+    *(
+        _one(
+            f"adaptive-large-{number}",
+            f"Adaptive {figure}: {name}, steps with falling rates",
+            (
+                9,
+                f"adaptive.equal_time --problem '{name}' --steps {steps} --resolution {resolution} --count 65536 --seeds 1 "
+                "--only uniform adaptive --part race",
+                f"--problem '{name}' --steps 4",
+            ),
+        )
+        for number, (name, figure, steps, resolution) in enumerate(_LARGE, 1)
+    ),
+    _one(
+        "adaptive-volume",
+        "Adaptive Fig. 9, LEGO: 8³ to its 256³",
+        (9, "adaptive.coarse_volume --resolution 512 --grid 256 --every 150 --after 300 --count 65536 --seeds 1"),
+    ),
+    _one(
+        "adaptive-kernels",
+        "Adaptive Eq. 12 between colours, and Fig. 6",
+        (3, "adaptive.cross_channels --paths 16777216"),
+        (5, "adaptive.fig6_differential --resolution 256 --count 8192"),
     ),
     _one("adaptive-cost", "cost of the importance map to 4096²", (5, "adaptive.cost --largest 4096")),
     _one(

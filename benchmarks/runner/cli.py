@@ -64,9 +64,15 @@ def execute(benchmark: Benchmark, arguments: Sequence[str]) -> int:
         given = parser.parse_args(arguments)
     folder = given.out or (scratch(f"quick/{benchmark.name}") if given.quick else benchmark.folder)
     if not given.plots_only:
+        import unrender as ur
+
         asked = {name: getattr(given, name) for name in names if hasattr(given, name)}
         settings = {**defaults(module.run), **(module.QUICK if given.quick else {}), **asked}
-        measure(benchmark, settings, folder, keep=not given.quick)
+        try:
+            measure(benchmark, settings, folder, keep=not given.quick)
+        except ur.InputError as error:
+            print(error, file=sys.stderr)
+            return 2
     record = records.read(folder)
     if record is None:
         print(f"no results.json in {folder}", file=sys.stderr)

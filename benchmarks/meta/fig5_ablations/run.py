@@ -59,6 +59,7 @@ def run(
     resolution: int = 48,
     part: tuple[str, ...] = ("tuned", "at length"),
     form: tuple[str, ...] = tuple(FORMS),
+    left_out: tuple[str, ...] = tuple(ABLATIONS),
     steps: int = 1500,
     long_seeds: int = 5,
     long_resolution: int = 16,
@@ -70,6 +71,7 @@ def run(
         seconds: budget of every run of the race
         part: measured; the other's figures stay
         form: of the descents at length; the other's figures stay
+        left_out: of the descents at length, "whole" for nothing; the others' figures stay
         steps: of every descent at length
         long_seeds: of the descents at length
         long_resolution: of the descents at length
@@ -81,7 +83,7 @@ def run(
     if "at length" in part:
         size = {"resolution": long_resolution, "texture_resolution": 8}
         problem = ur.gallery.problem("indirect-room", loss="RelativeL2", **size)
-        for entrant in (e for e in entrants() if e.name.partition(",")[0] in form):
+        for entrant in (e for e in entrants() if e.name.partition(",")[0] in form and e.group in left_out):
             found = descents(problem, entrant, rate, long_seeds, steps)
             conditions = {**size, "steps": steps, "seeds": long_seeds, "rate": rate}
             yield {"at length": {**conditions, "methods": {entrant.name: found}}}

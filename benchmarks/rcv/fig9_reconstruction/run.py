@@ -151,7 +151,7 @@ def parse(given: tuple[str, ...]) -> Grid | None:
 
 
 def run(
-    problem: tuple[str, ...] = (*OPTIONS, "tea"),
+    problem: tuple[str, ...] = (),
     loss: tuple[str, ...] = ("L1", "L2"),
     seconds: float | None = None,
     seeds: int = 5,
@@ -162,14 +162,18 @@ def run(
     """A part per problem and loss.
 
     Args:
-        problem: by the clock all but tea, by processor time indirect-room and tea
+        problem: by the clock some of indirect-room, glossy-room, sunlit-vase, lamp, by processor time of indirect-room, tea; left out, all
         seconds: budget of every run (15 for indirect-room, else 4; by processor time 8)
         resolution: film size, for GPUs
         grid: METHOD=SPP:RATE,..., in place of the method's grid; a single one is taken as it is
         processor: whether seconds are of the processor; then with denoised images, too, and smaller films
     """
     sizes = SMALL if processor else OPTIONS
-    for name, which in itertools.product((name for name in problem if name in sizes), loss):
+    for name in problem:
+        if name not in sizes:
+            way = "with --processor" if processor else "without --processor"
+            raise ur.InputError(f"{name}: not raced {way}; there are {', '.join(sizes)}")
+    for name, which in itertools.product(problem or sizes, loss):
         options = {**sizes[name], **({"resolution": resolution} if resolution else {})}
         budget = seconds or (8.0 if processor else BUDGETS.get(name, 4.0))
         entry = f"{name}, {which}{', processor' if processor else ''}"

@@ -104,6 +104,7 @@ def run(
     grid: int = 64,
     schedule: tuple[str, ...] = SCHEDULES,
     only: tuple[str, ...] = (),
+    balls: int = 0,
     reference_spp: int = 1024,
 ) -> Iterator[dict[str, Any]]:
     """A part per schedule and method.
@@ -113,9 +114,10 @@ def run(
         grid: voxels along a side
         schedule: of learning rates; the other's figures stay
         only: methods to run; the others' figures stay
+        balls: in place of the toy, so that the volume is sparse (Fig. 8); 0: the toy. The other's figures stay
     """
     options = {
-        "resolution": resolution, "grid_resolution": grid, "views": VIEWS, "reference_spp": reference_spp
+        "resolution": resolution, "grid_resolution": grid, "views": VIEWS, "reference_spp": reference_spp, "balls": balls
     }  # fmt: skip
     made = ur.gallery.problem("nerf-volume", **options)
     views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
@@ -124,4 +126,5 @@ def run(
     for kind in schedule:
         for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):
             methods = measure(problem, errors, name, kind, seconds, seeds)
-            yield {"schedules": {kind: {**conditions, "grid": grid, "methods": methods}}}
+            case = f"{kind}, {balls} balls" if balls else kind
+            yield {"schedules": {case: {**conditions, "grid": grid, "kind": kind, "balls": balls, "methods": methods}}}

@@ -7,7 +7,7 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """Final errors at equal time."""
     parts = []
-    for kind, s in record["schedules"].items():
+    for s in record["schedules"].values():
         rows = [
             [
                 name,
@@ -18,8 +18,7 @@ def table(record: Record) -> str:
             for name, e in s["methods"].items()
         ]
         head = ["method", "learning rate", "error of views seen", "of views unseen", "steps"]
-        parts.append(
-            f"`nerf-volume`, {s['resolution']}², grids of {s['grid']}³, {kind} rates, {s['seconds']:g} s, {s['seeds']} seeds. "
-            f"Errors over the initial ones.\n\n{markdown.table(head, rows)}"
-        )
+        of = f" of {s['balls']} balls" if s["balls"] else ""
+        sizes = f"`nerf-volume`{of}, {s['resolution']}², grids of {s['grid']}³, {s['kind']} rates, {s['seconds']:g} s, {s['seeds']} seeds."
+        parts.append(f"{sizes} Errors over the initial ones.\n\n{markdown.table(head, rows)}")
     return "\n\n".join(parts)
