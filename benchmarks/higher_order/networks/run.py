@@ -219,4 +219,5 @@ def run(
             found = [train(name, method, best, seconds, seed, images, size, centred) for seed in range(runs)]
             methods[method] = {"rate": best, "tried": tried, "runs": found}
             print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
-        yield {"tasks": {f"{name}, centred" if centred else name: {"weights": weights, "methods": methods}}}
+        entry = {"weights": weights, "seconds": seconds, "methods": methods}
+        yield {"tasks": {f"{name}, centred" if centred else name: entry}}

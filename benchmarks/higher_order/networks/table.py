@@ -8,7 +8,6 @@ from benchmarks.runner.records import Record
 
 def table(record: Record) -> str:
     """Errors of the networks' answers, and when they had fallen by 90 and 99 %."""
-    settings = record["settings"]
     rows = []
     for name, task in record["tasks"].items():
         for method, entry in task["methods"].items():
@@ -21,11 +20,12 @@ def table(record: Record) -> str:
                 [
                     f"{name}, {task['weights']} weights",
                     method,
+                    f"{len(finals)} of {task['seconds']:g} s",
                     f"{entry['rate']:g}",
                     spread,
                     *[f"{t:.3g}" if math.isfinite(t) else "—" for t in times],
                     steps[len(steps) // 2],
                 ]
             )
-    head = ["task", "method", "rate or radius", "final error: median (range)", "s to 90 %", "99 %", "steps"]
-    return f"{settings['runs']} runs of {settings['seconds']:g} s.\n\n{markdown.table(head, rows)}"
+    head = ["task", "method", "runs", "rate or radius", "final error: median (range)", "s to 90 %", "99 %", "steps"]
+    return markdown.table(head, rows)

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, prepare
+from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, dr, prepare
 from benchmarks.measured_races import compete, follow, scaled
 from benchmarks.races import TUNING_SEED, Entrant
+from benchmarks.runner.timing import work_time
 from unrender.schedules import Constant, Cosine, Schedule
 
 SPP = (2, 4, 8)
@@ -80,21 +81,34 @@ class ImageErrors:
         return {name: max(float(np.mean(x)), 0.0) ** 0.5 for name, x in squares.items()}
 
 
+def steps_in(problem: ur.Problem, entrant: Entrant, errors: ImageErrors, seconds: float, processor: bool) -> int:
+    """How many steps fit into so many seconds. Compiles and records what is left after a warm-up, measured as the runs are."""
+    rate = entrant.rates[0]
+    recorder = follow(problem, entrant, errors, rate, TUNING_SEED, 0.2, steps=15)
+    clocks = [clock for clock, _, _ in recorder.points["seen"]]
+    of_three = (clocks[-1] - clocks[-3]) / 2
+    if processor:
+        spent = []
+        for steps in (3, 6):
+            began = work_time()
+            follow(problem, entrant, errors, rate, TUNING_SEED, 2, steps=steps)
+            spent.append(work_time() - began)
+        of_three = spent[1] - spent[0]
+    return max(1, round(3 * seconds / of_three))
+
+
 def measure(
-    problem: ur.Problem, errors: ImageErrors, name: str, kind: str, seconds: float, seeds: int
+    problem: ur.Problem, errors: ImageErrors, name: str, kind: str, seconds: float, seeds: int, processor: bool
 ) -> dict[str, Any]:
     """One entrant's figures."""
 
     def entrant(schedule: Schedule) -> Entrant:
         return next(e for e in entrants(kind, schedule) if e.name == name)
 
-    # Compiles and records what is left after a warm-up, measured as the runs are, and gives the time of a step.
-    trial = entrant(Constant())
-    recorder = follow(problem, trial, errors, trial.rates[0], TUNING_SEED, 0.2, steps=15)
-    clocks = [clock for clock, _, _ in recorder.points["seen"]]
-    steps = max(1, round(seconds * 6 / (clocks[-1] - clocks[-3])))
+    steps = steps_in(problem, entrant(Constant()), errors, seconds, processor)
     schedule = Constant() if kind == "constant" else Cosine(steps, FLOOR)
-    return compete(problem, [entrant(schedule)], errors, "seen", seeds, seconds=seconds)
+    budget = {"steps": steps} if processor else {"seconds": seconds}
+    return compete(problem, [entrant(schedule)], errors, "seen", seeds, **budget)
 
 
 def run(
@@ -105,6 +119,7 @@ def run(
     schedule: tuple[str, ...] = SCHEDULES,
     only: tuple[str, ...] = (),
     balls: int = 0,
+    processor: bool = False,
     reference_spp: int = 1024,
 ) -> Iterator[dict[str, Any]]:
     """A part per schedule and method.
@@ -115,6 +130,7 @@ def run(
         schedule: of learning rates; the other's figures stay
         only: methods to run; the others' figures stay
         balls: in place of the toy, so that the volume is sparse (Fig. 8); 0: the toy. The other's figures stay
+        processor: whether seconds are those of one thread of the processor, which tell the steps of a run
     """
     options = {
         "resolution": resolution, "grid_resolution": grid, "views": VIEWS, "reference_spp": reference_spp, "balls": balls
@@ -122,9 +138,12 @@ def run(
     made = ur.gallery.problem("nerf-volume", **options)
     views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
     problem = ur.Problem(made.renderer, made.parameters, views, made.loss, made.max_depth, name="nerf-volume")
+    if processor:
+        dr.set_thread_count(1)
     errors, conditions = ImageErrors(made, options), {"seconds": seconds, "seeds": seeds, "resolution": resolution}
+    conditions |= {"processor": processor}
     for kind in schedule:
         for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):
-            methods = measure(problem, errors, name, kind, seconds, seeds)
+            methods = measure(problem, errors, name, kind, seconds, seeds, processor)
             case = f"{kind}, {balls} balls" if balls else kind
             yield {"schedules": {case: {**conditions, "grid": grid, "kind": kind, "balls": balls, "methods": methods}}}

@@ -19,6 +19,8 @@ def table(record: Record) -> str:
         ]
         head = ["method", "learning rate", "error of views seen", "of views unseen", "steps"]
         of = f" of {s['balls']} balls" if s["balls"] else ""
-        sizes = f"`nerf-volume`{of}, {s['resolution']}², grids of {s['grid']}³, {s['kind']} rates, {s['seconds']:g} s, {s['seeds']} seeds."
+        by = " of the processor" if s["processor"] else ""
+        sizes = f"`nerf-volume`{of}, {s['resolution']}², grids of {s['grid']}³, {s['kind']} rates"
+        sizes += f", {s['seconds']:g} s{by}, {s['seeds']} seeds."
         parts.append(f"{sizes} Errors over the initial ones.\n\n{markdown.table(head, rows)}")
     return "\n\n".join(parts)
