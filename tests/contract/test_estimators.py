@@ -23,6 +23,7 @@ from unrender.images.base import ImageEstimate
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import MARGIN
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.renderer import SampleRequest
 from unrender.runs.callbacks import Callback
 from unrender.runs.run import Run
 
@@ -65,6 +66,10 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "meta": lambda: ur.MetaEstimator(),
     "meta, several of each": lambda: ur.MetaEstimator(4, 3, space="primary"),
     "meta, other statistics": lambda: ur.MetaEstimator(statistics="independent"),
+    "meta, images of F": lambda: ur.MetaEstimator(difference_images="proportional"),
+    "meta, images of F, other statistics": lambda: ur.MetaEstimator(
+        1, 2, statistics="independent", difference_images="proportional"
+    ),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=3),
     "smoothed gradient": lambda: ur.SmoothedDerivatives(0.03, samples=16),
     "smoothed Hessian": lambda: ur.SmoothedDerivatives(0.03, samples=32, order="hessian", joint=False),
@@ -107,6 +112,7 @@ BIASED = {
     "coupled, adaptive pixels",
     "meta",
     "meta, several of each",
+    "meta, images of F",
     "coupled",
     "coupled, own paths",
     "coupled, control variate",
@@ -119,6 +125,7 @@ BIASED |= {name for name in ESTIMATORS if name.startswith(("smoothed", "loss val
 BIASED |= set(others("estimator"))
 DEAR = {
     "meta, other statistics",
+    "meta, images of F, other statistics",
     "meta, adaptive pixels, other statistics",
     "coupled, other statistics",
     "filtered",
@@ -392,11 +399,15 @@ def test_smoothed_derivatives_are_unbiased_where_images_have_no_noise(order: Any
     assert worst_z(np.array(rows) * 1.2, exact)[0] > limit, "a planted bias of 20 % went unseen"
 
 
-@pytest.mark.parametrize("coupled", quick([False, True], True))
-def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(coupled: bool) -> None:
+@pytest.mark.parametrize(
+    "options",
+    quick([{}, {"difference_images": "proportional"}, {"coupled": True, "spp": 2}], {"coupled": True, "spp": 2}),
+    ids=str,
+)
+def test_a_meta_gradient_is_unbiased_at_every_step_of_a_drift(options: dict[str, Any]) -> None:
     """200 runs, alpha bounded, statistics from independent samples: the mean gradient is the true one at each of ten steps."""
     asked = problem(noise=0.9)
-    estimator = ur.MetaEstimator(coupled=coupled, spp=2 if coupled else None, statistics="independent")
+    estimator = ur.MetaEstimator(**options, statistics="independent")
     path = [{k: v - 0.02 * step for k, v in asked.initial().items()} for step in range(10)]
     exact = [np.concatenate([g.ravel() for g in exact_gradient(asked, p).values()]) for p in path]
     rows = np.zeros((200, len(path), exact[0].size))
@@ -438,6 +449,10 @@ def test_meta_refuses_what_makes_no_sense() -> None:
         {"max_weight": 0.0},
         {"max_weight": 1.5},
         {"space": "pixel"},
+        {"difference_images": "F"},
+        {"difference_images": "proportional", "coupled": True},
+        {"difference_images": "proportional", "pixels": ur.pixels.Uniform(24)},
+        {"difference_images": "proportional", "pixels": ur.pixels.AdaptiveCounts(), "difference_spp": 4},
     ]
     for bad in refused:
         with pytest.raises(ur.InputError, match=next(iter(bad))):
@@ -456,6 +471,37 @@ def test_meta_refuses_what_makes_no_sense() -> None:
         ur.optimize(problem(), ur.PathGradient(), ur.optimizers.MetaAdam(), steps=1)
     with pytest.raises(ur.InputError, match='space="primary"'):
         ur.optimize(problem(shares_paths=False), ur.MetaEstimator(space="path"), ur.optimizers.MetaAdam(), steps=1)
+
+
+@pytest.mark.parametrize(("spp", "own", "proportional"), [((2, 1), 4, 3), ((1, 1), 4, 3), ((2, 4), 6, 6)])
+def test_images_of_f_save_the_passes_that_they_say(
+    spp: tuple[int, int], own: int, proportional: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first step; the samples told are those that the renderer traced, and the images those of F."""
+    traced: list[tuple[str, int]] = []
+    for name in ("image", "image_pair"):
+        sound = getattr(AnalyticRenderer, name)
+
+        def counted(self: Any, *arguments: Any, name: str = name, sound: Any = sound) -> Any:
+            traced.append((name, next(x.spp for x in arguments if isinstance(x, SampleRequest))))
+            return sound(self, *arguments)
+
+        monkeypatch.setattr(AnalyticRenderer, name, counted)
+    asked, parameters = problem(views=2), problem().initial()
+    pixels = asked.pixels
+    pairs, images = {}, {}
+    for choice, samples in (("own", own), ("proportional", proportional)):
+        estimator = ur.MetaEstimator(*spp, difference_images=choice)  # pyright: ignore[reportArgumentType]
+        _, state = estimator.estimate(asked, parameters, estimator.init(asked, parameters), Key(0))
+        traced.clear()
+        moved = {key: x + DRIFT for key, x in parameters.items()}
+        found, _ = estimator.estimate(asked, moved, state, Key(1))
+        assert found.info["samples"] == samples * pixels == sum(n for _, n in traced) * pixels // 2
+        pairs[choice], images[choice] = [n for name, n in traced if name == "image_pair"], found.info["images"]
+    assert sorted(images["own"]) == [0, 1]
+    assert all(np.array_equal(images["own"][view], images["proportional"][view]) for view in (0, 1))
+    assert pairs["proportional"] == [*spp] * 2
+    assert sum(pairs["own"]) == 2 * spp[1] * (2 if spp[1] == 1 else 1)
 
 
 def test_meta_takes_the_space_that_its_parameters_allow() -> None:

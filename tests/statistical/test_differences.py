@@ -1,4 +1,5 @@
-"""The variance of a finite difference of gradients falls with the square of the step (Balint et al. 2023, Eq. 14), in path space."""
+"""Finite differences of gradients (Balint et al. 2023, Eqs 3 to 5): with images of other paths they are unbiased, and in path space their
+variance falls with the square of the step (Eq. 14)."""
 
 from __future__ import annotations
 
@@ -6,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
+from zscores import z_scores
 
 import unrender as ur
 from tiers import quick
 from unrender.core import arrays, trees
 from unrender.core.random import Key
+from unrender.estimators import sample_groups
 from unrender.estimators.sample_groups import gather
-from unrender.images.base import PairRequest
+from unrender.images.base import ImageEstimate, PairRequest
 from unrender.images.plain import PlainState
 
 STEPS = (0.1, 0.03, 0.01)
@@ -48,3 +52,44 @@ def test_in_primary_space_it_does_not_where_roughness_moves_the_paths() -> None:
     """So the test above can fail: equal random numbers lead apart in a share of the paths that grows with the step."""
     problem = ur.gallery.problem("spiral", resolution=24, texture_resolution=8, reference_spp=256)
     assert slope(problem, "primary") < 1.75
+
+
+def paired_gradients(problem: ur.Problem, spp: int, difference_spp: int | None, runs: int) -> np.ndarray:
+    """(runs, n): of pairs of states a fifth of the way to the truth apart, the current one's gradient and the difference."""
+    start = problem.initial()
+    truth = {key: problem.renderer.array(value) for key, value in problem.truth.items()}
+    previous = {key: x + (truth[key] - x) * arrays.scalar(0.2, x) for key, x in start.items()}
+    asked = PairRequest(previous, "path", difference_spp=difference_spp)
+    rows = []
+    for run in range(runs):
+        key = Key(spp, run)
+        found = gather(problem, start, ur.images.Plain(), PlainState(), spp, key, pair_request=asked)
+        current = found.gradient if difference_spp is None else found.paired
+        both = (trees.numpy(current), trees.numpy(trees.subtract(current, found.previous)))
+        rows.append(np.concatenate([x.ravel() for tree in both for x in tree.values()]))
+    return np.stack(rows)
+
+
+def test_at_the_images_of_other_paths_the_difference_is_unbiased(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against leave-one-out groups. Faults that are seen: the current image for the previous one, images of the adjoint's own paths."""
+    problem = ur.gallery.problem("indirect-room", resolution=24, texture_resolution=8, reference_spp=256, loss="L2")
+    exact = paired_gradients(problem, 16, None, 48)
+
+    def worst(spp: int) -> float:
+        return float(np.abs(z_scores(paired_gradients(problem, spp, 1, 128), exact)).max())
+
+    limit = float(stats.norm.isf((1 - (1 - 1e-3) ** (1 / exact.shape[1])) / 2))
+    assert worst(2) < limit
+    with monkeypatch.context() as swapped:
+        swapped.setattr(ImageEstimate, "previous_mean", ImageEstimate.mean)
+        assert worst(2) > limit
+    sound, last = ur.images.Plain.estimate, []
+
+    def remembered(*arguments: Any) -> Any:
+        found = sound(*arguments)
+        last[:] = [found[0].paths]
+        return found
+
+    monkeypatch.setattr(ur.images.Plain, "estimate", remembered)
+    monkeypatch.setattr(sample_groups, "_paths", lambda *_: last[0])
+    assert worst(1) > limit

@@ -33,6 +33,7 @@ ESTIMATORS = {
     "plain": lambda: ur.PathGradient(spp=2),
     "rcv": lambda: ur.PathGradient(RCV(), spp=2, fresh_from=8),
     "coupled": lambda: ur.MetaEstimator(coupled=True, spp=2, image=RCV()),
+    "meta, images of F": lambda: ur.MetaEstimator(difference_images="proportional"),
     "adaptive": lambda: ur.PathGradient(pixels=ur.pixels.Adaptive(40, refresh=5, samples=256, denoiser="none"), spp=2),
     "rcv of mini-batches": lambda: ur.PathGradient(
         RCV(whole_views=3, learn_from_draws=False), pixels=ur.pixels.Uniform(40), spp=2

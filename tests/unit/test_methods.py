@@ -47,9 +47,15 @@ def test_rcv_takes_its_options():
 
 def test_meta_and_coupled_take_their_options():
     estimator, optimizer = method("meta").start(
-        {"proportional_spp": "4", "difference_spp": 2, "beta_difference": "0.5", "schedule": "cosine(10)"}
+        {
+            "proportional_spp": "4",
+            "difference_spp": 2,
+            "beta_difference": "0.5",
+            "schedule": "cosine(10)",
+            "difference_images": "proportional",
+        }
     )
-    assert estimator == MetaEstimator(4, 2, beta_difference=0.5)
+    assert estimator == MetaEstimator(4, 2, beta_difference=0.5, difference_images="proportional")
     assert optimizer == MetaAdam(0.002, schedule=schedules.Cosine(10))
     estimator, optimizer = method("coupled").start(
         {"spp": 6, "image": "rcv", "space": "primary", "optimizer": "adam", "learning_rate": 0.1}

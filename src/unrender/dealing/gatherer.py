@@ -226,7 +226,7 @@ class DealtViews:
             known = None if past is None else numbered(past)
             number = None if memory is None else memory.number
             state = ImageState(known, number, request.state.snapshot is not None, request.state.step)
-        asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step)
+        asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step, pair.difference_spp)
         self._calls += 1
         call = Call(
             numbered(request.parameters),
@@ -372,6 +372,7 @@ class DealtViews:
             state = request.image.advance(request.parameters, request.state, kept)
         return GradientSample(
             gradient=summed(lambda reply: reply.gradient),
+            paired=summed(lambda reply: reply.paired),
             previous=summed(lambda reply: reply.previous),
             fresh=summed(lambda reply: reply.fresh),
             losses=[loss for _, loss in losses],

@@ -41,6 +41,7 @@ class Pair:
     previous: References
     space: Space
     step: int
+    difference_spp: int | None
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ class Reply:
     """What came of a call.
 
     Attributes:
-        gradient, previous, fresh: summed over the share's views in double precision; {} where not wanted.
+        gradient, previous, fresh, paired: summed over the share's views in double precision; {} where not wanted.
         losses: {view: loss}, by the problem's own index; of a mini-batch under -1.
         samples: paths traced.
         images: {view: (H, W, 3)} where they were wanted.
@@ -156,6 +157,7 @@ class Reply:
     seconds: float
     paths: tuple[np.ndarray, ...] = ()
     draws: DrawStatistics | None = None
+    paired: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def payload_bytes(message: Any) -> int:

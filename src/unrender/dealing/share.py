@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.dealing.assignment import total
-from unrender.dealing.messages import Batch, Call, Difference, Pilot, References, Reply
-from unrender.estimators.sample_groups import GatherRequest, gather_frame, leave_one_out_groups
+from unrender.dealing.messages import Batch, Call, Difference, Pair, Pilot, References, Reply
+from unrender.estimators.sample_groups import TREES, GatherRequest, gather_frame, leave_one_out_groups
 from unrender.images.base import PairRequest
 from unrender.images.recursive_control_variate import RecursiveControlVariateState
 from unrender.pixels.base import MiniBatch
@@ -58,32 +58,29 @@ class ViewShare:
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
         parts = [gather_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
         kept = tuple(part.kept for part in parts)
-        arrays.evaluate(kept, [(part.gradient, part.previous, part.fresh, part.loss) for part in parts])
+        found = {name: [getattr(part, name) for part in parts] for name in TREES}
+        arrays.evaluate(kept, found, [part.loss for part in parts])
         if call.batch is None:
             self._remember(call, kept)
-        gradient, previous, fresh = (
-            total({key: arrays.numpy(x) for key, x in tree.items()} for tree in trees)
-            for trees in zip(*((part.gradient, part.previous, part.fresh) for part in parts), strict=True)
-        )
+        sums = {name: total(map(trees.numpy, parts)) for name, parts in found.items()}
         if call.single:
-            gradient, previous, fresh = (
-                {key: value.astype(np.float32) for key, value in tree.items()} for tree in (gradient, previous, fresh)
-            )
+            sums = {name: {key: value.astype(np.float32) for key, value in tree.items()} for name, tree in sums.items()}
         shown = [(index, part) for (index, _), part in zip(frames, parts, strict=True) if call.pictures and index >= 0]
         info: dict[str, dict[int, np.ndarray]] = {}
         for index, part in shown:
             for name, value in part.info.items():
                 info.setdefault(name, {})[index] = arrays.numpy(value)
         return Reply(
-            gradient,
-            previous,
-            fresh,
+            sums["gradient"],
+            sums["previous"],
+            sums["fresh"],
             {index: arrays.number(part.loss) for (index, _), part in zip(frames, parts, strict=True)},
             sum(part.samples for part in parts),
             {index: arrays.numpy(part.image) for index, part in shown},
             info,
             time.perf_counter() - started,
             draws=parts[0].draws if call.batch is not None else None,
+            paired=sums["paired"],
         )
 
     def store(self, number: int, packed: Packed) -> None:
@@ -121,7 +118,7 @@ class ViewShare:
                 state = replace(state, snapshot=self._snapshot[1])
         elif call.state is not None:
             state = RecursiveControlVariateState(step=call.state.step)
-        pair = call.pair and PairRequest(self._tree(call.pair.previous), call.pair.space, call.pair.step)
+        pair = call.pair and self._pair_request(call.pair)
         return GatherRequest(
             parameters,
             call.image,
@@ -133,6 +130,9 @@ class ViewShare:
             tolerance=call.tolerance,
             fresh=call.fresh,
         )
+
+    def _pair_request(self, pair: Pair) -> PairRequest:
+        return PairRequest(self._tree(pair.previous), pair.space, pair.step, difference_spp=pair.difference_spp)
 
     def _whole(self) -> list[tuple[int, Frame]]:
         return [(index, WholeView(self.problem, local)) for local, index in enumerate(self.views)]

@@ -92,7 +92,10 @@ class MetaEstimator:
     The independent form is the paper's. F comes from `proportional_spp` samples per pixel. ΔF comes from `difference_spp`
     others: one set of paths, traced in the current scene, gives the images and the adjoints of both states, and the loss
     derivative of each state comes from a pair of images independent of those paths (the other sample groups; for one sample per
-    pixel, a pair of its own).
+    pixel, a pair of its own). `difference_images="proportional"` takes that pair from F's samples: the loss derivatives of ΔF are at the
+    mean of their `proportional_spp`, whose paths are traced for both states, and ΔF traces its own paths once. F's samples are independent
+    of ΔF's paths, so that ΔF stays unbiased; but F and ΔF then share the noise of an image, and Eq. 8, which takes them for independent,
+    tells the variance without their covariance.
 
     The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and computes
     M = F + w (M − H), with w from their covariance: each sample serves both terms, at little more than the cost of a plain one. With
@@ -130,6 +133,9 @@ class MetaEstimator:
         centred: variances about the mean in place of mean squares. For comparison (Fig. 5).
         decouple: divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
         statistics: "shared" estimates variances from the samples that it sums; "independent" from as many more, at twice the cost.
+        difference_images: of both states, at which the loss derivatives of ΔF are: "own", or "proportional", F's. That is for the
+            independent form and whole views, `pixels.All()`. In path space it saves a pass where `difference_spp` cannot be divided into
+            groups, as 1 cannot; elsewhere it saves nothing.
     """
 
     proportional_spp: int | None = None
@@ -146,6 +152,7 @@ class MetaEstimator:
     decouple: bool = True
     statistics: Literal["shared", "independent"] = "shared"
     pixels: PixelSampler = field(default_factory=All)
+    difference_images: Literal["own", "proportional"] = "own"
 
     def __post_init__(self):
         for name, coupled, default in (
@@ -165,13 +172,22 @@ class MetaEstimator:
             checks.number("MetaEstimator", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         if not checks.number("MetaEstimator", "max_weight", self.max_weight, above=0.0) <= 1:
             raise InputError(f"MetaEstimator: max_weight must be in (0, 1], got {self.max_weight!r}")
-        for name, choices in (("space", ("auto", "path", "primary")), ("statistics", ("shared", "independent"))):
+        for name, choices in (
+            ("space", ("auto", "path", "primary")),
+            ("statistics", ("shared", "independent")),
+            ("difference_images", ("own", "proportional")),
+        ):
             if getattr(self, name) not in choices:
                 raise InputError(
                     f"MetaEstimator: {name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
         if not self.coupled and not isinstance(self.image, Plain):
             raise InputError("MetaEstimator: image is for the coupled form; give coupled=True with it")
+        if self.difference_images == "proportional" and (self.coupled or not isinstance(self.pixels, All)):
+            raise InputError(
+                'MetaEstimator: difference_images="proportional" is for the independent form and whole views; leave it out, or '
+                "give coupled=False and pixels=unrender.pixels.All()"
+            )
         if self.statistics == "independent" and not isinstance(self.image, Plain):
             raise InputError(
                 'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
@@ -270,19 +286,23 @@ class MetaEstimator:
         """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`: as for
         `_gather`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
-        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL), first=first)
+        at_once = self.difference_images == "proportional" and not fresh
+        asked = replace(pair_request, difference_spp=difference_spp) if at_once else None
+        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL), asked, first=first)
         coordinates = problem.coordinates
         slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
         F = coordinates.pull_back(step.gradient, slopes)
         if fresh:  # no change to be estimated
             return F, trees.zeros_like(F), step, pixels
-        again = replace(state, pixels=pixels)
-        further = key.fold(_DIFFERENCE)
-        pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
-        now, then = coordinates.pull_back(pair.gradient, slopes), coordinates.pull_back(pair.previous, before)
+        current, previous, samples = step.paired, step.previous, step.samples
+        if not at_once:
+            again, further = replace(state, pixels=pixels), key.fold(_DIFFERENCE)
+            pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
+            current, previous, samples = pair.gradient, pair.previous, samples + pair.samples
+        now, then = coordinates.pull_back(current, slopes), coordinates.pull_back(previous, before)
         difference = trees.subtract(now, then)
         memory.evaluate_in_turn(difference)
-        return F, difference, replace(step, samples=step.samples + pair.samples), pixels
+        return F, difference, replace(step, samples=samples), pixels
 
     def _coupled(
         self,

@@ -31,6 +31,7 @@ from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleReq
 
 __all__ = [
     "PIXELS",
+    "TREES",
     "FrameGradient",
     "GatherRequest",
     "GradientSample",
@@ -45,6 +46,9 @@ __all__ = [
 PIXELS = 1 << 32
 """The stream of a step's key that draws its pixels; the streams below are its frames'."""
 
+TREES = ("gradient", "paired", "previous", "fresh")
+"""What is summed over the frames, in a `GradientSample`."""
+
 _MOST_GROUPS = 16
 
 
@@ -58,6 +62,7 @@ class GradientSample:
 
     Attributes:
         gradient: of the loss with respect to the current parameters.
+        paired: the same on the paths of `previous`, where `PairRequest.difference_spp` asks for others than those of `gradient`; else {}.
         previous: of the loss at the previous parameters with respect to them, from the same paths; {} where it was not requested.
         fresh: of the loss as the samples of this step alone show it; {} where it was not requested.
         losses: of the current state, one per frame, lazy.
@@ -70,6 +75,7 @@ class GradientSample:
     """
 
     gradient: Tree
+    paired: Tree
     previous: Tree
     fresh: Tree
     losses: list[Array]
@@ -170,10 +176,12 @@ def gather(
 ) -> GradientSample:
     """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
 
-    A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, also the gradient
-    of the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space
-    allows, and their difference is a finite difference of gradients. With a pixel mini-batch, of its pixels alone, in one launch for
-    all views; the image estimator's state advances where whole views are rendered. For `tolerance` see `PathGradient`.
+    A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, also the gradient of
+    the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space allows, and
+    their difference is a finite difference of gradients. With its `difference_spp` these two are on paths of their own, beside the gradient
+    of the images' paths, and weighted by the images of all groups, which are independent of them. With a pixel mini-batch, of its pixels
+    alone, in one launch for all views; the image estimator's state advances where whole views are rendered. For `tolerance` see
+    `PathGradient`.
 
     Where the problem's views are dealt to workers, they do it (`Problem.gatherer`).
     """
@@ -187,13 +195,13 @@ def gather(
     likely = None if emitters is None else emitters.probabilities
     whole = sample is None
     frames = whole_views(problem, shares, spp, likely) if whole else [PixelBatch(problem, sample, likely)]
-    sums = {name: GradientSum() for name in ("gradient", "previous", "fresh")}
+    sums = {name: GradientSum() for name in TREES}
     parts = []
     for index, frame in enumerate(frames):
         part = gather_frame(problem, request, frame, key.fold(index))
         for name, total in sums.items():
             total.add(getattr(part, name))
-        parts.append(replace(part, gradient={}, previous={}, fresh={}))
+        parts.append(replace(part, **{name: {} for name in TREES}))
         del part
     info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
     images: dict[int, Array] = {}
@@ -243,6 +251,7 @@ class FrameGradient:
     """The part of one frame in a `GradientSample`; `kept` is its contribution to the image estimator's next state."""
 
     gradient: Tree
+    paired: Tree
     previous: Tree
     fresh: Tree
     loss: Array
@@ -264,6 +273,8 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
         request.adjoint_spp,
     )
     pair_request = request.pair_request
+    difference_spp = pair_request.difference_spp if pair_request else None
+    on_images = pair_request if difference_spp is None else None  # whose gradients are on the paths of the images
     groups = leave_one_out_groups(spp, adjoint_spp)
     session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
     found, kept = image.estimate(problem, parameters, state, frame, spp, groups, key.fold(0), pair_request)
@@ -273,17 +284,24 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
     counts = frame.counts if isinstance(frame, WholeView) else None
     if groups == 1 and counts is None:
         samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
-        paths = _paths(session, parameters, samples, pair_request)
+        paths = _paths(session, parameters, samples, on_images)
         traced += samples.spp
     derivative = _derivative(problem, frame, found.variance, request.tolerance)
     others = found.others()
     weights = derivative(others)
+    paired: Tree = {}
     previous: Tree = {}
-    if pair_request is None:
+    if on_images is None:
         gradient = session.adjoint(parameters, paths, weights)
     else:
         weights_previous = derivative(found.previous_others())
-        gradient, previous = session.adjoint_pair(parameters, pair_request.previous, paths, weights, weights_previous)
+        gradient, previous = session.adjoint_pair(parameters, on_images.previous, paths, weights, weights_previous)
+    if pair_request is not None and difference_spp is not None:
+        samples = frame.request(difference_spp, key.fold(2).uint32())
+        both = (derivative(arrays.add_first_axis(image)) for image in (mean, found.previous_mean()))
+        further = _paths(session, parameters, samples, pair_request)
+        paired, previous = session.adjoint_pair(parameters, pair_request.previous, further, *both)
+        traced += difference_spp
     fresh: Tree = {}
     if request.fresh and found.fresh is not None:
         fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
@@ -295,7 +313,8 @@ def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Ke
     told = None
     if request.emitters is not None and request.emitters.tangents:
         told = emitter_selection.connections(session, parameters, request.emitters.tangents, found, weights, spp)
-    return FrameGradient(gradient, previous, fresh, loss, mean, traced * frame.pixels, found.info, kept, draws, told)
+    pixels = traced * frame.pixels
+    return FrameGradient(gradient, paired, previous, fresh, loss, mean, pixels, found.info, kept, draws, told)
 
 
 def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:

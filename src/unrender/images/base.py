@@ -44,8 +44,11 @@ class ImageEstimate:
 
     def mean(self) -> Array:
         """The image of all samples together, (H, W, 3) or (N, 3)."""
-        whole = arrays.mean_over_first(self.images) if self.counts is None else self.counts.means(self.images)
-        return whole if self.filter is None else self.filter(whole)
+        return self._mean(self.images)
+
+    def previous_mean(self) -> Array:
+        """`mean()` of the previous step's parameters."""
+        return self._mean(self.previous)
 
     def others(self) -> Array:
         """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group. With
@@ -59,6 +62,10 @@ class ImageEstimate:
     def previous_others(self) -> Array:
         """`others()` of the previous step's parameters."""
         return self._left_out(self.previous)
+
+    def _mean(self, images: Any) -> Array:
+        whole = arrays.mean_over_first(images) if self.counts is None else self.counts.means(images)
+        return whole if self.filter is None else self.filter(whole)
 
     def _left_out(self, images: Array) -> Array:
         return self._filtered(leave_one_out(images)) if self.counts is None else self.counts.others(images)
@@ -98,12 +105,15 @@ class PairRequest:
         step: how many steps of whole views the estimator has taken. Image estimators with a state of earlier steps require it to be their
             own count.
         batches: steps with pixel mini-batches since then: where there are any, `previous` is not of what such a state remembers.
+        difference_spp: samples per pixel of further paths, on which the gradients of both states are taken, with plain images; None to
+            take them on those of the images.
     """
 
     previous: Tree
     space: Space
     step: int = 0
     batches: int = 0
+    difference_spp: int | None = None
 
 
 class ImageEstimator(Protocol):

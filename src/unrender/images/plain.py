@@ -65,7 +65,7 @@ class Plain:
             rendering = problem.renderer.prepare(list(parameters), None).image(parameters, request)
         else:
             session = problem.renderer.prepare(list(parameters), pair_request.space)
-            request = replace(request, both_gradients=True)
+            request = replace(request, both_gradients=pair_request.difference_spp is None)
             rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
         counts = frame.counts if isinstance(frame, WholeView) else None
         variance = variance_of_mean(rendering.images, counts)

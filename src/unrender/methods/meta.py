@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, PositiveInt
 
 from unrender.core.registry import register
@@ -19,7 +21,12 @@ class MetaMethod(MetaCommonOptions):
 
     proportional_spp: PositiveInt = Field(2, description="samples per pixel of the gradient itself")
     difference_spp: PositiveInt = Field(1, description="samples per pixel of its change since the last step")
+    difference_images: Literal["own", "proportional"] = Field(
+        "own",
+        description="images that the loss derivatives of the change are at: of samples of its own, or of the gradient's",
+    )
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """See `Options.build`."""
-        return MetaEstimator(self.proportional_spp, self.difference_spp, **self.shared()), self.built_optimizer()
+        spp, images = (self.proportional_spp, self.difference_spp), self.difference_images
+        return MetaEstimator(*spp, difference_images=images, **self.shared()), self.built_optimizer()
