@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ Record = dict[str, Any]
 
 def command() -> str:
     """This process's command line, as it is typed in the repository."""
-    return " ".join(["python", "-m", "benchmarks", *sys.argv[1:]])
+    return shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]])
 
 
 def scratch(name: str) -> Path:

@@ -2,7 +2,7 @@
 
 Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
 says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
-steps of a run, for Adam and MetaAdam alike, and are the better of two on runs of a tenth of the time, on a seed of their own. β_F is
+steps of a run, for Adam and MetaAdam alike, and are the better of two on shorter runs, a fifth of the time, on a seed of their own. β_F is
 0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per
 pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule
 "walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE
@@ -12,7 +12,6 @@ relative to where it began, averaged over parameters; seconds are the processor'
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -22,16 +21,22 @@ import drjit as dr
 import unrender as ur
 from benchmarks.internals import Estimator, Optimizer
 from benchmarks.races import TUNING_SEED, median_and_range, total_error
+from benchmarks.runner.timing import work_time
 from unrender.schedules import Cosine
 
-OPTIONS: dict[str, dict[str, Any]] = {"spiral": {}, "chalice": {"texture_resolution": 32}, "ajar": {}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "spiral": {},
+    "chalice": {"texture_resolution": 32, "reference_spp": 16384},
+    "ajar": {"reference_spp": 32768},
+}
+"""Noise of references is a part of the loss's minimum, which long descents reach: where it tells, they have 16 times the samples."""
 BETA = 0.999
 FLOOR = 0.02
 POINTS = 60
 """Measurements along a run."""
 TRIAL = 8
 """Steps that tell the cost of one."""
-TUNING_SHARE = 0.1
+TUNING_SHARE = 0.2
 PAPER = "meta, 1 + 2"
 MERGE = ("entries.*.methods",)
 QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
@@ -56,7 +61,7 @@ RATES: dict[str, dict[str, tuple[float, float]]] = {
         "coupled": (0.0005, 0.0015), "meta, 12 + 4": (0.0005, 0.0015),
     },
     "chalice": {
-        "meta, 1 + 2": (0.0005, 0.0015), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.02, 0.06),
+        "meta, 1 + 2": (0.0003, 0.001), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.02, 0.06),
         "coupled on rcv": (0.001, 0.003), "meta, 4 + 16": (0.001, 0.003), "meta, 1 + 2, walk": (0.005, 0.02),
         "coupled": (0.0005, 0.0015), "meta, 12 + 4": (0.0005, 0.0015),
     },
@@ -100,17 +105,17 @@ class Recorder(ur.Callback):
     def on_start(self, run: Any) -> None:
         """See `Callback.on_start`."""
         del run
-        self.begun = time.process_time()
+        self.begun = work_time()
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         """See `Callback.on_step`."""
         if run.step % self.every and run.step != self.steps:
             return
-        now = time.process_time()
+        now = work_time()
         self.spent += now - self.begun
         error = total_error(self.problem.parameter_error(run.parameters), self.start)
         self.points.append((round(self.spent, 3), float(record["samples"]), error))
-        self.begun = time.process_time()
+        self.begun = work_time()
 
 
 def descend(problem: ur.Problem, entrant: Entrant, rate: float, seed: int, steps: int) -> Points:
