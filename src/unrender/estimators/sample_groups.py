@@ -190,8 +190,7 @@ def gather(
     )
     if problem.gatherer is not None:
         return problem.gatherer.gather(request)
-    sample = batch.sample if batch else None
-    shares = batch.shares if batch else None
+    sample, shares = (batch.sample, batch.shares) if batch else (None, None)
     likely = None if emitters is None else emitters.probabilities
     whole = sample is None
     frames = whole_views(problem, shares, spp, likely) if whole else [PixelBatch(problem, sample, likely)]
