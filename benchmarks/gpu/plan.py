@@ -83,7 +83,7 @@ _TASKS = {"QUAD": 2, "BOX2": 5, "BOX10": 8, "MUG": 5, "SHADOW": 6, "BUNNY": 8, "
 _META = ("'adam 4 spp' 'adam 16 spp' 'rcv 2 spp' meta", "'adam 32 spp' 'coupled 3 spp' 'coupled 3 spp, rcv'")
 _AJAR = ("'adam 1 spp' 'adam 16 spp' 'adam 64 spp' meta", "'adam 4 spp' 'rcv 2 spp' 'coupled 3 spp, rcv'")
 _NERF = ("'Adam, 2 spp' 'Adam, 4 spp'", "'Adam, 8 spp' meta", "'coupled, 3 spp' 'coupled on rcv, 3 spp'")
-_SHAPES = {"SUZANNE": 8, "BANANA": 8}
+_SHAPES = ("SUZANNE", "BANANA")
 _NETWORKS = ("CNN", "CNN5")
 _LARGE = (
     ("three-textures", "Fig. 1", 5000, 1024),
@@ -207,12 +207,12 @@ SLICES: tuple[Slice, ...] = (
             f"ho-shapes-{task}",
             f"HO Fig. 5: {task}, at its number of vertices",
             (
-                minutes,
+                8,
                 f"higher_order.fig5_shapes --task {task} --resolution 128 --seconds 60 --views 4",
                 "--task BANANA",
             ),
         )
-        for task, minutes in _SHAPES.items()
+        for task in _SHAPES
     ),
     *(
         _one(

@@ -24,17 +24,22 @@ def work_time() -> float:
     return time.process_time()
 
 
-def turns(contenders: Mapping[str, Callable[[int], Any]], repeats: int = 15, warm: int = 4) -> Times:
-    """Milliseconds of each call of each contender, a function of the turn's number that must evaluate what it makes."""
+def turns(
+    contenders: Mapping[str, Callable[[int], Any]],
+    repeats: int = 15,
+    warm: int = 4,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Times:
+    """Milliseconds by a clock of each call of each contender, a function of the turn's number that must evaluate what it makes."""
     times: Times = {name: [] for name in contenders}
     for number in range(warm + repeats):
         for name, contender in contenders.items():
             dr.sync_thread()
-            began = time.perf_counter()
+            began = clock()
             contender(number)
             dr.sync_thread()
             if number >= warm:
-                times[name].append(1e3 * (time.perf_counter() - began))
+                times[name].append(1e3 * (clock() - began))
     return times
 
 

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, arrays, dr
-from benchmarks.paths import truth
+from benchmarks.internals import Key, Tree, arrays, dr
+from benchmarks.paths import straight
 from benchmarks.races import median_and_range, total_error
-from benchmarks.runner.timing import medians, work_time
+from benchmarks.runner.timing import medians, turns, work_time
 from unrender.schedules import Cosine
 
 OPTIONS: dict[str, dict[str, Any]] = {"spiral": {}, "chalice": {"texture_resolution": 32}}
 RATES = {"spiral": 0.003, "chalice": 0.0015}
 FLOOR = 0.02
-PATH_STEPS, PATH_SHARE = 16, 0.02
-"""Of the fixed path on which variances are measured: its steps, each a share of the way from the start to the truth."""
-WARM, REPEATS = 4, 24
+PATH_STEPS, WHOLE_PATH = 16, 51
+"""Of the fixed path on which variances are measured: its points, and those of the whole way from the start to the truth."""
+REPEATS = 24
 FORMS = {
     "own": ur.MetaEstimator(),
     "F's": ur.MetaEstimator(difference_images="proportional"),
@@ -28,30 +29,23 @@ FORMS = {
 """By the images; 1 + 2 samples, difference and proportional, unless others are given. Of those with others only the cost is measured."""
 
 
-def path(problem: ur.Problem) -> list[Any]:
+def path(problem: ur.Problem) -> list[Tree]:
     """Parameters on the way from the start to the truth."""
-    start, end = problem.initial(), truth(problem)
-    steps = [n * PATH_SHARE for n in range(PATH_STEPS)]
-    found = [{k: x + (end[k] - x) * arrays.scalar(share, x) for k, x in start.items()} for share in steps]
-    arrays.evaluate(found)
-    return found
+    return straight(problem, WHOLE_PATH)[:PATH_STEPS]
 
 
 def costs(problem: ur.Problem) -> dict[str, float]:
     """Processor milliseconds of a step of each form, taken in turns."""
     states = {name: form.init(problem, problem.initial()) for name, form in FORMS.items()}
-    times: dict[str, list[float]] = {name: [] for name in FORMS}
     points = path(problem)
-    for n in range(WARM + REPEATS):
-        for name, form in FORMS.items():
-            began = work_time()
-            # A new array per step, as in a descent, so that the scenes are updated.
-            parameters = {key: x * 1.0 for key, x in points[n % PATH_STEPS].items()}
-            states[name] = form.estimate(problem, parameters, states[name], Key(0, n))[1]
-            dr.sync_thread()
-            if n >= WARM:
-                times[name].append(1e3 * (work_time() - began))
-    return medians(times)
+
+    def step(name: str, n: int) -> None:
+        # A new array per step, as in a descent, so that the scenes are updated.
+        parameters = {key: x * 1.0 for key, x in points[n % PATH_STEPS].items()}
+        states[name] = FORMS[name].estimate(problem, parameters, states[name], Key(0, n))[1]
+
+    steps = {name: functools.partial(step, name) for name in FORMS}
+    return medians(turns(steps, repeats=REPEATS, clock=work_time))
 
 
 def variances(problem: ur.Problem, form: ur.MetaEstimator, runs: int) -> dict[str, Any]:
