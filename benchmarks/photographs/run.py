@@ -39,6 +39,8 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 ENTRANTS = ("start", "projection", "stages", "stages-flat", *METHODS, "stock", "stock-normals")
 FLAT = ("colour", "roughness", "metallic", "light")
+LAST_RATE = 1 / 20
+"""Of the stock loop's falling rates, as a share of the first."""
 MERGE = ("races.*.found", "maps")
 QUICK = {
     "seconds": 0.2,
@@ -83,8 +85,13 @@ class Judge:
         return self.psnr(lambda view: np.asarray(ur.render(self.problem, values, view=view, spp=self.spp)))
 
 
-def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int, seed: int) -> tuple[dict, int]:
-    """The usual loop over random views; its values, and how many steps it took. A step with each view, to warm up, does not count."""
+def stock(
+    problem: ur.Problem, spp: int, rate: float, falls: bool, seconds: float, views: int, seed: int
+) -> tuple[dict, int]:
+    """The usual loop over random views; its values, and how many steps it took. A step with each view, to warm up, does not count.
+
+    With `falls`, the rate falls exponentially, to a twentieth at the end.
+    """
     scene, parameters = stock_scene(problem)
     integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
     start, rng, step = problem.initial(), np.random.default_rng(seed), 0
@@ -114,6 +121,8 @@ def stock(problem: ur.Problem, spp: int, rate: float, seconds: float, views: int
                 loss += problem.loss_value(int(view), image)
             dr.backward(loss)
             optimizer.step()
+            if falls:
+                optimizer.set_learning_rate(rate * LAST_RATE ** min(clock / seconds, 1.0))
             for key in start:
                 optimizer[key] = project(optimizer[key], *problem.bounds[key])
             parameters.update(optimizer)
@@ -183,6 +192,7 @@ def run(
     entrant: tuple[str, ...] = ENTRANTS,
     spp: tuple[int, ...] = (4,),
     rates: tuple[float, ...] = (0.003, 0.01),
+    falling: tuple[float, ...] = (),
     stock_views: int = 2,
     seeds: int = 1,
     final_spp: int = 64,
@@ -194,6 +204,8 @@ def run(
         seconds: of the processor, for each descent, without compiling
         entrant: who takes part; the others' figures stay
         spp: of the stock loop, tried with each of the rates
+        rates: of the stock loop, that stay
+        falling: likewise, that fall to a twentieth
         stock_views: views a step of the stock loop
         final_spp: of the pictures that are measured
     """
@@ -205,6 +217,7 @@ def run(
     given = photographs or ur.gallery.photographs(folder / "photographs", size=resolution, spp=64)
     imports: dict[str, tuple[ur.Problem, Judge]] = {}
     maps: dict[str, np.ndarray] = {}
+    settings = [(s, r, falls) for s in spp for falls, rs in ((False, rates), (True, falling)) for r in rs]
     for who in entrant:
         kind = "flat" if who in ("stock", "stages-flat") else "normals"
         if kind not in imports:
@@ -221,7 +234,7 @@ def run(
             projection = Projection(judge.folder, problem, texture)
             found = {"psnr": [judge.psnr(lambda view, by=projection, of=judge: by.picture(of.problem, view))]}
         elif who in ("stock", "stock-normals"):
-            found = tuned(problem, judge, [(s, r) for s in spp for r in rates], seconds, stock_views, seeds)
+            found = tuned(problem, judge, settings, seconds, stock_views, seeds)
         else:
             for seed in range(seeds):
                 if who in ("stages", "stages-flat"):
@@ -236,13 +249,14 @@ def run(
                 print(who, seed, steps, np.mean(found["psnr"][-1]), flush=True)
             found["settings"] = METHODS.get(who, {})
         print(who, np.mean(found["psnr"]), flush=True)
+        race = f"{name}, {resolution}, {seconds:g}"
         conditions = {
             "views": len(problem.views),
             "held_out": len(judge.problem.views),
             "pixels": problem.pixels,
             "seconds": seconds,
         }
-        part: dict[str, Any] = {"races": {f"{name}, {resolution}": {**conditions, "found": {who: found}}}}
+        part: dict[str, Any] = {"races": {race: {**conditions, "found": {who: found}}}}
         if own:
             maps |= {
                 "photograph": judge.cut(np.asarray(judge.problem.views[0].reference)),
@@ -254,22 +268,22 @@ def run(
 
 
 def tuned(
-    problem: ur.Problem, judge: Judge, settings: list[tuple[int, float]], seconds: float, views: int, seeds: int
+    problem: ur.Problem, judge: Judge, settings: list[tuple[int, float, bool]], seconds: float, views: int, seeds: int
 ) -> dict[str, Any]:
-    """The stock loop with each of the settings, samples and rate; then further seeds of the best."""
+    """The stock loop with each of the settings, samples, rate and whether that falls; then further seeds of the best."""
     tried: list[dict[str, Any]] = []
     pictures = []
-    for samples, rate in settings:
-        values, steps = stock(problem, samples, rate, seconds, views, 0)
-        tried.append({"spp": samples, "rate": rate, "steps": steps, "psnr": judge.of(values)})
+    for samples, rate, falls in settings:
+        values, steps = stock(problem, samples, rate, falls, seconds, views, 0)
+        tried.append({"spp": samples, "rate": rate, "falls": falls, "steps": steps, "psnr": judge.of(values)})
         pictures.append(judge.picture)
-        print("stock", samples, rate, steps, np.mean(tried[-1]["psnr"]), flush=True)
+        print("stock", samples, rate, "falling" if falls else "", steps, np.mean(tried[-1]["psnr"]), flush=True)
     best = max(tried, key=lambda row: np.mean(row["psnr"]))
     judge.picture = pictures[tried.index(best)]
     found: dict[str, Any] = {"psnr": [best["psnr"]], "steps": [best["steps"]], "tried": tried}
-    found["settings"] = {key: best[key] for key in ("spp", "rate")}
+    found["settings"] = {key: best[key] for key in ("spp", "rate", "falls")}
     for seed in range(1, seeds):
-        values, steps = stock(problem, best["spp"], best["rate"], seconds, views, seed)
+        values, steps = stock(problem, best["spp"], best["rate"], best["falls"], seconds, views, seed)
         found["psnr"].append(judge.of(values))
         found["steps"].append(steps)
     return found

@@ -8,7 +8,8 @@ from benchmarks.runner.records import Record
 
 def table(record: Record) -> str:
     """Held-out PSNR of each, of each capture and resolution."""
-    return "\n\n".join(_race(name, race) for name, race in sorted(record["races"].items()))
+    races = sorted(record["races"].items(), key=lambda item: (item[1]["pixels"], item[1]["seconds"]))
+    return "\n\n".join(_race(name, race) for name, race in races)
 
 
 def _race(name: str, race: Record) -> str:
@@ -16,17 +17,18 @@ def _race(name: str, race: Record) -> str:
     for who, entry in race["found"].items():
         means = [float(np.mean(one)) for one in entry["psnr"]]
         spread = f" ± {np.std(means):.2f}" if len(means) > 1 else ""
-        settings = ", ".join(f"{key} {value:g}" for key, value in entry.get("settings", {}).items())
+        given = {key: value for key, value in entry.get("settings", {}).items() if value is not False}
+        settings = ", ".join(key if value is True else f"{key} {value:g}" for key, value in given.items())
         steps = f"{np.mean(entry['steps']):.0f}" if "steps" in entry else ""
         rows.append(
             [who, f"{np.mean(means):.2f}{spread}", f"{min(entry['psnr'][0]):.2f}", str(len(means)), steps, settings]
         )
-    capture, size = name.rsplit(", ", 1)
+    capture, size, _ = name.rsplit(", ", 2)
     counts = f"{race['views']} photographs of {size} pixels along the longer side, {race['held_out']} more held out"
     said = f"{capture}: {counts}, {race['seconds']:g} s of the processor each."
     head = ["", "held-out PSNR (dB)", "the worst of them", "seeds", "steps", "settings"]
     tried = [
-        [who, str(row["spp"]), f"{row['rate']:g}", str(row["steps"]), f"{np.mean(row['psnr']):.2f}"]
+        [who, str(row["spp"]), f"{row['rate']:g}{' falling' if row.get('falls') else ''}", str(row["steps"]), f"{np.mean(row['psnr']):.2f}"]
         for who, entry in race["found"].items()
         for row in entry.get("tried", [])
     ]

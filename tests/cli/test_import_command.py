@@ -127,7 +127,7 @@ def test_unknowns_by_choice_are_parameters_of_the_scene(unrender: Unrender, capt
     assert np.allclose(sorted(weights), [0, 26 / 255, 1], atol=2e-3)
     assert {float(weight) for view in held_out.views for weight in np.unique(np.asarray(view.mask))} == {0.0, 1.0}
     stages = stages_file.read("asset/stages.toml")
-    assert [stage.name for stage in stages.stages] == ["coarse-materials", "materials", "normals", "shape"]
+    assert [stage.name for stage in stages.stages] == ["coarse-materials", "materials", "normals", "detail", "shape"]
     assert {key for stage in stages.stages for key in stage.unknowns} == set(problem.initial_values())
     assert all("exposure" in stage.unknowns for stage in stages.stages)
     for wrong in ("", "color", "colour,lihgt"):

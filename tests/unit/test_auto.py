@@ -64,6 +64,8 @@ def test_images_have_a_memory(loss: Any) -> None:
 def test_textures_are_smoothed_unless_they_have_a_preconditioner() -> None:
     _, optimizer = chosen(problem())
     assert (optimizer.preconditioner, optimizer.preconditioned) == (Sobolev(), ("map",))
+    _, optimizer = chosen(problem(), correlation=1 / 32)
+    assert optimizer.preconditioner == Sobolev(correlation=1 / 32)
     for made, settings in ((problem(preconditioner=LargeSteps(1.0)), {}), (problem(), {"smooth": False})):
         _, optimizer = chosen(made, **settings)
         assert (optimizer.preconditioner, optimizer.preconditioned) == (None, ())

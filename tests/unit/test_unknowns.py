@@ -19,24 +19,31 @@ def _stages(*names: str) -> list[tuple[str, list[str], object]]:
     return [(stage.name, [of[key] for key in stage.unknowns], stage.settings) for stage in found]
 
 
-def test_a_hull_has_its_normals_in_a_last_stage_beside_shorter_steps() -> None:
+LATE = {"learning_rate": 0.02}
+DETAIL = {**LATE, "correlation": 1 / 128}
+
+
+def test_a_hull_has_its_normals_and_then_all_detail_by_shorter_steps() -> None:
     materials = ["colour", "roughness", "metallic", "light"]
     assert _stages(*unknowns.OF_HULL) == [
         ("coarse-materials", materials, None),
         ("materials", materials, None),
-        ("normals", list(unknowns.OF_HULL), {"learning_rate": 0.02}),
+        ("normals", list(unknowns.OF_HULL), LATE),
+        ("detail", list(unknowns.OF_HULL), DETAIL),
     ]
     stages = unknowns.stages(unknowns.OF_HULL, Path("problem.toml"))
-    # Half of the time finds the normals, and settles the others.
-    assert [seconds for _, seconds in split(stages.__class__(stages.problem, stages.stages, seconds=8.0))] == [1, 3, 4]
+    split_up = split(stages.__class__(stages.problem, stages.stages, seconds=12.0))
+    assert [seconds for _, seconds in split_up] == [1, 3, 4, 4]
 
 
-def test_stages_without_normals_keep_the_methods_own_rates() -> None:
-    assert [settings for *_, settings in _stages(*unknowns.DEFAULT)] == [None, None]
+def test_without_normals_detail_alone_has_settings_of_its_own() -> None:
+    assert [settings for *_, settings in _stages(*unknowns.DEFAULT)] == [None, None, DETAIL]
 
 
-def test_a_shape_keeps_the_short_steps_of_the_normals_before_it() -> None:
-    assert _stages("shape", *unknowns.OF_HULL)[-1][::2] == ("shape", {"learning_rate": 0.02})
+def test_a_shape_keeps_the_short_steps_of_the_stages_before_it() -> None:
+    assert _stages("shape", *unknowns.OF_HULL)[-1][::2] == ("shape", DETAIL)
+    assert [name for name, *_ in _stages("shape")] == ["shape"]
+    assert [name for name, *_ in _stages("exposure")] == ["photographs"]
 
 
 def test_settings_of_stages_are_options_of_the_method() -> None:

@@ -40,6 +40,8 @@ _OF_PICTURES = ("exposure", "vignetting", "response")
 """Unknowns that move in all stages."""
 _NORMALS_RATE, _LATE = 0.01, {"learning_rate": 0.02}
 """First steps of a normal map; and the rate of `auto` for the others from then on, a fifth of that of the first stages: they settle."""
+_DETAIL = {**_LATE, "correlation": 1 / 128}
+"""Of what comes last: what is broad has been found, and detail hardly moves along gradients that are smoothed as far."""
 _POSE_RATE = 0.05
 """First step of poses, in degrees and units like them."""
 _RESPONSE_RATE = 0.2
@@ -111,8 +113,8 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the shape. What was moved before keeps moving, beside normals
-    and shape by shorter steps.
+    """Materials and light at low resolution, then in full, then normals, then the detail of all, then the shape. What was moved before keeps
+    moving, from the normals on by shorter steps, and at last by gradients that are smoothed over few texels.
 
     Poses move from the second stage on, when there is a texture to see them by.
     """
@@ -123,7 +125,7 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
         name: str, more: Sequence[str], share: float, coarser: int = 1, settings: dict[str, Any] | None = None
     ) -> None:
         given = [one for one in more if one in unknowns]
-        if given:
+        if given or (not more and moved):
             moved.extend(one for one in given if one not in moved)
             moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
             found.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
@@ -131,6 +133,7 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
     add("materials", (*_MATERIALS, "poses"), 3.0)
     add("normals", ("normal",), 4.0, settings=_LATE)
-    add("shape", ("shape",), 1.0, settings=_LATE)
+    add("detail", (), 4.0, settings=_DETAIL)
+    add("shape", ("shape",), 1.0, settings=_DETAIL)
     rest = [name for name in _OF_PICTURES if name in unknowns]
     return Stages(problem, tuple(found or [Stage("photographs", tuple(of[name] for name in rest))]))

@@ -61,6 +61,7 @@ _PER_DERIVATIVE, _FEWEST_DERIVATIVE, _MOST_ELEMENTS = 8, 4, 1 << 10
 """Samples of the images over those of the derivative images, and the fewest of these; elements of poses up to which there is a matrix."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
+_CORRELATION = Sobolev().correlation
 _SIGMA, _STEP = 0.2, 0.5
 """Width of the smoothing of what is perturbed, and its first rate as a share of that."""
 _PERTURBED, _PERTURBED_SPP, _ANNEALING = 16, 2, (25.0, 0.1)
@@ -121,6 +122,9 @@ class AutoMethod(Options):
     smooth: bool = Field(
         True, description="whether textures, grids and values at vertices move along Sobolev gradients"
     )
+    correlation: PositiveFloat = Field(
+        _CORRELATION, le=1, description="length over which Sobolev gradients smooth, at most, as a share of a texture's side"
+    )
     coarse: bool = Field(True, description="whether grids of volumes are coarse in the first steps")
     learning_rate: PositiveFloat = Field(
         _RATE,
@@ -180,7 +184,7 @@ class AutoMethod(Options):
         rates = {**first_rates(problem, self.learning_rate), **given}
         optimizer: Optimizer = ScheduleFree(
             {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
-            preconditioner=Sobolev() if smoothed else None,
+            preconditioner=Sobolev(correlation=self.correlation) if smoothed else None,
             preconditioned=smoothed,
             wiener=not isinstance(sampler, pixels.Uniform),
             parameterisations=moved,
