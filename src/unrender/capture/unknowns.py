@@ -113,8 +113,9 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the detail of all, then the shape. What was moved before keeps
-    moving, from the normals on by shorter steps, and at last by gradients that are smoothed over few texels.
+    """Materials and light at low resolution, then in full, then normals, then the detail of all, then the shape.
+
+    What was moved before keeps moving, from the normals on by shorter steps, and at last by gradients that are smoothed over few texels.
 
     Poses move from the second stage on, when there is a texture to see them by.
     """
