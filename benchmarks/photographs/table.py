@@ -28,7 +28,13 @@ def _race(name: str, race: Record) -> str:
     said = f"{capture}: {counts}, {race['seconds']:g} s of the processor each."
     head = ["", "held-out PSNR (dB)", "the worst of them", "seeds", "steps", "settings"]
     tried = [
-        [who, str(row["spp"]), f"{row['rate']:g}{' falling' if row.get('falls') else ''}", str(row["steps"]), f"{np.mean(row['psnr']):.2f}"]
+        [
+            who,
+            str(row["spp"]),
+            f"{row['rate']:g}{' falling' if row.get('falls') else ''}",
+            str(row["steps"]),
+            f"{np.mean(row['psnr']):.2f}",
+        ]
         for who, entry in race["found"].items()
         for row in entry.get("tried", [])
     ]

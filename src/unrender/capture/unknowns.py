@@ -116,7 +116,6 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
     """Materials and light at low resolution, then in full, then normals, then the detail of all, then the shape.
 
     What was moved before keeps moving, from the normals on by shorter steps, and at last by gradients that are smoothed over few texels.
-
     Poses move from the second stage on, when there is a texture to see them by.
     """
     of, found = keys(unknowns, turntable), []

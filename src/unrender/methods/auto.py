@@ -123,7 +123,9 @@ class AutoMethod(Options):
         True, description="whether textures, grids and values at vertices move along Sobolev gradients"
     )
     correlation: PositiveFloat = Field(
-        _CORRELATION, le=1, description="length over which Sobolev gradients smooth, at most, as a share of a texture's side"
+        _CORRELATION,
+        le=1,
+        description="length over which Sobolev gradients smooth, at most, as a share of a texture's side",
     )
     coarse: bool = Field(True, description="whether grids of volumes are coarse in the first steps")
     learning_rate: PositiveFloat = Field(
