@@ -84,11 +84,11 @@ def test_masks_alone_become_a_problem_that_runs(unrender: Unrender, capture: Pat
         *("references", "masks", "textures"),
     }
     assert [path.name for path in Path().iterdir() if "part" in path.name] == []
-    # The hull's normals are unknown, in a last stage of their own.
+    # The hull's normals are unknown, from the third stage on.
     assert _keys(folder) == [*(f"asset.bsdf.nested_bsdf.{name}" for name in MATERIAL), NORMALS, "light.data"]
     stages = stages_file.read(folder / "stages.toml").stages
-    assert [NORMALS in stage.unknowns for stage in stages] == [False, False, True]
-    assert [set(stage.unknowns) for stage in stages[2:]] == [set(_keys(folder))]
+    assert [NORMALS in stage.unknowns for stage in stages] == [False, False, True, True]
+    assert [set(stage.unknowns) for stage in stages[2:]] == 2 * [set(_keys(folder))]
 
 
 def test_normals_of_a_mesh_that_is_given_are_taken_as_they_are(unrender: Unrender, capture: Path, mesh: Path) -> None:
