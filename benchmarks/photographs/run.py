@@ -86,11 +86,11 @@ class Judge:
 
 
 def stock(
-    problem: ur.Problem, spp: int, rate: float, falls: bool, seconds: float, views: int, seed: int
+    problem: ur.Problem, spp: int, rate: float, falling: bool, seconds: float, views: int, seed: int
 ) -> tuple[dict, int]:
     """The usual loop over random views; its values, and how many steps it took. A step with each view, to warm up, does not count.
 
-    With `falls`, the rate falls exponentially, to a twentieth at the end.
+    With `falling`, the rate falls exponentially, to a twentieth at the end.
     """
     scene, parameters = stock_scene(problem)
     integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
@@ -121,7 +121,7 @@ def stock(
                 loss += problem.loss_value(int(view), image)
             dr.backward(loss)
             optimizer.step()
-            if falls:
+            if falling:
                 optimizer.set_learning_rate(rate * LAST_RATE ** min(clock / seconds, 1.0))
             for key in start:
                 optimizer[key] = project(optimizer[key], *problem.bounds[key])
@@ -273,17 +273,17 @@ def tuned(
     """The stock loop with each of the settings, samples, rate and whether that falls; then further seeds of the best."""
     tried: list[dict[str, Any]] = []
     pictures = []
-    for samples, rate, falls in settings:
-        values, steps = stock(problem, samples, rate, falls, seconds, views, 0)
-        tried.append({"spp": samples, "rate": rate, "falls": falls, "steps": steps, "psnr": judge.of(values)})
+    for samples, rate, falling in settings:
+        values, steps = stock(problem, samples, rate, falling, seconds, views, 0)
+        tried.append({"spp": samples, "rate": rate, "falling": falling, "steps": steps, "psnr": judge.of(values)})
         pictures.append(judge.picture)
-        print("stock", samples, rate, "falling" if falls else "", steps, np.mean(tried[-1]["psnr"]), flush=True)
+        print("stock", samples, rate, "falling" if falling else "", steps, np.mean(tried[-1]["psnr"]), flush=True)
     best = max(tried, key=lambda row: np.mean(row["psnr"]))
     judge.picture = pictures[tried.index(best)]
     found: dict[str, Any] = {"psnr": [best["psnr"]], "steps": [best["steps"]], "tried": tried}
-    found["settings"] = {key: best[key] for key in ("spp", "rate", "falls")}
+    found["settings"] = {key: best[key] for key in ("spp", "rate", "falling")}
     for seed in range(1, seeds):
-        values, steps = stock(problem, best["spp"], best["rate"], best["falls"], seconds, views, seed)
+        values, steps = stock(problem, best["spp"], best["rate"], best["falling"], seconds, views, seed)
         found["psnr"].append(judge.of(values))
         found["steps"].append(steps)
     return found

@@ -7,7 +7,7 @@ from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """Held-out PSNR of each, of each capture and resolution."""
+    """Held-out PSNR of each, of each capture, resolution and time."""
     races = sorted(record["races"].items(), key=lambda item: (item[1]["pixels"], item[1]["seconds"]))
     return "\n\n".join(_race(name, race) for name, race in races)
 
@@ -31,7 +31,7 @@ def _race(name: str, race: Record) -> str:
         [
             who,
             str(row["spp"]),
-            f"{row['rate']:g}{' falling' if row.get('falls') else ''}",
+            f"{row['rate']:g}{' falling' if row.get('falling') else ''}",
             str(row["steps"]),
             f"{np.mean(row['psnr']):.2f}",
         ]

@@ -125,7 +125,7 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
         name: str, more: Sequence[str], share: float, coarser: int = 1, settings: dict[str, Any] | None = None
     ) -> None:
         given = [one for one in more if one in unknowns]
-        if given or (not more and moved):
+        if given:
             moved.extend(one for one in given if one not in moved)
             moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
             found.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
@@ -133,7 +133,7 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
     add("materials", (*_MATERIALS, "poses"), 3.0)
     add("normals", ("normal",), 4.0, settings=_LATE)
-    add("detail", (), 4.0, settings=_DETAIL)
+    add("detail", tuple(moved), 4.0, settings=_DETAIL)
     add("shape", ("shape",), 1.0, settings=_DETAIL)
     rest = [name for name in _OF_PICTURES if name in unknowns]
     return Stages(problem, tuple(found or [Stage("photographs", tuple(of[name] for name in rest))]))
