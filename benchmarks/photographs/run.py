@@ -178,7 +178,7 @@ def prepare(
 ) -> tuple[ur.Problem, Judge]:
     """Import the photographs; the problem, and the judge of its results by pictures of `spp` samples per pixel."""
     options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=unknowns)
-    importing.import_capture(photographs, folder, options)
+    importing.import_capture(photographs, folder, options, overwrite=True)
     problem = ur.Problem.from_file(folder / "problem.toml")
     return problem, Judge(folder, [parameter.key for parameter in problem.parameters], spp)
 
