@@ -107,6 +107,28 @@ def test_both_parts_are_unbiased() -> None:
     assert worst(np.array(rows[False])[:, 4:], mean[4:]) > 3.9, "the noise of the images adds to the loss"
 
 
+def test_a_perturbed_texture_with_a_preconditioner_and_a_path_gradient_are_by_the_same_coordinates() -> None:
+    """The perturbed gradient is by those of the descent; the path's is brought to them, by its own preconditioner and parameterisation."""
+    matrix = np.random.default_rng(1).standard_normal((48, 8))
+    renderer = AnalyticRenderer({"a": TRUTH["map"], "b": TRUTH["map"]}, matrix, noise=0.0)
+    smooth, log = ur.preconditioners.LargeSteps(2.0), ur.parameterisations.Log()
+    a = ur.Parameter("a", 0.5, preconditioner=smooth)
+    b = ur.Parameter("b", 0.5, (0.1, 2.0), parameterisation=log)
+    asked = ur.Problem(renderer, [a, b], [ur.View(renderer.exact({}))])
+    perturbed = smoothed(samples=64, orthogonal=True)
+    found = ur.estimate(asked, ur.HybridGradient(ur.PathGradient(), perturbed, ("a",)))
+    plain = ur.Problem(renderer, [ur.Parameter("a", 0.5), ur.Parameter("b", 0.5)], asked.given_views)
+    exactly = ur.estimate(plain, ur.PathGradient()).gradient
+    assert found.preconditioned
+    np.testing.assert_allclose(found.gradient["b"], 0.4 * exactly["b"], rtol=1e-5)  # x = 0.1 + exp u
+    runs = [
+        ur.estimate(asked, ur.HybridGradient(ur.PathGradient(), perturbed, ("a",)), seed=seed).gradient["a"].ravel()
+        for seed in range(50)
+    ]
+    assert worst(np.stack(runs), smooth.apply(exactly["a"]).ravel()) < 3.9
+    assert worst(np.stack(runs), exactly["a"].ravel()) > 3.9, "a gradient by the texture went unseen"
+
+
 @pytest.mark.parametrize("first", [1, 2, 3])
 def test_a_debiased_loss_is_unbiased_for_any_number_of_samples(first: int) -> None:
     from unrender.estimators.loss_values import BlackBox

@@ -58,13 +58,14 @@ def test_problems_that_it_cannot_take() -> None:
         ur.estimate(problem(), ur.SmoothedDerivatives({}))
     with pytest.raises(ur.InputError, match="sigma names y, which is none of the parameters"):
         ur.estimate(problem(), ur.SmoothedDerivatives({"*": 0.1, "y": 0.1}))
-    renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5)}, np.ones((12, 4)), shape=(2, 2))
-    asked = ur.Problem(
-        renderer,
-        [ur.Parameter("x", initial=0.2, preconditioner=ur.preconditioners.LargeSteps(1.0))],
-        [ur.View(renderer.exact({}))],
-    )
-    with pytest.raises(ur.InputError, match="parameter x has a preconditioner"):
+    renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5), "y": np.full(1, 0.5)}, np.ones((12, 5)), shape=(2, 2))
+    smooth = ur.Parameter("x", initial=0.2, preconditioner=ur.preconditioners.LargeSteps(1.0))
+    asked = ur.Problem(renderer, [smooth], [ur.View(renderer.exact({}))])
+    with pytest.raises(ur.InputError, match="LossValues: parameter x has a preconditioner"):
+        ur.estimate(asked, ur.LossValues())
+    log = ur.Parameter("y", initial=0.2, bounds=(0.1, 2.0), parameterisation=ur.parameterisations.Log())
+    asked = ur.Problem(renderer, [smooth, log], [ur.View(renderer.exact({}))])
+    with pytest.raises(ur.InputError, match="parameter x has a preconditioner and y a parameterisation"):
         ur.estimate(asked, ur.SmoothedDerivatives(0.1))
     with pytest.raises(ur.InputError, match=r'"hvp".*does not provide'):
         ur.optimize(problem(), ur.SmoothedDerivatives(0.1), ur.optimizers.NewtonCG(), steps=1)

@@ -9,8 +9,10 @@ def table(record: Record) -> str:
     settings = record["settings"]
     rows = []
     for name, task in record["tasks"].items():
-        for method, runs in task["methods"].items():
-            finals = ", ".join(f"{run['final']:.3f}" for run in runs)
-            rows.append([name, task["numbers"], method, finals, ", ".join(str(run["steps"]) for run in runs)])
+        for method, found in task["methods"].items():
+            finals = ", ".join(f"{run['final']:.3f}" for run in found["runs"])
+            steps = ", ".join(str(run["steps"]) for run in found["runs"])
+            rows.append([name, task["numbers"], method, f"{found['setting']:g}", finals, steps])
     lead = f"{settings['views']} views of {settings['resolution']}², {settings['seconds']:g} s of the processor, runs: {settings['runs']}."
-    return f"{lead}\n\n" + markdown.table(["task", "numbers", "method", "loss / at the start", "steps"], rows)
+    columns = ["task", "numbers", "method", "rate or radius, in σ", "loss / at the start", "steps"]
+    return f"{lead}\n\n" + markdown.table(columns, rows)

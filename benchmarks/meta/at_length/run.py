@@ -2,7 +2,8 @@
 
 Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
 says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
-steps of a run, for Adam and MetaAdam alike, and are the better of two on shorter runs, a fifth of the time, on a seed of their own. β_F is
+steps of a run, for Adam and MetaAdam alike, and are the better of two on shorter runs, a fifth of the time, on a seed of their own. Other
+resolutions than 64² have entries of their own. β_F is
 0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per
 pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule
 "walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE
@@ -36,7 +37,7 @@ POINTS = 60
 """Measurements along a run."""
 TRIAL = 8
 """Steps that tell the cost of one."""
-TUNING_SHARE = 0.2
+USUAL_RESOLUTION = 64
 PAPER = "meta, 1 + 2"
 MERGE = ("entries.*.methods",)
 QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
@@ -135,9 +136,11 @@ def cost(problem: ur.Problem, entrant: Entrant) -> float:
     return (recorder.points[-1][0] - recorder.points[halfway - 1][0]) / (TRIAL - halfway)
 
 
-def measure(problem: ur.Problem, entrant: Entrant, name: str, steps: int, seeds: int) -> dict[str, Any]:
+def measure(
+    problem: ur.Problem, entrant: Entrant, name: str, steps: int, seeds: int, tuning_share: float
+) -> dict[str, Any]:
     """One method, tuned, over seeds 0, 1, ..."""
-    short = max(2, round(steps * TUNING_SHARE))
+    short = max(2, round(steps * tuning_share))
 
     def error(rate: float) -> float:
         found = descend(problem, entrant, rate, TUNING_SEED, short)[-1][2]
@@ -171,8 +174,9 @@ def run(
     problem: tuple[str, ...] = tuple(OPTIONS),
     steps: int = 3000,
     seeds: int = 1,
-    resolution: int = 64,
+    resolution: int = USUAL_RESOLUTION,
     only: tuple[str, ...] = (),
+    tuning_share: float = 0.2,
 ) -> Iterator[dict[str, Any]]:
     """A part per problem and method.
 
@@ -180,6 +184,7 @@ def run(
         steps: of the paper's form at 1 + 2 samples; the others have as much processor time
         resolution: film size
         only: methods to run; the others' figures stay
+        tuning_share: of a run's steps, those of each run that a rate is chosen by
     """
     dr.set_thread_count(1)
     for name in problem:
@@ -188,6 +193,7 @@ def run(
         seconds = steps * cost(made, racing[PAPER])
         for method in (m for m in racing if not only or m in only):
             own = steps if method == PAPER else max(2, round(seconds / cost(made, racing[method])))
-            found = measure(made, racing[method], method, own, seeds)
+            found = measure(made, racing[method], method, own, seeds, tuning_share)
             entry = {"options": options, "steps": steps, "seeds": seeds, "methods": {method: found}}
-            yield {"entries": {name: entry}}
+            label = name if resolution == USUAL_RESOLUTION else f"{name}, {resolution}²"
+            yield {"entries": {label: entry}}

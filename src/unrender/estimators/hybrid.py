@@ -165,8 +165,8 @@ class HybridGradient:
         found, path_state = self.path.estimate(path, parameters, state.path, key)
         part = {name: parameters[name] for name in own}
         moved, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, key.fold(_PERTURBED))
-        if found.preconditioned:
-            moved = by_coordinates(moved, _of(problem, own), part)
+        if found.preconditioned or moved.preconditioned:
+            found, moved = by_coordinates(found, problem, parameters), by_coordinates(moved, _of(problem, own), part)
         moments = state
         if self.averaged:
             moved, moments = _averaged(moved, state)

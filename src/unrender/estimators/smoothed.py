@@ -27,6 +27,7 @@ from unrender.estimators.capabilities import (
     Variance,
 )
 from unrender.estimators.loss_values import BlackBox
+from unrender.estimators.preconditioned_perturbations import PreconditionedPerturbations
 from unrender.problem.problem import Problem
 from unrender.problem.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
@@ -80,11 +81,17 @@ class SmoothedDerivatives:
     included. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not
     of the noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
+    A parameter with a preconditioner S is perturbed along the steps that it allows, by S ε in place of ε, scaled to σ in the mean square:
+    neighbouring vertices or texels move alike. Derivatives are then by v, where the parameter is S v, of the loss smoothed by that
+    Gaussian of covariance S². For meshes and textures of thousands of elements: the noise of a gradient grows with the number of
+    directions, and those are fewer.
+
     Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss, unless it is
     `debiased`; but products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
 
     Args:
-        sigma: σ in units of the parameters, > 0: one number, or {key: number}, where "*" stands for all keys that are not named.
+        sigma: σ in units of the parameters, > 0 (with a preconditioner the root mean square of a perturbation): one number, or
+            {key: number}, where "*" stands for all keys that are not named.
         samples: renders per view and derivative, >= 4; without `aggregate`, per element of the derivative too.
         order: "gradient", "hessian" (n × n, for few parameters), or "hvp".
         aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
@@ -180,11 +187,9 @@ class SmoothedDerivatives:
                 return Capabilities(*common, HessianProduct)
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
-        """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed, has a preconditioner, or has no σ."""
-        for key in (key for key in problem.preconditioners if key in parameters):
-            raise InputError(
-                f"SmoothedDerivatives: parameter {key} has a preconditioner; leave it out, σ smooths already"
-            )
+        """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed or has no σ, or where one has a preconditioner
+        and one a parameterisation."""
+        PreconditionedPerturbations(problem, parameters)
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._sigma_per_parameter(parameters)
         size = vectors.ravel(parameters).size
@@ -202,11 +207,14 @@ class SmoothedDerivatives:
         at the parameters themselves."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0), self.debiased)
         factor = self.schedule(state.age) if self.schedule else 1.0
-        sigma = {name: factor * value for name, value in self._sigma_per_parameter(parameters).items()}
-        perturbed: list[np.ndarray] = []
+        smooth = PreconditionedPerturbations(problem, parameters)
+        sigma = {
+            name: factor * value for name, value in smooth.deviations(self._sigma_per_parameter(parameters)).items()
+        }
+        evaluate, perturbed = smooth.by_coordinates(box.losses), []
 
         def record_losses(points: np.ndarray) -> np.ndarray:
-            perturbed.append(box.losses(points))
+            perturbed.append(evaluate(points))
             return perturbed[-1]
 
         point = vectors.ravel(parameters), vectors.repeat_per_element(sigma, parameters)
@@ -226,10 +234,12 @@ class SmoothedDerivatives:
         capabilities = (
             Variance(vectors.unravel(error**2, parameters)),
             *curvature,
-            LossFunction(box.losses),
+            LossFunction(evaluate),
             Smoothing(sigma),
         )
-        found = Estimate(box.center(), vectors.unravel(gradient, parameters), capabilities, box.info)
+        found = Estimate(
+            box.center(), vectors.unravel(gradient, parameters), capabilities, box.info, preconditioned=bool(smooth)
+        )
         age = state.age + (_convergence(losses, found.loss) if self.adaptive_annealing else 1.0)
         return found, SmoothedState(age, hessian)
 
