@@ -237,7 +237,7 @@ def test_the_page_is_true(check: Any) -> None:
         (wrong_names, "none: the paper sets it aside", "the paper sets it aside", "equation 9"),
         (wrong_commands, "benchmarks rcv.fig4_order", "benchmarks rcv.fig4", "no benchmark rcv.fig4"),
         (wrong_commands, "--steps 400 --seeds 3", "--step 400", "no option step"),
-        (wrong_commands, "`adaptive.cost`", "`adaptive.costs`", "no benchmark adaptive.costs"),
+        (wrong_commands, "`adaptive.over_uniform`", "`adaptive.over`", "no benchmark adaptive.over"),
         (wrong_verdicts, "| beyond |", "| fine |", "Fig. 8"),
         (wrong_verdicts, "not run because they are not in the paper", "met, not in the paper", "Suppl., animations"),
         (wrong_verdicts, "| met, on another scene |", "| not run because of time |", "Fig. 7"),
