@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.race_plots import colours, draw
 from benchmarks.runner.records import Record
-from benchmarks.volumes.fig11_smoke.run import PLAIN
+from benchmarks.volumes.fig11_smoke.run import PLAIN, kind
 
 RCV = {"rcv, 1": "#1f6fb4", "rcv, 2": "#7fb2dd"}
 SHADES = dict(zip((f"plain, {n}" for n in PLAIN["steps"]), colours(len(PLAIN["steps"])), strict=True)) | RCV
@@ -18,7 +18,7 @@ def plot(record: Record) -> Figure:
     figure, axes = plt.subplots(2, len(budgets), figsize=(4.6 * len(budgets), 8), squeeze=False, layout="constrained")
     for (above, below), (budget, entry) in zip(axes.T, budgets.items(), strict=True):
         found, by_samples = entry["methods"], budget not in ("steps", "time")
-        title = f"smoke, equal {budget}" if budget in ("steps", "time") else f"{budget}, equal steps"
+        title = f"smoke, equal {budget}" if kind(budget) in ("steps", "time") else f"{budget}, equal steps"
         plain = [name for name in found if name.startswith("plain")]
         spp = [int(name.split(", ")[1]) for name in plain]
         middle, low, high = np.array([found[name]["final"]["both"] for name in plain]).T

@@ -5,7 +5,8 @@ Mitsuba's tutorials under the bright sky, which is left out where the assets are
 
 Differential ratio tracking with 1 adjoint path per pixel throughout; the image with 1 to 32 paths per pixel without a
 control variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget:
-the albedo's, extinction's being 10 times that. At equal steps, and of `smoke` some of them at equal time.
+the albedo's, extinction's being 10 times that. At equal steps, and of `smoke` some of them at equal time. Grids of other
+sizes than 16³ have entries of their own.
 
 Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient
 (extinction times albedo), averaged: the albedo of empty voxels shows in no image. "needs" says how many samples a plain
@@ -36,6 +37,7 @@ RATES = {
 }
 OTHERS = ("lit inside", "tutorial")
 """Volumes beside `smoke`, at equal steps."""
+USUAL_GRID = 16
 MERGE = ("budgets.*.methods",)
 QUICK = {"budget": ("steps", "lit inside"), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
 
@@ -51,6 +53,11 @@ def entrants(budget: str) -> list[Entrant]:
         Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, RATES[budget])
         for n in WITH[budget]
     ]
+
+
+def kind(entry: str) -> str:
+    """The budget of an entry of the record: "steps" of "steps, 64³"."""
+    return entry.partition(", ")[0]
 
 
 def needs(found: dict[str, Any], name: str) -> dict[str, Any]:
@@ -72,14 +79,15 @@ def needs(found: dict[str, Any], name: str) -> dict[str, Any]:
 def summarize(record: dict[str, Any]) -> dict[str, Any]:
     """Methods in order, and what plain images need at equal steps."""
     budgets: dict[str, Any] = {}
-    for budget in (b for b in PLAIN if b in record["budgets"]):
-        entry, names = record["budgets"][budget], [entrant.name for entrant in entrants(budget)]
+    for budget, entry in sorted(record["budgets"].items(), key=lambda item: list(PLAIN).index(kind(item[0]))):
+        names = [entrant.name for entrant in entrants(kind(budget))]
         budgets[budget] = {**entry, "methods": {n: entry["methods"][n] for n in names if n in entry["methods"]}}
     found: dict[str, Any] = {"budgets": budgets, "needs": {}}
     for budget, entry in budgets.items():
         methods = entry["methods"]
-        if budget != "time" and len(methods) == len(entrants(budget)):
-            found["needs"][budget] = {f"rcv, {n}": needs(methods, f"rcv, {n}") for n in WITH[budget]}
+        with_control = [name for name in methods if name.startswith("rcv") and kind(budget) != "time"]
+        if with_control and len(methods) > len(with_control):
+            found["needs"][budget] = {name: needs(methods, name) for name in with_control}
     return found
 
 
@@ -90,7 +98,7 @@ def run(
     seeds: int = 2,
     only: tuple[str, ...] = (),
     resolution: int = 24,
-    grid: int = 16,
+    grid: int = USUAL_GRID,
     assets: Path = Path("../shared/assets"),
 ) -> Iterator[dict[str, Any]]:
     """A part per budget.
@@ -111,4 +119,5 @@ def run(
         limit = {"seconds": seconds} if by == "time" else {"steps": steps}
         chosen = [entrant for entrant in entrants(by) if not only or entrant.name in only]
         methods = compete(made, chosen, measure(made), "both", seeds, **limit)
-        yield {"budgets": {by: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}}
+        label = by if grid == USUAL_GRID else f"{by}, {grid}³"
+        yield {"budgets": {label: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}}

@@ -32,6 +32,7 @@ def table(record: Record) -> str:
             ]
             for name in first["methods"]
         ]
+        title = title.replace("steps, ", "`smoke`, ")
         told = [f"{title}, {first['resolution']}², grids of {first['grid']}³, {first['seeds']} seeds."]
         for budget in budgets:
             for name, need in record.get("needs", {}).get(budget, {}).items():
