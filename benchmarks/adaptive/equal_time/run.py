@@ -142,7 +142,7 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def times(runs: Runs) -> dict[str, float | None]:
-    """When each method first has the least error that at least half of the runs of all have in the end, over when uniform mini-batches do."""
+    """When each method first has the least error that half of the runs of all have in the end, over when uniform mini-batches do."""
     level = max(float(np.quantile([run[-1][2] for run in found], 0.5, method="higher")) for found in runs.values())
     first = {name: reached(found, level, 0) for name, found in runs.items()}
     uniform = first["uniform"]

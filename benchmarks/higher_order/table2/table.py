@@ -7,7 +7,6 @@ from typing import Any
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
-
 OURS = ("OurHVPA", "OurJoint")
 """Tuned as widely as FR22, and measured with it."""
 
@@ -33,7 +32,7 @@ def table(record: Record) -> str:
     parts = [count, markdown.table(["task", "method", *goals, "runs that got there"], rows), made]
     for rival in ("FR22", "CMA-ES"):
         parts += [
-            f"{rival}'s time over that of the better of OurHVPA and OurJoint, per goal (>: its budget over theirs, where it never got there):"
+            f"{rival}'s time over the better of OurHVPA and OurJoint, per goal (>: its budget over theirs where it never got there):"
         ]
         parts += [_gains(record["tasks"], rival, goals)]
     parts += [

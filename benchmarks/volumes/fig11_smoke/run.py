@@ -120,4 +120,6 @@ def run(
         chosen = [entrant for entrant in entrants(by) if not only or entrant.name in only]
         methods = compete(made, chosen, measure(made), "both", seeds, **limit)
         label = by if grid == USUAL_GRID else f"{by}, {grid}³"
-        yield {"budgets": {label: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}}
+        yield {
+            "budgets": {label: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}
+        }
