@@ -2,12 +2,12 @@
 
 Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
 says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
-steps of a run, for Adam and MetaAdam alike, and are the better of two on shorter runs, a fifth of the time, on a seed of their own. Other
-resolutions than 64² have entries of their own. β_F is
-0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per
-pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule
-"walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE
-relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
+steps of a run, for Adam and MetaAdam alike, and are the better of two, and of more where it is at an end, on shorter runs,
+a fifth of the time, on a seed of their own. Other resolutions than 64² have entries of their own. β_F is 0.999, the loss
+the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per pixel, the paper's form
+at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule "walk", and the coupled form
+at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE relative to where it began,
+averaged over parameters; seconds are the processor's, on one thread.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import drjit as dr
 
 import unrender as ur
 from benchmarks.internals import Estimator, Optimizer
-from benchmarks.races import TUNING_SEED, median_and_range, total_error
+from benchmarks.races import TUNING_SEED, median_and_range, search, total_error
 from benchmarks.runner.timing import work_time
 from unrender.schedules import Cosine
 
@@ -147,13 +147,12 @@ def measure(
         print(f"{problem.name} {name} rate {rate:g}, {short} steps: {found:.4f}", flush=True)
         return found
 
-    tried = {rate: error(rate) for rate in entrant.rates}
-    rate = min(tried, key=tried.__getitem__)
+    rate, tried = search(entrant.rates, error)
     runs = [descend(problem, entrant, rate, seed, steps) for seed in range(seeds)]
     final = median_and_range([run[-1][2] for run in runs])
     print(f"{problem.name} {name} rate {rate:g}, {steps} steps, {runs[0][-1][0]:.0f} s: {final[0]:.4f}", flush=True)
     return {
-        "group": entrant.group, "rate": rate, "tried": list(tried.items()), "steps": steps, "tuning_steps": short,
+        "group": entrant.group, "rate": rate, "tried": tried, "steps": steps, "tuning_steps": short,
         "runs": runs, "final": final,
     }  # fmt: skip
 
