@@ -171,6 +171,8 @@ _WIDE = {"half_life": (1e6,), "steps": (1e6,), "radius": (0.5,), "iterations": (
 _ONE_BY_ONE = {"steps": (2.0, 5.0), "spp": (8.0, 16.0)}
 _FAR = {"half_life": (6.0, 60.0), "steps": (30.0,), "radius": (0.8, 4.0)}
 _FEW_SAMPLES = {"spp": (1.0, 2.0)}
+_MORE_SAMPLES = {"spp": (2.0, 4.0)}
+_BUNNY = {"adaptive": (1.0,), "steps": (10.0,), **_HALF_OR_ALL, **_MORE_SAMPLES}
 _CROWD = {"half_life": (30.0,), "radius": (0.25,), "steps": (80.0,), **_HALF_OR_ALL, **_FEW_SAMPLES}
 """Chosen by hand before there was a kept Hessian: σ by convergence, nothing kept."""
 _DIAGONAL = {"adaptive": (1.0,), "diagonal": (1.0,), "steps": (80.0,), **_FEW_SAMPLES}
@@ -187,6 +189,10 @@ OTHER_GRIDS: dict[tuple[str, str], Grid | tuple[Grid, ...]] = {
         {**_DIAGONAL, "half_life": (30.0,), "radius": (0.25,), "memory": (0.3,), **_HALF_OR_ALL},
     ),
     ("BUNNY", "Mitsuba"): _RATES,
+    ("BUNNY", "FR22"): {"half_life": (10.0, 25.0), "rate": (0.15,), **_HALF_OR_ALL, **_MORE_SAMPLES},
+    ("BUNNY", "CMA-ES"): {"deviation": (0.5, 1.0), "population": (8, 16), **_MORE_SAMPLES},
+    ("BUNNY", "OurHVPA"): {**_BUNNY, "radius": (1.5,), "memory": (0.5,), "epsilon": (0.3, 0.8)},
+    ("BUNNY", "OurJoint"): {**_BUNNY, "radius": (1.0,), "memory": (0.3, 1.0)},
     **{("QUAD", method): _FAR for method in ("OurH", "OurHVP")},
     ("QUAD", "OurHVPA"): {**_FAR, "iterations": (1.0, 2.0)},
     ("QUAD", "OurJoint"): _FAR_KEPT,
