@@ -2,12 +2,13 @@
 
 Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
 says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
-steps of a run, for Adam and MetaAdam alike, and are the better of two, and of more where it is at an end, on shorter runs,
-a fifth of the time, on a seed of their own. Other resolutions than 64² have entries of their own. β_F is 0.999, the loss
-the paper's mean relative squared error. Raced are Adam on plain gradients at 16 and 64 samples per pixel, the paper's form
-at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that with MetaAdam's rule "walk", and the coupled form
-at 3 samples on plain images and on a control variate's. Error is each parameter's RMSE relative to where it began,
-averaged over parameters; seconds are the processor's, on one thread.
+steps of a run, for Adam and MetaAdam alike. They are chosen in two rounds: the best of two, and of more where it is at an
+end, on runs of a fifth of the time from a seed of their own; then, since longer runs want lower rates, whole runs with that
+and with the next lower ones, for as long as their ends get nearer, of which the best is kept. Other resolutions than 64²
+have entries of their own. β_F is 0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients
+at 16 and 64 samples per pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that
+with MetaAdam's rule "walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each
+parameter's RMSE relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ POINTS = 60
 TRIAL = 8
 """Steps that tell the cost of one."""
 USUAL_RESOLUTION = 64
+LOWER = 2
+"""Lower rates that whole runs try at most."""
 PAPER = "meta, 1 + 2"
 MERGE = ("entries.*.methods",)
 QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
@@ -148,13 +151,30 @@ def measure(
         return found
 
     rate, tried = search(entrant.rates, error)
-    runs = [descend(problem, entrant, rate, seed, steps) for seed in range(seeds)]
-    final = median_and_range([run[-1][2] for run in runs])
-    print(f"{problem.name} {name} rate {rate:g}, {steps} steps, {runs[0][-1][0]:.0f} s: {final[0]:.4f}", flush=True)
+    whole: dict[float, list[Points]] = {}
+    ends: dict[float, list[float]] = {}
+    for lower in downward(rate, [entry["rate"] for entry in tried]):
+        whole[lower] = [descend(problem, entrant, lower, seed, steps) for seed in range(seeds)]
+        ends[lower] = median_and_range([run[-1][2] for run in whole[lower]])
+        seconds = whole[lower][0][-1][0]
+        print(f"{problem.name} {name} rate {lower:g}, {steps} steps, {seconds:.0f} s: {ends[lower][0]:.4f}", flush=True)
+        if ends[lower][0] > min(end[0] for end in ends.values()):
+            break
+    rate = min(ends, key=lambda each: ends[each][0])
     return {
         "group": entrant.group, "rate": rate, "tried": tried, "steps": steps, "tuning_steps": short,
-        "runs": runs, "final": final,
+        "whole": [{"rate": each, "error": end[0]} for each, end in ends.items()],
+        "runs": whole[rate], "final": ends[rate],
     }  # fmt: skip
+
+
+def downward(rate: float, tried: list[float]) -> list[float]:
+    """That rate and `LOWER` lower ones: of those tried, then at their distance."""
+    below = sorted((each for each in tried if each < rate), reverse=True)
+    factor = sorted(tried)[1] / sorted(tried)[0]
+    while len(below) < LOWER:
+        below.append((below[-1] if below else rate) / factor)
+    return [rate, *below[:LOWER]]
 
 
 def ratios(found: dict[str, Any]) -> dict[str, float]:

@@ -12,14 +12,31 @@ def table(record: Record) -> str:
         rows = []
         for method, f in methods.items():
             end = f["runs"][0][-1]
-            row = [method, f"{f['rate']:g}", str(f["steps"]), f"{f['final'][0]:.3f}", f"{end[0]:.0f}"]
+            others = (f"{w['rate']:.3g}: {w['error']:.3f}" for w in f.get("whole", []) if w["rate"] != f["rate"])
+            row = [
+                method,
+                f"{f['rate']:.3g}",
+                str(f["steps"]),
+                f"{f['final'][0]:.3f}",
+                ", ".join(others),
+                f"{end[0]:.0f}",
+            ]
             rows.append([*row, f"{end[1] / 1e6:.1f}"])
         seeds = f"{entry['seeds']} seed{'s' if entry['seeds'] > 1 else ''}"
         blocks += [
-            f"**`{name}`**, {entry['options']['resolution']}², the processor time of {entry['steps']} steps of "
+            f"**`{name.partition(', ')[0]}`**, {entry['options']['resolution']}², the processor time of {entry['steps']} steps of "
             f"`meta, 1 + 2`, {seeds}.",
             markdown.table(
-                ["method", "rate", "steps", "final error (median)", "processor seconds", "million paths"], rows
+                [
+                    "method",
+                    "rate",
+                    "steps",
+                    "final error (median)",
+                    "at other rates",
+                    "processor seconds",
+                    "million paths",
+                ],
+                rows,
             ),
             "Final error over that of the other:",
         ]
