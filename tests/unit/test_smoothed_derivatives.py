@@ -61,8 +61,9 @@ def test_problems_that_it_cannot_take() -> None:
     renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5), "y": np.full(1, 0.5)}, np.ones((12, 5)), shape=(2, 2))
     smooth = ur.Parameter("x", initial=0.2, preconditioner=ur.preconditioners.LargeSteps(1.0))
     asked = ur.Problem(renderer, [smooth], [ur.View(renderer.exact({}))])
-    with pytest.raises(ur.InputError, match="LossValues: parameter x has a preconditioner"):
-        ur.estimate(asked, ur.LossValues())
+    for estimator in (ur.LossValues(), ur.SmoothedDerivatives(0.1)):
+        with pytest.raises(ur.InputError, match="CMAES: parameter x has a preconditioner"):
+            ur.optimize(asked, estimator, ur.optimizers.CMAES(), steps=1)
     log = ur.Parameter("y", initial=0.2, bounds=(0.1, 2.0), parameterisation=ur.parameterisations.Log())
     asked = ur.Problem(renderer, [smooth, log], [ur.View(renderer.exact({}))])
     with pytest.raises(ur.InputError, match="parameter x has a preconditioner and y a parameterisation"):

@@ -9,7 +9,6 @@ import numpy as np
 
 from unrender.core import arrays, checks, vectors
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -49,11 +48,7 @@ class LossValues:
         return Capabilities(LossFunction)
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed, or that has a preconditioner."""
-        for key in (key for key in problem.preconditioners if key in parameters):
-            raise InputError(
-                f"LossValues: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
-            )
+        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         return LossState()
 

@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates, regularized
 from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Preconditioning, Refining, Reparameterising
 from unrender.problem.bounds import project
@@ -92,6 +93,11 @@ def prepare(
         problem = problem.reparameterised(optimizer.parameterisations)
     if isinstance(optimizer, Preconditioning):
         problem = problem.preconditioned(optimizer.preconditioners)
+    if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it
+        for key in problem.preconditioners:
+            raise InputError(
+                f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
+            )
     if isinstance(optimizer, Refining):
         ways = {key: CoarseToFine(tuple(steps), states="carry") for key, steps in optimizer.coarse_to_fine.items()}
         problem = problem.refining(ways)
