@@ -112,9 +112,8 @@ def test_perturbed_elements_move_by_sigma_in_the_mean_square(case: Case) -> None
     (found,) = estimates(case, 1)
     assert found.sigma is not None
     expected = SIGMA / np.sqrt(np.trace(case.S @ case.S) / N)
-    assert found.sigma["x"] == pytest.approx(
-        expected, rel=0.25
-    )  # four draws of 36 texels, of some ten independent ones
+    # Four draws of 36 texels, of which some ten are independent.
+    assert found.sigma["x"] == pytest.approx(expected, rel=0.25)
     assert found.sigma["x"] > 1.5 * SIGMA
 
 

@@ -25,22 +25,29 @@ _POINTS = 12
 QUICK = {"seconds": 0.5, "subdivisions": 1, "resolution": 8}
 
 
-def _smoothed(**more: Any) -> ur.SmoothedDerivatives:
+def smoothed(samples: int = SAMPLES, **more: Any) -> ur.SmoothedDerivatives:
+    """With the σ and the schedule of all methods."""
     schedule = ur.schedules.Exponential(60, 0.2)
-    return ur.SmoothedDerivatives(SIGMA, SAMPLES, spp=_SPP, schedule=schedule, **more)
+    return ur.SmoothedDerivatives(SIGMA, samples, spp=_SPP, schedule=schedule, **more)
+
+
+def cma_es(deviation: float) -> tuple[Any, Any]:
+    """A search that begins with that deviation over 2, in units of σ."""
+    optimizer = ur.optimizers.CMAES(0.5, SAMPLES, diagonal=True, learning_rate=deviation * SIGMA)
+    return ur.LossValues(spp=_SPP), optimizer
 
 
 def _fr22(_: int) -> tuple[Any, Any]:
-    return _smoothed(product=True), ur.optimizers.Adam(0.2 * SIGMA)
+    return smoothed(product=True), ur.optimizers.Adam(0.2 * SIGMA)
 
 
 def _joint(n: int) -> tuple[Any, Any]:
     optimizer = ur.optimizers.NewtonCG(trust_radius=0.5 * math.sqrt(n), iterations=1, line=True)
-    return _smoothed(order="hvp", adaptive_annealing=True), optimizer
+    return smoothed(order="hvp", adaptive_annealing=True), optimizer
 
 
 def _search(_: int) -> tuple[Any, Any]:
-    return ur.LossValues(spp=_SPP), ur.optimizers.CMAES(0.5, SAMPLES, diagonal=True, learning_rate=SIGMA)
+    return cma_es(1.0)
 
 
 METHODS: dict[str, Callable[[int], tuple[Any, Any]]] = {"FR22": _fr22, "CMA-ES": _search, "OurJoint": _joint}

@@ -19,6 +19,7 @@ from typing import Any
 
 import unrender as ur
 from benchmarks.higher_order.fig5_mesh import run as fig5_mesh
+from benchmarks.higher_order.fig5_mesh.run import smoothed
 from benchmarks.higher_order.fig5_shapes import shapes
 from benchmarks.internals import dr, vectors
 from benchmarks.races import TUNING_SEED, search
@@ -29,19 +30,14 @@ QUICK = {"task": ("BANANA",), "vertices": 60, "resolution": 8, "seconds": 0.5}
 
 STRENGTH = 19.0
 """λ of the preconditioner, that of Nicolet, Jacobson and Jakob 2021."""
-SIGMA, SAMPLES = fig5_mesh.SIGMA, fig5_mesh.SAMPLES
 RATES = (3.0, 9.0, 27.0)
 """Of Adam, in units of σ; one for all elements where steps are smooth."""
 RADII = (0.5, 1.5, 4.5)
 """Of Newton's steps: by how many σ each element moves at most, in the mean square."""
 
 
-def _smoothed(samples: int = SAMPLES, **more: Any) -> ur.SmoothedDerivatives:
-    return ur.SmoothedDerivatives(SIGMA, samples, spp=1, schedule=ur.schedules.Exponential(60, 0.2), **more)
-
-
 def _adam(rate: float, smooth: bool) -> ur.optimizers.Adam:
-    return ur.optimizers.Adam(rate * SIGMA, uniform=smooth)
+    return ur.optimizers.Adam(rate * fig5_mesh.SIGMA, uniform=smooth)
 
 
 def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
@@ -50,18 +46,12 @@ def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
 
 Make = Callable[[float, int, bool], tuple[Any, Any]]
 METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
-    "FR22": (lambda rate, _, smooth: (_smoothed(product=True), _adam(rate, smooth)), RATES),
-    "CMA-ES": (
-        lambda deviation, _, __: (
-            ur.LossValues(spp=1),
-            ur.optimizers.CMAES(0.5, SAMPLES, diagonal=True, learning_rate=deviation * SIGMA),
-        ),
-        (0.1, 0.3, 0.9),
-    ),
-    "OurG": (lambda rate, _, smooth: (_smoothed(), _adam(rate, smooth)), RATES),
-    "OurJoint": (lambda radius, n, _: (_smoothed(order="hvp"), _newton(radius, n)), RADII),
+    "FR22": (lambda rate, _, smooth: (smoothed(product=True), _adam(rate, smooth)), RATES),
+    "CMA-ES": (lambda deviation, _, __: fig5_mesh.cma_es(deviation), (0.1, 0.3, 0.9)),
+    "OurG": (lambda rate, _, smooth: (smoothed(), _adam(rate, smooth)), RATES),
+    "OurJoint": (lambda radius, n, _: (smoothed(order="hvp"), _newton(radius, n)), RADII),
     "OurHVPA": (
-        lambda radius, n, _: (_smoothed(SAMPLES // 2, order="hvp", joint=False), _newton(radius, n)),
+        lambda radius, n, _: (smoothed(fig5_mesh.SAMPLES // 2, order="hvp", joint=False), _newton(radius, n)),
         RADII,
     ),
 }

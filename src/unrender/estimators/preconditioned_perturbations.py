@@ -37,10 +37,11 @@ class PreconditionedPerturbations:
         maps = problem.preconditioners
         self._maps: Mapping[str, Preconditioner] = {key: maps[key] for key in parameters if key in maps}
         self._parameters, self._theta = parameters, vectors.ravel(parameters)
-        for key in (key for key in problem.coordinates.transforms if key in parameters and self._maps):
+        bent = [key for key in problem.coordinates.transforms if key in parameters]
+        if self._maps and bent:
             smooth = next(iter(self._maps))
             raise InputError(
-                f"SmoothedDerivatives: parameter {smooth} has a preconditioner and {key} a parameterisation; leave one of them out"
+                f"SmoothedDerivatives: parameter {smooth} has a preconditioner and {bent[0]} a parameterisation; leave one of them out"
             )
 
     def __bool__(self) -> bool:
