@@ -11,9 +11,9 @@ from benchmarks.runner.records import Record
 
 
 def plot(record: Record) -> Figure:
-    """The derivative of one run and its bias, each row in units of its own."""
+    """The derivative of one run and its bias, each row in units of its own; then the walls where descents end."""
     maps, found = record["maps"], record["bias"]["losses"]["perceptual"]
-    figure, axes = plt.subplots(2, len(METHODS) + 1, figsize=(11, 5.6), layout="constrained")
+    figure, axes = plt.subplots(3, len(METHODS) + 1, figsize=(11, 8.4), layout="constrained")
     exact = maps["perceptual/reference"]
     pictures: list[list[tuple[str, Any]]] = [
         [("converged", exact), *((f"{method}, one run", maps[f"perceptual/{method}"]) for method in METHODS)],
@@ -25,7 +25,7 @@ def plot(record: Record) -> Figure:
             ),
         ],
     ]
-    for row, given in zip(axes, pictures, strict=True):
+    for row, given in zip(axes[:2], pictures, strict=True):
         for axis, (title, picture) in zip(row, given, strict=True):
             axis.axis("off")
             if picture is None:
@@ -34,5 +34,16 @@ def plot(record: Record) -> Figure:
             drawn = axis.imshow(picture, vmin=-top, vmax=top, cmap="RdBu_r")
             axis.set_title(title, fontsize=9)
             figure.colorbar(drawn, ax=axis, shrink=0.8)
-    figure.suptitle("Derivative of the perceptual loss by each pixel, each picture with a scale of its own")
+    ends = {name: entry["final"][0] for name, entry in record["tasks"]["cornell-box"]["methods"].items()}
+    titles = {
+        "reference": "wall: reference",
+        **{name: f"wall: {name} spp, error {end:.2f}" for name, end in ends.items()},
+    }
+    for axis, (name, title) in zip(axes[2], titles.items(), strict=True):
+        axis.axis("off")
+        axis.imshow(np.clip(maps[f"wall/{name}"], 0.0, 1.0) ** (1 / 2.2), interpolation="nearest")
+        axis.set_title(title, fontsize=9)
+    figure.suptitle(
+        "Derivative of the perceptual loss by each pixel, each picture with a scale of its own; walls that descents on it find"
+    )
     return figure

@@ -24,5 +24,19 @@ def table(record: Record) -> str:
                 f"{f['variance']:.2f}",
             ]
         )
-    parts = [sizes, markdown.table(["image", "bias, RMS over pixels (its square)", "mean bias", "variance"], rows)]
+    ends = [
+        [
+            f"{name} spp",
+            f"{entry['rate']:g}",
+            markdown.median_range(entry["final"]),
+            f"{entry['runs'][0][-1][1] / 1e6:.1f}",
+        ]
+        for name, entry in record["tasks"]["cornell-box"]["methods"].items()
+    ]
+    parts = [
+        sizes,
+        markdown.table(["image", "bias, RMS over pixels (its square)", "mean bias", "variance"], rows),
+        f"Descents of {settings['steps']} steps, {settings['seeds']} seeds:",
+        markdown.table(["image", "rate", "final error of the wall (range)", "million paths"], ends),
+    ]
     return "\n\n".join(parts)

@@ -35,6 +35,7 @@ RATES = {
 }
 SCHEDULES = ("constant", "falling")
 FLOOR = 0.05
+USUAL_GRID = 64
 MERGE = ("schedules.*.methods",)
 QUICK = {
     "seconds": 0.5, "seeds": 1, "resolution": 8, "grid": 8, "schedule": ("constant",), "only": ("Adam, 2 spp", "meta"),
@@ -111,11 +112,17 @@ def measure(
     return compete(problem, [entrant(schedule)], errors, "seen", seeds, **budget)
 
 
+def label(kind: str, grid: int, balls: int) -> str:
+    """The name of an entry of the record."""
+    of = [f"{grid}³"] * (grid != USUAL_GRID) + [f"{balls} balls"] * (balls > 0)
+    return ", ".join([kind, *of])
+
+
 def run(
     seconds: float = 12.0,
     seeds: int = 2,
     resolution: int = 64,
-    grid: int = 64,
+    grid: int = USUAL_GRID,
     schedule: tuple[str, ...] = SCHEDULES,
     only: tuple[str, ...] = (),
     balls: int = 0,
@@ -126,7 +133,7 @@ def run(
 
     Args:
         seconds: budget of every run
-        grid: voxels along a side
+        grid: voxels along a side; the others' figures stay
         schedule: of learning rates; the other's figures stay
         only: methods to run; the others' figures stay
         balls: in place of the toy, so that the volume is sparse (Fig. 8); 0: the toy. The other's figures stay
@@ -145,5 +152,5 @@ def run(
     for kind in schedule:
         for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):
             methods = measure(problem, errors, name, kind, seconds, seeds, processor)
-            case = f"{kind}, {balls} balls" if balls else kind
+            case = label(kind, grid, balls)
             yield {"schedules": {case: {**conditions, "grid": grid, "kind": kind, "balls": balls, "methods": methods}}}
