@@ -181,6 +181,19 @@ def wrong_numbers(page: str) -> Iterator[str]:
             yield f"{title}, {row[0]}: not in the results: {sorted(given)}"
 
 
+def wrong_goals(page: str) -> Iterator[str]:
+    """Goals not reached of which fewer than three things were tried, or whose numbers the results of the benchmarks named do not have."""
+    for goal, here, tried, record in rows(section(page, "Goals that were not reached"), 4):
+        if goal == "goal":
+            continue
+        ways, _, reason = tried.rpartition(": ")
+        if len(re.split("[;,] ", ways)) < 3 or not reason:
+            yield f"{goal}: three ways and why they fail"
+        known = frozenset[str]().union(*(numbers(results()[name]) for name in re.findall(r"`([\w.]+)`", record)))
+        if given := numbers(here) - known:
+            yield f"{goal}: not in the results: {sorted(given)}"
+
+
 @functools.cache
 def baselines() -> list[str]:
     """The rows of the table of baselines that the records ask for, as regular expressions."""
@@ -216,7 +229,7 @@ def wrong_baselines(page: str) -> Iterator[str]:
         yield f"baselines: {len(baselines())} rows expected"
 
 
-CHECKS = (left_out, wrong_names, wrong_commands, wrong_verdicts, wrong_numbers, wrong_baselines)
+CHECKS = (left_out, wrong_names, wrong_commands, wrong_verdicts, wrong_numbers, wrong_goals, wrong_baselines)
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
@@ -245,6 +258,8 @@ def test_the_page_is_true(check: Any) -> None:
         (wrong_numbers, "over FR22 2.01 (1.76)", "over FR22 2.01 (0.55)", "Table 2, all: not in the results: ['0.55', '2.01 (0.55)']"),
         (wrong_numbers, "L1's derivative -47.1%", "L1's derivative +47.1%", "['+47.1']"),
         (wrong_numbers, "with L1 stock ends at 1.93", "with L1 stock ends at 1.98", "['1.98']"),
+        (wrong_goals, "with 5.0 and 3.6 times fewer", "with 5.7 and 3.6 times fewer", "['5.7']"),
+        (wrong_goals, "more paths behind the maps, a smaller share of uniform draws, smoother maps, ", "", "Adaptive Fig. 3"),
         (wrong_baselines, "OurHVPA: 8; OurJoint: 8 | 3 | 10 to 20 |", "OurHVPA: 2; OurJoint: 8 | 3 | 10 to 20 |", "BOX2"),
         (wrong_baselines, "uniform: 4; loss: 4; adaptive: 4 | 1 |", "uniform: 4; loss: 4; adaptive: 4 | 2 |", "adaptive_smoke"),
         (wrong_baselines, "| `meta.equal_time` | chalice |", "| meta | chalice |", "chalice"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,3 +96,12 @@ def problem(name: str, resolution: int, grid: int, reference_spp: int, assets: P
         return build_problem(name, Volume(smoke, lit_inside))
     file = assets / FILE
     return build_problem(name, Volume(smoke, from_file(file))) if file.is_file() else None
+
+
+def smoothed(made: ur.Problem) -> ur.Problem:
+    """The same problem, its grids preconditioned by `Sobolev`."""
+    preconditioner = ur.preconditioners.Sobolev()
+    parameters = tuple(replace(parameter, preconditioner=preconditioner) for parameter in made.parameters)
+    return ur.Problem(
+        made.renderer, parameters, made.given_views, made.loss, made.max_depth, truth=made.truth, name=made.name
+    )
