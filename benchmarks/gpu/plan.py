@@ -132,7 +132,7 @@ SLICES: tuple[Slice, ...] = (
         "rcv-moving",
         "RCV Sec. 7 and Fig. 10",
         (3, "rcv.heuristic_weights --resolution 128 --spp 16"),
-        (5, "rcv.fig10_perceptual --resolution 128 --spp 16"),
+        (7, "rcv.fig10_perceptual --resolution 128 --spp 16 --steps 100 --seeds 1"),
     ),
     _one("rcv-spaces", "RCV Fig. 8", (6, "rcv.fig8_spaces --resolution 256")),
     *(

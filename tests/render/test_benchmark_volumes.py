@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.volumes.fig11_smoke import run as race
-from benchmarks.volumes.fig11_smoke.scenes import DENSEST, FILE, problem
+from benchmarks.volumes.fig11_smoke.scenes import DENSEST, FILE, problem, smoothed
 from benchmarks.volumes.smoke_error import EXTINCTION, measure
 
 SIZES = {"resolution": 8, "grid": 6, "reference_spp": 16}
@@ -56,3 +56,13 @@ def test_what_plain_images_need_is_between_their_neighbours() -> None:
     told = race.summarize({"budgets": {"lit inside": {"methods": methods}}})["needs"]["lit inside"]["rcv, 1"]
     assert told == {"more_than": 16, "times": 16.0}
     assert race.summarize({"budgets": {"lit inside": {"methods": {"plain, 1": entry(1.0)}}}})["needs"] == {}
+
+
+def test_fine_grids_are_the_same_problem_with_smoothed_gradients(tmp_path: Path) -> None:
+    made = problem("lit inside", assets=tmp_path, **SIZES)
+    assert made is not None
+    found = smoothed(made)
+    for before, after in zip(made.parameters, found.parameters, strict=True):
+        assert after.preconditioner is not None
+        assert (after.key, after.learning_rate) == (before.key, before.learning_rate)
+    assert measure(found)(found.initial())["both"] == pytest.approx(1.0)
