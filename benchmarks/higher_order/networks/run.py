@@ -36,11 +36,13 @@ REST: dict[str, Any] = {"mug.rotation.y": -0.1, COLOUR: (0.45, 0.45, 0.45)}
 """Their middles, where they are not 0. Beyond 0.8 rad the cup hides its handle, and images do not tell the angle."""
 SIGMA = 0.5
 """In units of the ranges, at first; it falls in proportion to the time left, to `LEAST_SIGMA` of this."""
-LEAST_SIGMA = 0.15
-LEAST_RATE = 0.05
+LEAST_SIGMA = 0.08
+LEAST_RATE = 0.01
 """Of rates and radii, at the end of a run."""
 GRID = {"OurG": (1e-4, 3e-4, 1e-3), "OurHVPA": (1e-3, 3e-3), "OurJoint": (1e-3, 3e-3)}
 """Of each method: Adam's learning rates, or trust radii as the length of a step that moves each weight by so much."""
+REFERENCES = 32
+"""Renders of 64 samples per pixel that references are the mean of: their noise is a part of the loss's minimum, and moves answers."""
 _DECAY = 0.99
 """Of the mean square of the gradient that makes the metric."""
 _TINY = 1e-24
@@ -68,7 +70,8 @@ class Data:
         self.rest = np.concatenate([np.atleast_1d(REST.get(key, 0.0)) for key in self.keys])
         self.truth = np.random.default_rng(seed).uniform(-1, 1, (count, len(self.ranges)))
         self.session = self._prepared(size)
-        self.references = self._render(self.session, self.truth, 64, 1)
+        renders = [self._render(self.session, self.truth, 64, 10_000 + number) for number in range(REFERENCES)]
+        self.references = np.mean(renders, axis=0)
         images = self._render(self._prepared(RESOLUTION), self.truth, 64, 2)
         images = images - images.mean(axis=0)
         images /= images.std()
