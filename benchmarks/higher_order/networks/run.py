@@ -34,7 +34,7 @@ ANSWERS: dict[str, dict[str, Any]] = {
 """Each number's range to either side: of the truth, and what the network's outputs are multiples of."""
 REST: dict[str, Any] = {"mug.rotation.y": -0.1, COLOUR: (0.45, 0.45, 0.45)}
 """Their middles, where they are not 0. Beyond 0.8 rad the cup hides its handle, and images do not tell the angle."""
-SIGMA = 0.5
+SIGMA = {"CNN": 0.5, "CNN5": 0.25}
 """In units of the ranges, at first; it falls in proportion to the time left, to `LEAST_SIGMA` of this."""
 LEAST_SIGMA = 0.08
 LEAST_RATE = 0.01
@@ -125,7 +125,7 @@ def train(
     weights = list(network.parameters())
     adam = torch.optim.Adam(weights, lr=rate)
     curve, clock = [(0.0, data.error(network))], 0.0
-    sigma = SIGMA
+    sigma = SIGMA[task]
 
     joint = method == "OurJoint"
     squares = [torch.zeros_like(weight) for weight in weights]
@@ -155,7 +155,7 @@ def train(
     factor = 1.0
     while clock < seconds:
         left = 1 - clock / seconds
-        sigma, factor = SIGMA * max(LEAST_SIGMA, left), max(LEAST_RATE, left)
+        sigma, factor = SIGMA[task] * max(LEAST_SIGMA, left), max(LEAST_RATE, left)
         for group in adam.param_groups:
             group["lr"] = factor * rate
         began = time.process_time()
