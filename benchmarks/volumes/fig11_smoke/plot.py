@@ -27,6 +27,7 @@ def plot(record: Record) -> Figure:
             above.axhline(found[name]["final"]["both"][0], color=RCV[name], label=name)
         above.set(title=f"{title}: error at the end", xlabel="paths per pixel of the image", xscale="log")
         above.set_xticks(spp, [str(n) for n in spp])
+        above.set_xticks([], minor=True)
         above.legend(fontsize=8)
         for name, each in found.items():
             label = f"{name}: {each['final']['both'][0]:.3f}"
