@@ -26,7 +26,8 @@ from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import gather, leave_one_out_groups
 from unrender.evaluation import denoising
-from unrender.gallery import parts, textures, volumes
+from unrender.gallery import parts, volumes
+from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
@@ -64,6 +65,7 @@ __all__ = [
     "Estimator",
     "ImageEstimate",
     "ImageEstimator",
+    "IndirectRoom",
     "Key",
     "Optimizer",
     "PixelSampler",
@@ -109,7 +111,6 @@ __all__ = [
     "second_moments",
     "stages_file",
     "stock_scene",
-    "textures",
     "time_run_folder",
     "trees",
     "turntable_turns",

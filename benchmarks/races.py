@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,9 +42,15 @@ def descend(
     seed: int,
     seconds: float | None = None,
     steps: int | None = None,
+    ended: Callable[[ur.Result], None] | None = None,
 ) -> list[tuple[float, float, float]]:
-    """(seconds, samples, error) along one run: each parameter's RMSE relative to where it began, averaged over parameters."""
+    """(seconds, samples, error) along one run: each parameter's RMSE relative to where it began, averaged over parameters.
+
+    `ended` is called with the result.
+    """
     result = ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), seconds=seconds, steps=steps, seed=seed)
+    if ended is not None:
+        ended(result)
     start = problem.parameter_error(problem.initial())
     return [
         (h["seconds"], float(h["samples"]), total_error(h["parameter_error"], start))
@@ -86,14 +93,23 @@ def tune(
 
 
 def race(
-    problem: ur.Problem, entrants: list[Entrant], seeds: int, tuning_seeds: int = 1, **budget: Any
+    problem: ur.Problem,
+    entrants: list[Entrant],
+    seeds: int,
+    tuning_seeds: int = 1,
+    ended: Callable[[str, int, ur.Result], None] = lambda name, seed, result: None,
+    **budget: Any,
 ) -> dict[str, Any]:
-    """Every entrant, tuned, over seeds 0, 1, ..., in turns: {name: {"group", "rate", "tried", "runs", "final"}}."""
+    """Every entrant, tuned, over seeds 0, 1, ..., in turns: {name: {"group", "rate", "tried", "runs", "final"}}.
+
+    `ended` is called with the entrant's name, the seed and the result of each run but those that tune.
+    """
     tuned = {entrant.name: tune(problem, entrant, tuning_seeds, **budget) for entrant in entrants}
     runs: Runs = {entrant.name: [] for entrant in entrants}
     for seed in range(seeds):
         for entrant in entrants:
-            runs[entrant.name].append(descend(problem, entrant, tuned[entrant.name][0], seed, **budget))
+            keep = functools.partial(ended, entrant.name, seed)
+            runs[entrant.name].append(descend(problem, entrant, tuned[entrant.name][0], seed, ended=keep, **budget))
             print(f"{problem.name} {entrant.name} seed {seed}: final {runs[entrant.name][-1][-1][2]:.4f}", flush=True)
     return {
         entrant.name: {

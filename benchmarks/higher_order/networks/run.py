@@ -64,7 +64,7 @@ class Data:
     """
 
     def __init__(self, task: str, count: int, size: int, seed: int):
-        self.keys = list(ANSWERS[task])
+        self.task, self.keys = task, list(ANSWERS[task])
         self.widths = [np.size(ANSWERS[task][key]) for key in self.keys]
         self.ranges = np.concatenate([np.atleast_1d(ANSWERS[task][key]) for key in self.keys])
         self.rest = np.concatenate([np.atleast_1d(REST.get(key, 0.0)) for key in self.keys])
@@ -108,24 +108,14 @@ class Data:
         return float(np.sqrt(np.mean((found - self.truth) ** 2)))
 
 
-def train(
-    task: str,
-    method: str,
-    rate: float,
-    seconds: float,
-    seed: int,
-    count: int,
-    size: int,
-    samples: int = 8,
-) -> dict[str, Any]:
+def train(data: Data, method: str, rate: float, seconds: float, seed: int, samples: int = 8) -> dict[str, Any]:
     """One run: errors over time, relative to the first."""
-    data = Data(task, count, size, 5)
+    data.evaluations = data.step = 0
     torch.manual_seed(seed)
     network = PoseNetwork(len(data.ranges))
     weights = list(network.parameters())
     adam = torch.optim.Adam(weights, lr=rate)
     curve, clock = [(0.0, data.error(network))], 0.0
-    sigma = SIGMA[task]
 
     joint = method == "OurJoint"
     squares = [torch.zeros_like(weight) for weight in weights]
@@ -152,10 +142,9 @@ def train(
         radius = factor * rate * math.sqrt(sum(float((1 / scale**2).sum()) for scale in scales))
         ur.grey_box.newton_cg_step(lambda: value, weights, radius, iterations=2, scales=scales)
 
-    factor = 1.0
     while clock < seconds:
         left = 1 - clock / seconds
-        sigma, factor = SIGMA[task] * max(LEAST_SIGMA, left), max(LEAST_RATE, left)
+        sigma, factor = SIGMA[data.task] * max(LEAST_SIGMA, left), max(LEAST_RATE, left)
         for group in adam.param_groups:
             group["lr"] = factor * rate
         began = time.process_time()
@@ -193,12 +182,13 @@ def run(
     """
     torch.set_num_threads(1)
     for name in task:
-        weights = parameter_count(PoseNetwork(sum(np.size(width) for width in ANSWERS[name].values())))
+        data = Data(name, images, size, 5)
+        weights = parameter_count(PoseNetwork(len(data.ranges)))
         methods: dict[str, Any] = {}
         for method, rates in GRID.items():
-            tried = {r: train(name, method, r, seconds / 4, 1000, images, size)["final"] for r in rates}
+            tried = {r: train(data, method, r, seconds / 4, 1000)["final"] for r in rates}
             best = min(tried, key=lambda rate, tried=tried: tried[rate])
-            found = [train(name, method, best, seconds, seed, images, size) for seed in range(runs)]
+            found = [train(data, method, best, seconds, seed) for seed in range(runs)]
             methods[method] = {"rate": best, "tried": tried, "runs": found}
             print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
         entry = {"weights": weights, "seconds": seconds, "methods": methods}

@@ -45,9 +45,10 @@ MERGE = ("budgets.*.methods",)
 QUICK = {"budget": ("steps", "lit inside"), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
 
 
-def entrants(budget: str, rates: tuple[float, ...]) -> list[Entrant]:
-    """Who races: the image's samples differ, the derivative's do not."""
+def entrants(budget: str, fine: bool = False) -> list[Entrant]:
+    """Who races, on a grid of the usual size or on a fine one: the image's samples differ, the derivative's do not."""
     adam, cv = scaled(ur.optimizers.Adam), ur.images.RecursiveControlVariate
+    rates = SMOOTHED_RATES if fine else RATES[budget]
     plain = [Entrant(f"plain, {n}", "plain", ur.PathGradient(spp=n, adjoint_spp=1), adam, rates) for n in PLAIN[budget]]
     return plain + [
         Entrant(f"rcv, {n}", "rcv", ur.PathGradient(cv(), spp=n, adjoint_spp=1), adam, rates) for n in WITH[budget]
@@ -79,7 +80,7 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
     """Methods in order, and what plain images need at equal steps."""
     budgets: dict[str, Any] = {}
     for budget, entry in sorted(record["budgets"].items(), key=lambda item: list(PLAIN).index(kind(item[0]))):
-        names = [entrant.name for entrant in entrants(kind(budget), ())]
+        names = [entrant.name for entrant in entrants(kind(budget))]
         budgets[budget] = {**entry, "methods": {n: entry["methods"][n] for n in names if n in entry["methods"]}}
     found: dict[str, Any] = {"budgets": budgets, "needs": {}}
     for budget, entry in budgets.items():
@@ -119,8 +120,7 @@ def run(
         if fine:
             made = smoothed(made)
         limit = {"seconds": seconds} if by == "time" else {"steps": steps}
-        racing = entrants(by, SMOOTHED_RATES if fine else RATES[by])
-        chosen = [entrant for entrant in racing if not only or entrant.name in only]
+        chosen = [entrant for entrant in entrants(by, fine) if not only or entrant.name in only]
         methods = compete(made, chosen, measure(made), "both", seeds, **limit)
         label = f"{by}, {grid}³" if fine else by
         yield {
