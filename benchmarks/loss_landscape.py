@@ -105,7 +105,7 @@ def check(
     found: dict[str, list[float]] = {}
     for name, loss in LOSSES.items():
         view = ur.View(reference.astype(np.float32))
-        posed = ur.Problem(problem.renderer, problem.parameters, [view], loss, problem.max_depth)
+        posed = problem.replaced(views=[view], loss=loss)
         estimator = ur.PathGradient(spp=spp, adjoint_spp=spp)
         state, values = estimator.init(posed, parameters), []
         for run in range(runs):

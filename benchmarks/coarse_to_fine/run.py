@@ -69,9 +69,7 @@ def run(
             for states in STATES:
                 levels = None if states == "finest" else ur.CoarseToFine(changes, states=states)
                 parameters = [replace(p, coarse_to_fine=levels) for p in base.parameters]
-                made = ur.Problem(
-                    base.renderer, parameters, base.given_views, base.loss, base.max_depth, truth=base.truth, name=name
-                )
+                made = base.replaced(parameters=parameters)
                 rows[states] = measure(made, by, changes, steps, seeds)
                 print(name, by, states, rows[states], flush=True)
     return {"problems": found}

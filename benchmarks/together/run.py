@@ -78,14 +78,9 @@ def opened(name: str, resolution: int | None, reference_spp: int | None, assets:
     if name not in POSES:
         return found
     poses = POSES[name]
-    return ur.Problem(
-        found.renderer,
-        [*found.parameters, *(ur.Parameter(key, initial=start) for key, start in poses.items())],
-        found.given_views,
-        found.loss,
-        found.max_depth,
+    return found.replaced(
+        parameters=[*found.parameters, *(ur.Parameter(key, initial=start) for key, start in poses.items())],
         truth={**found.truth, **dict.fromkeys(poses, 0.0)},
-        name=name,
     )
 
 

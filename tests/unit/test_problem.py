@@ -148,6 +148,24 @@ def test_truth_takes_what_initial_takes():
     assert made.parameter_error(point) == {"floor.data": pytest.approx(0.3 / np.sqrt(3), rel=1e-5)}
 
 
+def test_replaced_is_the_same_scene_with_what_was_given_anew():
+    """Of one loaded scene; what is not given stays, truths of what is unknown no more go."""
+    truth = {"wall.value": [0.1, 0.2, 0.3], "floor.data": 0.4}
+    made = problem([WALL, Parameter("floor.data")], truth=truth, name="room", loss=losses.L1())
+    brighter = made.replaced(parameters=[Parameter("wall.value", initial=0.9), Parameter("lamp.scale")])
+    assert brighter.renderer is made.renderer
+    assert (brighter.name, brighter.loss, brighter.max_depth) == ("room", losses.L1(), made.max_depth)
+    assert list(brighter.truth) == ["wall.value"]
+    np.testing.assert_allclose(brighter.initial()["wall.value"], 0.9)
+    np.testing.assert_array_equal(brighter.views[0].reference, REFERENCE)
+
+    other = made.replaced(views=[View(REFERENCE + 1, sensor=1)], loss=losses.L2(), truth={}, name="other")
+    assert (other.name, other.loss, other.truth, other.parameters) == ("other", losses.L2(), {}, made.parameters)
+    np.testing.assert_array_equal(other.views[0].reference, REFERENCE + 1)
+    with pytest.raises(InputError, match="parameters: expected at least one Parameter"):
+        made.replaced(parameters=[])
+
+
 # ------------------------------------------------------------------ the loss
 
 

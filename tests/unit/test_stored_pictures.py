@@ -8,7 +8,7 @@ import pytest
 import unrender as ur
 from unrender.io import stored_pictures
 from unrender.io.stored_pictures import PictureStore, StoredPicture
-from unrender.problem import problem as problems
+from unrender.problem import view_checks
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
 
@@ -64,7 +64,7 @@ def test_a_problem_whose_pictures_wait_in_a_file_is_the_same(monkeypatch: pytest
     ]
     results = []
     for most in (1 << 29, 10):
-        monkeypatch.setattr(problems, "ON_DEVICE", most)
+        monkeypatch.setattr(view_checks, "ON_DEVICE", most)
         problem = ur.Problem(renderer, [ur.Parameter("map", 0.5)], views, max_depth=1)
         assert isinstance(problem.views[0].reference, StoredPicture) == (most == 10)
         monkeypatch.setattr(problem.references, "in_host_memory", most == 10)

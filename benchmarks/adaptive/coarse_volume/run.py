@@ -132,8 +132,7 @@ def run(
     def problem(coarse: bool) -> ur.Problem:
         way = ur.CoarseToFine(changes, states="carry") if coarse else None
         parameters = [replace(parameter, coarse_to_fine=way) for parameter in made.parameters]
-        given = [made.given_views[number] for number in seen]
-        return ur.Problem(made.renderer, parameters, given, made.loss, made.max_depth, name="nerf-volume")
+        return made.replaced(parameters=parameters, views=[made.given_views[number] for number in seen])
 
     def descend(name: str, rate: float, seed: int, points: int) -> dict[str, list[tuple[float, float, float]]]:
         scheme, coarse = WAYS[name]

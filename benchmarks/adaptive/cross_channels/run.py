@@ -138,7 +138,7 @@ def run(
         made = ur.gallery.problem(kind, **options)
         if special.startswith("roughness"):
             parameters = [replace(parameter, initial=float(special.split()[1])) for parameter in made.parameters]
-            made = ur.Problem(made.renderer, parameters, made.given_views, made.loss, made.max_depth, name=name)
+            made = made.replaced(parameters=parameters, name=name)
         entry = measure(made, paths, runs)
         print(name, entry, flush=True)
         yield {"problems": {name: {"options": options, **entry}}}

@@ -123,13 +123,14 @@ def problem(name: str, resolution: int = 48, reference_spp: int = 2048) -> ur.Pr
         [ur.Parameter(key) for key in keys],
         [ur.View(np.zeros((resolution, resolution, 3), np.float32))],
         max_depth=5,
+        name=name,
     )
     truth = {key: np.array(value) for key, value in blank.initial().items()}
     reference = ur.render(blank, truth, 0, reference_spp, 0)
     starts = [
         ur.Parameter(key, np.full(truth[key].shape, 0.5) if key.endswith("data") else 0.7 * truth[key]) for key in keys
     ]
-    return ur.Problem(lambda: scene(resolution), starts, [ur.View(reference)], max_depth=5, truth=truth, name=name)
+    return blank.replaced(parameters=starts, views=[ur.View(reference)], truth=truth)
 
 
 def powers(problem: ur.Problem) -> np.ndarray:

@@ -63,20 +63,10 @@ def opened(name: str, resolution: int, reference_spp: int) -> ur.Problem:
         return ur.gallery.problem(name, resolution=resolution, reference_spp=reference_spp)
     start, truth = DESCENTS.get(name, (0.2, 0.05))
     scene, key = _metal(name, truth, resolution), "metal.bsdf.alpha.value"
-
-    def made(reference: np.ndarray) -> ur.Problem:
-        known = {key: np.float32(truth)}
-        return ur.Problem(
-            scene,
-            [ur.Parameter(key, start, bounds=(0.01, 1))],
-            [ur.View(reference)],
-            max_depth=4,
-            truth=known,
-            name=name,
-        )
-
-    blank = made(np.zeros((resolution, resolution, 3), np.float32))
-    return made(np.asarray(ur.render(blank, blank.truth, 0, reference_spp, 0), np.float32))
+    black = ur.View(np.zeros((resolution, resolution, 3), np.float32))
+    unknown = ur.Parameter(key, start, bounds=(0.01, 1))
+    blank = ur.Problem(scene, [unknown], [black], max_depth=4, truth={key: np.float32(truth)}, name=name)
+    return blank.replaced(views=[ur.View(ur.render(blank, blank.truth, 0, reference_spp, 0))])
 
 
 def image_derivative(problem: ur.Problem, at: Tree, kind: str, spp: int) -> Callable[[Any], float]:

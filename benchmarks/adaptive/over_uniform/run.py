@@ -80,16 +80,11 @@ def rough_box(reference_spp: int = 2048, resolution: int = 64) -> ur.Problem:
         del found["integrator"]
         return found
 
-    def made(reference: np.ndarray) -> ur.Problem:
-        truth = {BOX: np.float32(0.1)}
-        return ur.Problem(
-            scene, [ur.Parameter(BOX, 0.3)], [ur.View(reference)], max_depth=6, truth=truth, name="rough-box"
-        )
-
-    blank = made(np.zeros((resolution, resolution, 3), np.float32))
+    black, truth = ur.View(np.zeros((resolution, resolution, 3), np.float32)), {BOX: np.float32(0.1)}
+    blank = ur.Problem(scene, [ur.Parameter(BOX, 0.3)], [black], max_depth=6, truth=truth, name="rough-box")
     parts = max(1, reference_spp // 256)
     images = [ur.render(blank, blank.truth, 0, reference_spp // parts, seed) for seed in range(parts)]
-    return made(np.mean(images, axis=0).astype(np.float32))
+    return blank.replaced(views=[ur.View(np.mean(images, axis=0))])
 
 
 @dataclass(frozen=True)

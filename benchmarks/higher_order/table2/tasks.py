@@ -65,15 +65,7 @@ def begin(problem: ur.Problem, task: Task, run: int, rate: float | None = None) 
         replace(p, initial=moved[p.key], bounds=problem.bounds[p.key], learning_rate=own.get(p.key))
         for p in problem.parameters
     ]
-    return ur.Problem(
-        problem.renderer,
-        parameters,
-        problem.views,
-        problem.loss,
-        problem.max_depth,
-        truth=problem.truth,
-        name=problem.name,
-    )
+    return problem.replaced(parameters=parameters)
 
 
 def _around(spread: float) -> Callable[..., np.ndarray]:

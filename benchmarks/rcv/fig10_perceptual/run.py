@@ -58,9 +58,7 @@ def run(
         made = ur.gallery.problem(
             "indirect-room", resolution=resolution, texture_resolution=resolution, reference_spp=2048
         )
-        problem = ur.Problem(
-            made.renderer, made.parameters, made.given_views, loss, made.max_depth, truth=made.truth, name=made.name
-        )
+        problem = made.replaced(loss=loss)
         target = converged(problem, truth(problem), reference_spp).mean
         path = descent(problem, ur.PathGradient(spp=16, adjoint_spp=16), 0.02, step + 1)
         bias, maps = derivatives(problem, path, {"perceptual": loss}, target, spp, runs, renders, reference_spp)

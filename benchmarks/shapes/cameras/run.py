@@ -59,8 +59,7 @@ class Case:
             far = PERCENT / 100 * self.distance(name)
             unknown.append(ur.Parameter(f"{name}.translation", initial=far * shift))
             unknown.append(ur.Parameter(f"{name}.rotation", initial=np.radians(DEGREES) * axis))
-        of = self.problem
-        return ur.Problem(of.renderer, unknown, of.views, of.loss, of.max_depth, name=of.name)
+        return self.problem.replaced(parameters=unknown)
 
 
 def _gallery(name: str, resolution: int, reference_spp: int) -> Case:
@@ -106,11 +105,12 @@ def _models(assets: Path, resolution: int, reference_spp: int) -> Case:
 
     unknown = [ur.Parameter(f"{name}.{part}") for name in places for part in ("translation", "rotation")]
     empty = np.zeros((resolution, resolution, 3), np.float32)
-    made = ur.Problem(scene, unknown, [ur.View(empty, index) for index in range(len(places))], max_depth=2)
+    made = ur.Problem(
+        scene, unknown, [ur.View(empty, index) for index in range(len(places))], max_depth=2, name="models"
+    )
     zeros = {parameter.key: np.zeros(3, np.float32) for parameter in unknown}
     views = [ur.View(ur.render(made, zeros, index, spp=reference_spp, seed=77), index) for index in range(len(places))]
-    made = ur.Problem(made.renderer, unknown, views, ur.losses.L2(), 2, name="models")
-    return Case(made, places, (0.0, 0.0, 0.0))
+    return Case(made.replaced(views=views), places, (0.0, 0.0, 0.0))
 
 
 def case(name: str, assets: Path | None, resolution: int, reference_spp: int) -> Case | None:

@@ -122,8 +122,7 @@ def begun(problem: ur.Problem, start: Callable[..., np.ndarray], seed: int) -> u
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     parts = {key: part.reshape(shapes[key]) for key, part in zip(shapes, np.split(values, ends[:-1]), strict=True)}
     unknown = [replace(each, initial=parts[each.key]) for each in problem.parameters]
-    of = problem
-    return ur.Problem(of.renderer, unknown, of.views, of.loss, of.max_depth, truth=of.truth, name=of.name)
+    return problem.replaced(parameters=unknown)
 
 
 def error(problem: ur.Problem, values: dict[str, np.ndarray]) -> float:

@@ -41,22 +41,13 @@ def checkerboard(reference_spp: int = 8192) -> ur.Problem:
     side, key = wall.texture_resolution, wall.parameters()[0].key
     odd = (np.indices((side, side)).sum(axis=0) % 2)[..., None]
     truth = np.broadcast_to(np.where(odd == 1, _BOARD[1], _BOARD[0]), (side, side, 3)).astype(np.float32)
-    blank = np.zeros((wall.resolution, wall.resolution, 3), np.float32)
-
-    def made(reference: np.ndarray) -> ur.Problem:
-        return ur.Problem(
-            wall.scene(),
-            wall.parameters(),
-            [ur.View(reference)],
-            wall.loss,
-            wall.max_depth,
-            truth={key: truth},
-            name="checkerboard",
-        )
-
+    black = ur.View(np.zeros((wall.resolution, wall.resolution, 3), np.float32))
+    blank = ur.Problem(
+        wall.scene(), wall.parameters(), [black], wall.loss, wall.max_depth, truth={key: truth}, name="checkerboard"
+    )
     parts = max(1, reference_spp // 512)
-    images = [ur.render(made(blank), {key: truth}, 0, reference_spp // parts, seed) for seed in range(parts)]
-    return made(np.mean(images, axis=0).astype(np.float32))
+    images = [ur.render(blank, {key: truth}, 0, reference_spp // parts, seed) for seed in range(parts)]
+    return blank.replaced(views=[ur.View(np.mean(images, axis=0))])
 
 
 def _end(problem: ur.Problem, chosen: Any, error: Any, seconds: float, seed: int) -> float:

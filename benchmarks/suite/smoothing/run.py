@@ -89,17 +89,7 @@ def run(
         if name in FOREIGN and assets is not None:
             opened = scenes.problem(name, assets, resolution, texture, reference_spp)
         elif name.startswith("checkerboard"):
-            opened = checkerboard(**options)
-            loss = scenes.LOSSES[name.split(", ")[1]]
-            opened = ur.Problem(
-                opened.renderer,
-                opened.parameters,
-                opened.given_views,
-                loss,
-                opened.max_depth,
-                truth=opened.truth,
-                name=name,
-            )
+            opened = checkerboard(**options).replaced(loss=scenes.LOSSES[name.split(", ")[1]], name=name)
         else:
             opened = ur.gallery.problem(name, **options)
         error = error_of(opened)

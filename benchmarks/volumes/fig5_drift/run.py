@@ -72,9 +72,7 @@ def run(steps: int = 600, seeds: int = 3, resolution: int = 32, only: tuple[str,
     there = [ur.Parameter(p.key, initial=made.truth[p.key], bounds=p.bounds) for p in made.parameters]
     found: dict[str, Any] = {}
     for loss, methods in METHODS.items():
-        problem = ur.Problem(
-            made.renderer, there, made.given_views, LOSSES[loss], made.max_depth, truth=made.truth, name="three-bodies"
-        )
+        problem = made.replaced(parameters=there, loss=LOSSES[loss])
         for label, estimator in ((f"{loss}, {name}", each) for name, each in methods.items()):
             if only and label not in only:
                 continue

@@ -51,8 +51,7 @@ def run(resolution: int = 32, runs: int = 96, factors: int = 11, reference_spp: 
         factors: points between 0.5 and 1.5
     """
     made = ur.gallery.problem("three-bodies", resolution=resolution, reference_spp=1)
-    fog = [ur.Parameter(p.key) for p in made.parameters if p.key == KEY]
-    problem = ur.Problem(made.renderer, fog, made.given_views, made.loss, made.max_depth, name="three-bodies")
+    problem = made.replaced(parameters=[ur.Parameter(KEY)])
     truth = np.asarray(made.truth[KEY])
 
     def at(factor: float) -> Tree:

@@ -144,7 +144,7 @@ def run(
     }  # fmt: skip
     made = ur.gallery.problem("nerf-volume", **options)
     views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
-    problem = ur.Problem(made.renderer, made.parameters, views, made.loss, made.max_depth, name="nerf-volume")
+    problem = made.replaced(views=views)
     if processor:
         dr.set_thread_count(1)
     errors, conditions = ImageErrors(made, options), {"seconds": seconds, "seeds": seeds, "resolution": resolution}

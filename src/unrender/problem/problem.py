@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.evaluation.surfaces import Surface, surface_error
-from unrender.io.stored_pictures import PictureStore
 from unrender.losses import L2, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
@@ -33,7 +31,7 @@ from unrender.problem.mesh_checks import (
     mesh_notices,
 )
 from unrender.problem.parameter import Parameter
-from unrender.problem.references import ON_DEVICE, References
+from unrender.problem.references import References
 from unrender.problem.validation import (
     Bounds,
     CheckedParameter,
@@ -51,14 +49,15 @@ from unrender.problem.validation import (
     renderer_notices,
 )
 from unrender.problem.view import View
-from unrender.problem.view_checks import check_view, stored
+from unrender.problem.view_checks import check_views
+from unrender.problem.view_losses import ViewLosses
 from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
 
 __all__ = ["Bounds", "Problem"]
 
 
-class Problem:
+class Problem(ViewLosses):
     """A scene, its unknown parameters, and the reference images.
 
     Everything is checked and read at construction. A problem then does not change: no method writes to it, and its caches hold device
@@ -160,7 +159,7 @@ class Problem:
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
-        self.views, notices = self._read_views()
+        self.views, notices = check_views(self.given_views, self.renderer.resolutions())
         self.notices += notices
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth = self._checked_truth(truth or {})
@@ -172,17 +171,6 @@ class Problem:
         self.references = References(self.views, self.renderer.array)
         self._references, self._masks = dict[int, Array](), dict[int, Array | None]()
         self._as_given: Problem | None = None
-
-    def _read_views(self) -> tuple[tuple[View, ...], list[str]]:
-        """The views with their pictures, and notices: in memory, or in a file where they are many."""
-        sizes, found, notices = self.renderer.resolutions(), [], []
-        known = [v.sensor for v in self.given_views if isinstance(v.sensor, int) and 0 <= v.sensor < len(sizes)]
-        store = PictureStore() if 12 * sum(math.prod(sizes[sensor]) for sensor in known) > ON_DEVICE else None
-        for number, given in enumerate(self.given_views):
-            view, notes = check_view(number, given, sizes)
-            found.append(view if store is None else stored(view, store))
-            notices += notes
-        return tuple(found), notices
 
     def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """True values as arrays; adds to the notices."""
@@ -198,6 +186,37 @@ class Problem:
         from unrender.problem.toml_file import read
 
         return read(path)
+
+    def replaced(
+        self,
+        *,
+        parameters: Sequence[Parameter] | None = None,
+        views: Sequence[View] | None = None,
+        loss: Loss | Callable[..., Any] | None = None,
+        truth: Mapping[str, Any] | None = None,
+        name: str | None = None,
+    ) -> Problem:
+        """Another problem of the same scene, which is not loaded again; arguments as for `Problem`, None for what it has already.
+
+        Of truths and true surfaces those stay whose parameters are still unknown. Of `origin` the scene's file stays.
+
+        Raises `InputError` as `Problem` does.
+        """
+        given = self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
+        keys = {parameter.key for parameter in given}
+        made = Problem(
+            self.renderer,
+            given,
+            self.given_views if views is None else views,
+            self.loss if loss is None else loss,
+            self.max_depth,
+            truth={key: value for key, value in self.truth.items() if key in keys} if truth is None else truth,
+            name=name or self.name,
+            surfaces={key: surface for key, surface in self.surfaces.items() if key in keys},
+        )
+        if self.remeshed_from is None:
+            made.origin = {key: value for key, value in self.origin.items() if key == "scene"}
+        return made
 
     @property
     def as_given(self) -> Problem:
@@ -328,50 +347,6 @@ class Problem:
             if key in found and found[key].shape in way.shapes(self.first_values[key].shape):
                 found[key] = way.refined(found[key], self.first_values[key].shape)
         return found
-
-    def reference(self, view: int) -> Array:
-        """The view's reference as the renderer's array (H, W, 3)."""
-        if view in self._references:
-            return self._references[view]
-        found = self.renderer.array(np.asarray(self.views[view].reference))
-        if not self.references.in_host_memory:
-            self._references[view] = found
-        return found
-
-    def mask(self, view: int) -> Array | None:
-        """The view's mask as the renderer's array (H, W, 1), or None where every pixel counts."""
-        if view in self._masks:
-            return self._masks[view]
-        mask = self.views[view].mask
-        found = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
-        if not self.references.in_host_memory:
-            self._masks[view] = found
-        return found
-
-    def loss_value(self, view: int, image: Array) -> Array:
-        """The view's part of the loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
-        return arrays.mean(self._values(image, self.reference(view), self.mask(view))) * self.views[view].weight
-
-    def loss_values(self, view: int, images: Array) -> Array:
-        """`loss_value` of each of many images (B, H, W, 3): (B,), lazy."""
-        reference, mask = arrays.add_first_axis(self.reference(view)), self.mask(view)
-        values = self._values(images, reference, None if mask is None else arrays.add_first_axis(mask))
-        return arrays.mean_over_rest(values) * self.views[view].weight
-
-    def loss_derivative(self, view: int, image: Array) -> Array:
-        """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
-        reference, mask = self.reference(view), self.mask(view)
-        derivative = self.loss.derivative(self._masked(image, reference, mask), reference)
-        factor = self.views[view].weight / math.prod(arrays.shape(reference))
-        return (derivative if mask is None else derivative * mask) * factor
-
-    def _values(self, image: Array, reference: Array, mask: Array | None) -> Array:
-        values = self.loss.value(self._masked(image, reference, mask), reference)
-        return values if mask is None or not self.loss.pixelwise else values * mask
-
-    def _masked(self, image: Array, reference: Array, mask: Array | None) -> Array:
-        """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
-        return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
 
     def texture_coordinates(self, key: str) -> np.ndarray | None:
         """(V, 2) of a mesh whose vertex positions are the parameter `key`; None where it has none."""

@@ -1,7 +1,8 @@
-"""Checks of one view, and its pictures."""
+"""Checks of views, and their pictures."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,13 +12,31 @@ from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.problem.errors import FieldError
+from unrender.problem.references import ON_DEVICE
 from unrender.problem.validation import is_number
 from unrender.problem.view import View
 
-__all__ = ["check_view", "stored"]
+__all__ = ["check_views"]
 
 
-def check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
+def check_views(given: Sequence[View], resolutions: Sequence[tuple[int, int]]) -> tuple[tuple[View, ...], list[str]]:
+    """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
+
+    Args:
+        given: as the problem was given them.
+        resolutions: (height, width) of each sensor's film.
+    """
+    found, notices = [], []
+    known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
+    store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
+    for number, one in enumerate(given):
+        view, notes = _check_view(number, one, resolutions)
+        found.append(view if store is None else _stored(view, store))
+        notices += notes
+    return tuple(found), notices
+
+
+def _check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
     """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
 
     Args:
@@ -75,7 +94,7 @@ def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sen
         )
 
 
-def stored(view: View, store: PictureStore) -> View:
+def _stored(view: View, store: PictureStore) -> View:
     """A view that was checked, with its pictures in a file."""
     kept = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
     return replace(view, **kept)
