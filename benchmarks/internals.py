@@ -26,12 +26,14 @@ from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import gather, leave_one_out_groups
 from unrender.evaluation import denoising
+from unrender.evaluation.metrics import srgb
 from unrender.gallery import parts, volumes
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
+from unrender.io.images import srgb_to_linear
 from unrender.methods import method
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
@@ -109,6 +111,8 @@ __all__ = [
     "project",
     "scene_description",
     "second_moments",
+    "srgb",
+    "srgb_to_linear",
     "stages_file",
     "stock_scene",
     "time_run_folder",

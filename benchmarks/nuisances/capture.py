@@ -12,7 +12,17 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from benchmarks.internals import MITSUBA_TO_OPENGL, Camera, CapturedMesh, Corrections, falloff, light_turns, ply
+from benchmarks.internals import (
+    MITSUBA_TO_OPENGL,
+    Camera,
+    CapturedMesh,
+    Corrections,
+    falloff,
+    light_turns,
+    ply,
+    srgb,
+    srgb_to_linear,
+)
 
 __all__ = ["NUISANCES", "RESPONSE", "TURNTABLE", "Made", "make", "responded", "truth"]
 
@@ -76,9 +86,9 @@ def truth() -> tuple[np.ndarray, np.ndarray]:
 
 def responded(x: np.ndarray) -> np.ndarray:
     """Radiance in [0, 1] through a camera whose curve has more contrast than sRGB, decoded as sRGB; none that `response` can be exactly."""
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    encoded = srgb(x)
     encoded = encoded + CONTRAST * encoded * (1 - encoded) * (2 * encoded - 1)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return srgb_to_linear(encoded)
 
 
 def poses() -> np.ndarray:
@@ -166,9 +176,7 @@ def make(folder: Path, given: tuple[str, ...], size: int, spp: int, told: bool) 
         Image.fromarray(np.uint8(np.round(255 * mask))).save(folder / "masks" / f"{v}.png")
         name = f"images/{v}.{'jpg' if 'jpeg' in given else 'exr'}"
         if "jpeg" in given:
-            clipped = np.clip(values, 0, 1)
-            shown = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-            Image.fromarray(np.uint8(np.round(255 * shown))).save(folder / name, quality=QUALITY, subsampling=0)
+            Image.fromarray(np.uint8(np.round(255 * srgb(values)))).save(folder / name, quality=QUALITY, subsampling=0)
         else:
             mi.Bitmap(values.astype(np.float32)).write(str(folder / name))
         frames.append({"file_path": name, "transform_matrix": wrong[v].tolist()})

@@ -1,9 +1,9 @@
 """Figure."""
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 SHOWN = {
@@ -22,8 +22,7 @@ def plot(record: Record) -> Figure:
     shown = {name: label for name, label in SHOWN.items() if name in maps}
     figure, axes = plt.subplots(1, len(shown), figsize=(2.4 * len(shown), 4), layout="constrained")
     for axis, (name, label) in zip(axes, shown.items(), strict=True):
-        picture = np.clip(maps[name], 0, 1)
-        axis.imshow(np.where(picture <= 0.0031308, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055))
+        axis.imshow(srgb(maps[name]))
         psnr = race["found"].get(name, {}).get("psnr")
         axis.set_title(label if psnr is None else f"{label}\n{psnr[-1][0]:.1f} dB")
         axis.axis("off")

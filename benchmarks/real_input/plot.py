@@ -4,6 +4,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 TITLES = {
@@ -23,6 +24,6 @@ def plot(record: Record) -> Figure:
         scale = np.percentile(maps[f"{name}/reference"], 97)
         for axis, (what, title) in zip(row, TITLES.items(), strict=True):
             unit = 1 if "texture" in what else scale
-            axis.imshow(np.clip(maps[f"{name}/{what}"] / unit, 0, 1) ** (1 / 2.2))
+            axis.imshow(srgb(maps[f"{name}/{what}"] / unit))
             axis.set(title=f"{name}: {title}", xticks=[], yticks=[])
     return figure

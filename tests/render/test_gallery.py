@@ -677,12 +677,6 @@ def test_photographs_are_reflectances(name):
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), textures.photograph(name, 128).mean(axis=(0, 1)), atol=0.01)
 
 
-def test_to_linear_is_the_standard_curve():
-    np.testing.assert_allclose(
-        textures.to_linear(np.array([0, 0.04, 0.5, 1.0])), [0, 0.0030959752, 0.2140411, 1], rtol=1e-6
-    )
-
-
 def test_a_bitmap_keeps_its_values_and_stands_upright():
     values = np.arange(12, dtype=np.float32).reshape(2, 2, 3) / 12
     texture = mi.load_dict(textures.bitmap(values))

@@ -44,6 +44,11 @@ def test_linearises_png(tmp_path: Path, bits: int):
     np.testing.assert_allclose(images.read(tmp_path / "a.png", linearise=False).values, encoded, atol=1e-6)
 
 
+def test_srgb_is_linearised_by_the_standard_curve():
+    values = images.srgb_to_linear(np.array([0, 0.04, 0.5, 1.0]))
+    np.testing.assert_allclose(values, [0, 0.0030959752, 0.2140411, 1], rtol=1e-6)
+
+
 def test_reads_jpeg_and_upper_case_endings(tmp_path: Path):
     Image.fromarray(np.full((6, 8, 3), 188, np.uint8)).save(tmp_path / "A.JPG")
     picture = images.read(str(tmp_path / "A.JPG"))

@@ -23,7 +23,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.gradient_variance import gradients
-from benchmarks.internals import Key, channel_moments, element_scales
+from benchmarks.internals import Key, channel_moments, element_scales, with_differential_bsdf
 
 PROBLEMS: dict[str, dict[str, Any]] = {
     "mirror-trio": {"reference_spp": 256},
@@ -35,8 +35,11 @@ PROBLEMS: dict[str, dict[str, Any]] = {
     "mirror-trio, roughness 0.08": {"reference_spp": 256},
     "mirror-trio, roughness 0.25": {"reference_spp": 256},
     "mirror-trio, 32²": {"resolution": 32, "reference_spp": 1024},
+    "mirror-trio, roughness 0.15, differential": {"reference_spp": 256},
+    "mirror-trio, roughness 0.25, differential": {"reference_spp": 256},
 }
-"""By label: the problem's name comes first. The roughness is the mirror's where the gradient is taken; 0.15 otherwise."""
+"""By label: the problem's name comes first. The roughness is the mirror's where the gradient is taken; 0.15 otherwise.
+Differential: derivatives by roughness are sampled apart (`PathGradient(differential_bsdf=True)`)."""
 UNIFORM = 0.1
 PARTS = 8
 BLUR = 1.5
@@ -134,11 +137,12 @@ def run(
     """
     for name in problem:
         options = {**PROBLEMS[name], **({"resolution": resolution} if resolution else {})}
-        kind, _, special = name.partition(", ")
+        kind, *special = name.split(", ")
         made = ur.gallery.problem(kind, **options)
-        if special.startswith("roughness"):
-            parameters = [replace(parameter, initial=float(special.split()[1])) for parameter in made.parameters]
-            made = made.replaced(parameters=parameters, name=name)
+        for roughness in (float(word.split()[1]) for word in special if word.startswith("roughness")):
+            made = made.replaced(parameters=[replace(parameter, initial=roughness) for parameter in made.parameters])
+        if "differential" in special:
+            made = made.rendered_by(with_differential_bsdf(made.renderer))
         entry = measure(made, paths, runs)
         print(name, entry, flush=True)
         yield {"problems": {name: {"options": options, **entry}}}

@@ -1,10 +1,10 @@
 """Figure."""
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.adaptive.fig7_failure.run import FEW
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 
@@ -13,7 +13,7 @@ def plot(record: Record) -> Figure:
     stored, problems = record["maps"], record["variance"]
     figure, axes = plt.subplots(len(problems), 3, figsize=(9, 3.2 * len(problems)), squeeze=False, layout="constrained")
     for row, name in zip(axes, problems, strict=True):
-        row[0].imshow(np.clip(stored[f"{name}|reference"], 0, 1) ** (1 / 2.2))
+        row[0].imshow(srgb(stored[f"{name}|reference"]))
         row[0].set_title(name)
         for axis, which in zip(row[1:], ("few", "many"), strict=True):
             axis.imshow(stored[f"{name}|{which}"], cmap="magma", norm="log")

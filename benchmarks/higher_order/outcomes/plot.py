@@ -1,9 +1,9 @@
 """Figure."""
 
 import matplotlib.pyplot as plt
-import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 
@@ -17,7 +17,7 @@ def plot(record: Record) -> Figure:
     for column, name in enumerate(errors):
         for row, kind in enumerate(rows):
             axis = axes[row, column]
-            axis.imshow(np.clip(maps[f"{name}|{kind}"], 0, 1) ** (1 / 2.2), interpolation="nearest")
+            axis.imshow(srgb(maps[f"{name}|{kind}"]), interpolation="nearest")
             axis.set(xticks=[], yticks=[])
             if row == 0:
                 axis.set_title(name, fontsize=9)

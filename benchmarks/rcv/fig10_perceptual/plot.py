@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.derivative_bias import METHODS
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 
@@ -41,7 +42,7 @@ def plot(record: Record) -> Figure:
     }
     for axis, (name, title) in zip(axes[2], titles.items(), strict=True):
         axis.axis("off")
-        axis.imshow(np.clip(maps[f"wall/{name}"], 0.0, 1.0) ** (1 / 2.2), interpolation="nearest")
+        axis.imshow(srgb(maps[f"wall/{name}"]), interpolation="nearest")
         axis.set_title(title, fontsize=9)
     figure.suptitle(
         "Derivative of the perceptual loss by each pixel, each picture with a scale of its own; walls that descents on it find"

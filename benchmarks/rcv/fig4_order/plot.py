@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 PATHS = {"still": "unchanging parameters", "drift": "drifting parameters"}
@@ -37,9 +38,7 @@ def plot(record: Record) -> Figure:
         line[0].axhline(0, color="black", lw=0.7)
         line[0].set(xlabel="step", ylabel="mean bias, % of the image's mean", title=f"{title} (± standard error)")
         line[0].legend(fontsize=7)
-        line[1].imshow(
-            np.clip(maps[f"{path}/reference"] / np.quantile(maps[f"{path}/reference"], 0.98), 0, 1) ** (1 / 2.2)
-        )
+        line[1].imshow(srgb(maps[f"{path}/reference"] / np.quantile(maps[f"{path}/reference"], 0.98)))
         line[1].set_title(f"converged, step {record['settings']['steps'] - 1}", fontsize=9)
         top = 100 * float(np.quantile(maps[f"{path}/before"], 0.98))
         drawn: Any = None

@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.internals import srgb
 from benchmarks.runner.records import Record
 
 METHODS = {"plain": ("plain", "#888888"), "primary": ("primary space", "#d1782a"), "path": ("path space", "#1f6fb4")}
@@ -43,7 +44,7 @@ def plot(record: Record) -> Figure:
         )
         row[1].legend(fontsize=8)
         reference = maps[f"{scene}/reference"]
-        row[2].imshow(np.clip(reference / np.quantile(reference, 0.98), 0, 1) ** (1 / 2.2))
+        row[2].imshow(srgb(reference / np.quantile(reference, 0.98)))
         row[2].set_title("converged, last step", fontsize=9)
         drawn: Any = None
         for axis, name in zip(row[3:5], ("primary", "path"), strict=True):

@@ -13,19 +13,15 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.io.images import srgb_to_linear
 
-__all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp", "to_linear"]
+__all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp"]
 
 Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
 """Those that lie inside scikit-image's wheel, so that nothing is downloaded."""
 
 DARKEST, BRIGHTEST = 0.04, 0.9
 """Reflectances of real paints: none is black, none reflects all."""
-
-
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def photograph(name: Photograph, resolution: int) -> np.ndarray:
@@ -36,7 +32,7 @@ def photograph(name: Photograph, resolution: int) -> np.ndarray:
     height, width = picture.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
-    linear = to_linear(picture[top : top + side, left : left + side, :3] / 255.0)
+    linear = srgb_to_linear(picture[top : top + side, left : left + side, :3] / 255.0)
     small = _resized(linear, resolution)
     return np.clip(DARKEST + (BRIGHTEST - DARKEST) * small, DARKEST, BRIGHTEST).astype(np.float32)
 
