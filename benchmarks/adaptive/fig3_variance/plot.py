@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.adaptive.fig3_variance.run import FIVE_LEVELS, SHOWN
 from benchmarks.internals import srgb
+from benchmarks.pixel_schemes import COLOURS
 from benchmarks.runner.records import Record
 
 
@@ -27,8 +28,8 @@ def plot(record: Record) -> Figure:
         of = [entry["schemes"][name] for entry in cases.values()]
         places = np.arange(len(cases)) + 0.16 * (number - 2)
         values, errors = [e["variance"] for e in of], [e["error"] for e in of]
-        axes[3].barh(places, values, height=0.15, xerr=errors, label=name)
+        axes[3].barh(places, values, height=0.15, xerr=errors, label=name, color=COLOURS[name])
     axes[3].set(xscale="log", xlabel="variance of dL/d(roughness)", yticks=range(len(cases)), yticklabels=list(cases))
     axes[3].invert_yaxis()
-    axes[3].legend(fontsize=7)
+    axes[3].legend(fontsize=7, ncols=5, loc="lower center", bbox_to_anchor=(0.25, 1))
     return figure

@@ -51,7 +51,7 @@ def ratios(schemes: Schemes) -> dict[str, list[float]]:
 
 def label(roughness: float, differential: bool, samples: int) -> str:
     """The name of a case."""
-    words = ["differential"] * differential + [f"{samples} paths"] * (samples != USUAL_SAMPLES)
+    words = ["differential"] * differential + [f"maps from {samples} paths"] * (samples != USUAL_SAMPLES)
     return ", ".join([f"roughness {roughness:g}", *words])
 
 
