@@ -49,6 +49,23 @@ def test_its_gradient_is_that_of_mitsubas_own_functions() -> None:
     assert found.info["samples"] == 2 * 4 * 8 * 8
 
 
+def test_alpha_of_the_film_is_left_out() -> None:
+    """Films with alpha are common, and references have none."""
+    described = surface()
+    seen = {}
+    for pixel_format in ("rgb", "rgba"):
+        film = {**described["sensor"]["film"], "pixel_format": pixel_format}
+        scene = {**described, "sensor": {**described["sensor"], "film": film}}
+        asked = ur.Problem(scene, [ur.Parameter(TEXTURE, initial=0.5)], [ur.View(np.full((8, 8, 3), 0.3))], max_depth=3)
+        start, estimator = asked.initial(), StockGradient(spp=4)
+        found, _ = estimator.estimate(asked, start, estimator.init(asked, start), Key(5, 3))
+        assert found.info["images"][0].shape == (8, 8, 3)
+        seen[pixel_format] = found
+    assert seen["rgba"].loss == pytest.approx(seen["rgb"].loss, rel=1e-5)
+    ours, theirs = (seen[each].gradient[TEXTURE].numpy() for each in ("rgba", "rgb"))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-9)
+
+
 def test_its_steps_are_those_of_mitsubas_adam() -> None:
     rng = np.random.default_rng(0)
     theirs, ours = mi.ad.Adam(lr=0.03), ur.optimizers.Adam(0.03)

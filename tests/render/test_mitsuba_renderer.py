@@ -259,3 +259,27 @@ def test_a_number_stays_a_number() -> None:
     assert problem.renderer.array(np.array(0.25)).shape == ()
     assert problem.initial()[key].shape == ()
     assert ur.render(problem, problem.truth, spp=1).shape == (8, 8, 3)
+
+
+def test_a_value_that_a_plugin_refuses_is_an_input_error() -> None:
+    """The sky's turbidity has a range; bounds that leave it meet Mitsuba's own error, in one line, and what was set before stays."""
+    key = "sky.turbidity"
+    made = problem(box(sky={"type": "sunsky", "turbidity": 4.0}), key)
+    assert made.bounds[key] == (1.0, 10.0)
+    session = made.renderer.prepare([key], None, False)
+    first = session.image({key: mi.TensorXf([3.0], ())}, SampleRequest(0, 4, 1)).images[0].numpy()
+    with pytest.raises(
+        ur.InputError, match=r"sky\.turbidity: Mitsuba refuses the value, give it bounds: .*out of range"
+    ):
+        session.image({key: mi.TensorXf([0.6], ())}, SampleRequest(0, 4, 1))
+    np.testing.assert_array_equal(
+        session.image({key: mi.TensorXf([3.0], ())}, SampleRequest(0, 4, 1)).images[0].numpy(), first
+    )
+
+
+def test_more_camera_rays_than_a_launch_has_are_refused() -> None:
+    session = problem(box()).renderer.prepare([WALL], None, False)
+    with pytest.raises(
+        ur.InputError, match=r"camera rays at once: a launch has less than 2³²; take fewer samples per pixel"
+    ):
+        session.image({}, SampleRequest(0, 1 << 24, 1))

@@ -147,3 +147,13 @@ def test_npy_fills_any_shape(tmp_path: Path):
 def test_a_picture_cannot_fill_a_volume(tmp_path: Path):
     with pytest.raises(InputError, match=r"a picture cannot fill a parameter of shape \(3,\)"):
         values.fill(bitmap(COLOURS, tmp_path / "a.exr"), (3,))
+
+
+def test_alpha_that_is_left_out_is_told(tmp_path: Path):
+    """Of files of integers, whose alpha is straight, so that what is under it counts; of an opaque one there is nothing to tell."""
+    pixels = np.full((6, 8, 4), 188, np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert images.read(tmp_path / "a.png").notice == "a.png: 8-bit sRGB, linearised, its alpha left out"
+    pixels[..., 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert images.read(tmp_path / "a.png").notice == "a.png: 8-bit sRGB, linearised"

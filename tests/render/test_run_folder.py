@@ -22,7 +22,7 @@ from callbacks import At
 import unrender as ur
 from unrender.core.errors import InputError
 from unrender.io import files
-from unrender.runs.folder import checkpoint, lock
+from unrender.runs.folder import checkpoint, lock, reader
 from unrender.runs.folder.lock import Holder, Lock
 
 RATE = "rate"
@@ -435,3 +435,26 @@ def test_checkpoints_that_cannot_be_said_are_one_warning(tmp_path: Path) -> None
     )
     assert np.isfinite(result.parameters[RATE])
     assert status(folder) == "finished"
+
+
+def test_ctrl_c_while_the_folder_is_begun_leaves_nothing_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has a method and no record is no run, and `--out` would refuse it."""
+    written = files.write_arrays
+
+    def interrupted(path: Path, *arguments: Any, **options: Any) -> None:
+        written(path, *arguments, **options)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_arrays", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            start(tmp_path / "run")
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
+    assert start(tmp_path / "run").status == "finished"
+
+
+def test_a_run_killed_while_its_folder_was_begun_says_so(tmp_path: Path) -> None:
+    start(tmp_path / "run", steps=2)
+    (tmp_path / "run" / "run.json").unlink()
+    with pytest.raises(InputError, match="stopped before its first step; start it again with --overwrite"):
+        reader.read_run_record(tmp_path / "run")

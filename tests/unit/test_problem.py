@@ -96,6 +96,15 @@ def test_initial_is_moved_into_the_bounds_and_says_so():
     assert made.notices == ["parameter wall.value: 2 of 3 initial values moved into the bounds [0.1, 0.9]"]
 
 
+@pytest.mark.parametrize(("initial", "bounds"), [(7.0, (0.1, 4.0)), (None, (3.0, 4.0)), (np.float32(0), (1.0, None))])
+def test_a_number_is_moved_into_its_bounds_too(initial: Any, bounds: Any):
+    made = problem([Parameter("lamp.scale", initial, bounds=bounds)])
+    low, high = bounds
+    assert made.initial()["lamp.scale"].shape == ()
+    assert made.initial()["lamp.scale"] == (low if initial is None or initial < low else high)
+    assert made.notices == [f"parameter lamp.scale: 1 of 1 initial values moved into the bounds [{low}, {high}]"]
+
+
 @pytest.mark.parametrize(
     ("bounds", "kept"),
     [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None))],
@@ -134,6 +143,17 @@ def test_eight_bit_masks_are_taken_as_they_are():
     made = problem(views=[View(REFERENCE, mask=mask)])
     np.testing.assert_allclose(np.asarray(made.views[0].mask), mask / 255)
     assert made.notices == []
+
+
+def test_a_reference_with_saturated_pixels_says_so():
+    """Of integers alone: floating-point values have no white."""
+    levels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    levels[1, 2, 0] = 255
+    told = "view 0: 5 % of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+    assert told in problem(views=View(levels)).notices
+    assert problem(views=View((levels / 255).astype(np.float32))).notices == []
+    levels[1, 2, 0] = 254
+    assert not any("saturated" in notice for notice in problem(views=View(levels)).notices)
 
 
 def test_one_view_or_parameter_may_be_given_bare():

@@ -107,8 +107,8 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
 
 def read(path: Path) -> Mesh:
     """The mesh in a PLY or OBJ file, with its texture coordinates where it has them. Raises `InputError`."""
-    if (found := bounded_files.kind(path)) != "file":
-        raise InputError(f"--mesh {path}: {'not a file' if found else 'no such file'}")
+    if bounded_files.kind(path) != "file":
+        raise InputError(f"--mesh {path}: {bounded_files.no_file(path)}")
     if path.suffix.lower() not in _KINDS:
         raise InputError(f"--mesh {path}: expected a {' or '.join(_KINDS)} file")
     import mitsuba as mi

@@ -55,8 +55,8 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
     """
     if path.suffix.lower() in _RAW:
         raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
-    if (found := bounded_files.kind(path)) != "file":
-        raise InputError(f"{path}: {'not a file' if found else 'no such file'}")
+    if bounded_files.kind(path) != "file":
+        raise InputError(f"{path}: {bounded_files.no_file(path)}")
     try:
         with _opened(path) as picture:
             if picture.format == "PNG":

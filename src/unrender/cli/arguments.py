@@ -164,10 +164,13 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
         if options:
             raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
         if not Path(name).exists():
-            raise InputError(f"{name}: no such file")
+            from unrender.io import bounded_files  # NumPy with it
+
+            raise InputError(f"{name}: {bounded_files.no_file(Path(name))}")
         refuse_stages(name)
     elif name not in gallery.names():
-        hint = did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
+        file = f"; did you mean {name}.toml?" if Path(f"{name}.toml").is_file() else ""
+        hint = file or did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
         raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
 
 

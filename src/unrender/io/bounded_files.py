@@ -8,6 +8,7 @@ that begins with the path.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import stat
@@ -21,7 +22,8 @@ from typing import IO, Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.text import printable
+from unrender.core.suggestions import did_you_mean
+from unrender.core.text import printable, visible
 from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
@@ -31,6 +33,7 @@ __all__ = [
     "LARGEST_TEXT",
     "exists",
     "kind",
+    "no_file",
     "open_regular",
     "parse_json",
     "parse_object",
@@ -58,6 +61,7 @@ MOST_VALUES = 200_000
 """Values of JSON text: reading a million names takes seconds."""
 
 _MEMBERS = 10_000
+_MOST_BESIDE = 1000  # names of a folder that a missing one is compared with
 _BYTES_PER_BYTE = 100  # unpacked for one in the file: zeros give a thousand
 _LARGEST_DIRECTORY = 1 << 20  # of an archive, in bytes: its members' names among them
 _UNREADABLE = (
@@ -97,6 +101,19 @@ def kind(path: Path) -> str:
     return "file" if stat.S_ISREG(mode) else "folder" if stat.S_ISDIR(mode) else "other"
 
 
+def no_file(path: Path) -> str:
+    """Why a path is no regular file, in words: what is there instead, or the nearest name beside it."""
+    try:
+        if path.exists():
+            return "not a file"
+        beside = [
+            visible(found.name) for found in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if found.is_file()
+        ]
+    except OSError:
+        beside = []
+    return f"no such file{did_you_mean(path.name, beside)}"
+
+
 # ---------------------------------------------------------------------- bytes and text
 
 
@@ -119,7 +136,7 @@ def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
         # Without waiting for a pipe's other end, and without following a link that took the file's place meanwhile.
         descriptor = os.open(real, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0))
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
+        raise InputError(f"{path}: {no_file(path)}") from error
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links is a RuntimeError before Python 3.13

@@ -45,8 +45,8 @@ def read(source: Any, linearise: bool = True) -> Picture:
     """
     if isinstance(source, (str, Path)):
         path = Path(source)
-        if (found := bounded_files.kind(path)) != "file":
-            raise InputError(f"{path}: {'not a file' if found else 'no such file'}")
+        if bounded_files.kind(path) != "file":
+            raise InputError(f"{path}: {bounded_files.no_file(path)}")
         if path.suffix.lower() not in READABLE:
             raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
         try:
@@ -96,7 +96,11 @@ def _read(path: Path, linearise: bool) -> Picture:
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             return Picture(_colour_channels(bitmap))
         encoded = bool(bitmap.srgb_gamma())
-        bits = 8 * np.array(bitmap).itemsize
+        stored = np.array(bitmap)
+        bits = 8 * stored.itemsize
+        transparent = (
+            bitmap.has_alpha() and bool((stored[..., -1] < np.iinfo(stored.dtype).max).any()) if encoded else False
+        )
         single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
         kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
         if encoded and not linearise:
@@ -107,7 +111,9 @@ def _read(path: Path, linearise: bool) -> Picture:
     except Exception as error:  # Mitsuba throws what its image libraries throw
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
-    return Picture(values, f"{bits}-bit sRGB, linearised" if encoded and linearise else "")
+    if not (encoded and linearise):
+        return Picture(values)
+    return Picture(values, f"{bits}-bit sRGB, linearised{', its alpha left out' if transparent else ''}")
 
 
 def _colour_channels(bitmap: Any) -> np.ndarray:

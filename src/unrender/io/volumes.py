@@ -150,8 +150,8 @@ def check_vol(path: Path) -> int:
 def _existing(file: Path) -> Path:
     if file.suffix.lower() not in READABLE:
         raise InputError(f"{file}: unknown kind of grid, expected one of {', '.join(READABLE)}")
-    if (found := bounded_files.kind(file)) != "file":
-        raise InputError(f"{file}: {'not a file' if found else 'no such file'}")
+    if bounded_files.kind(file) != "file":
+        raise InputError(f"{file}: {bounded_files.no_file(file)}")
     return file
 
 

@@ -292,7 +292,7 @@ def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]
     if not moved:
         return start, ""
     notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
-    return np.clip(start, low, high).astype(np.float32, copy=False), notice
+    return np.asarray(np.clip(start, low, high), np.float32), notice  # of a number, clip returns no array
 
 
 def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> tuple[np.ndarray, str]:

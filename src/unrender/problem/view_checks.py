@@ -18,6 +18,9 @@ from unrender.problem.view import View
 
 __all__ = ["check_views"]
 
+_WHITE = 0.001
+"""Share of saturated pixels that is told."""
+
 
 def check_views(given: Sequence[View], resolutions: Sequence[tuple[int, int]]) -> tuple[tuple[View, ...], list[str]]:
     """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
@@ -64,6 +67,10 @@ def _check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) 
             image = images.read(view.reference)
             _check_size(image.values, height, width, view.sensor)
             notices += [f"{owner}: reference {image.notice}"] if image.notice else []
+            if image.notice and (white := float(np.mean((image.values >= 1).any(axis=2)))) >= _WHITE:
+                notices.append(
+                    f"{owner}: {100 * white:.2g} % of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+                )
             if image.values.shape[2] == 1:
                 notices.append(
                     f"{owner}: reference of one channel, which red, green and blue of the image are each compared with"

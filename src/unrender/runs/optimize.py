@@ -20,6 +20,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
 from unrender.problem.serialization import origin
 from unrender.runs import advice, components
+from unrender.runs.bounds_watch import BoundsWatch
 from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
@@ -154,6 +155,7 @@ def assemble_hooks(
         PhaseTimes(earlier),
         InfluenceWatch(),
         MeshWatch(),
+        BoundsWatch(),
         Budget(),
         Refinement(),
         MeshRefinement(),

@@ -102,7 +102,9 @@ def resume_run(
         for source in _sources(stored):
             changes = _changes(stored, source.checkpoint, fingerprint)
             if changes and not force:
-                raise InputError(f"run folder {folder}: not as it was: {changes}; to go on nevertheless, force it")
+                raise InputError(
+                    f"run folder {folder}: not as it was: {changes}; to go on nevertheless, give --force (force=True)"
+                )
             _check_budget_left(folder, method, source.checkpoint)
             if source.checkpoint is not None:
                 initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))

@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.core.errors import InputError
+
 __all__ = [
     "CameraSamples",
     "Films",
@@ -77,6 +79,13 @@ def independent(sampler: Any, lanes: int) -> RepeatingSampler:
     return RepeatingSampler(lanes, rng)
 
 
+def _seed(sampler: Any, seed: Any, lanes: int) -> None:
+    """Raises `InputError` for more lanes than Dr.Jit counts."""
+    if lanes >= 1 << 32:
+        raise InputError(f"{lanes} camera rays at once: a launch has less than 2³²; take fewer samples per pixel")
+    sampler.seed(seed, lanes)
+
+
 @dataclass(frozen=True)
 class CameraSamples:
     """What a sensor makes camera rays of, per lane; samples of a pixel side by side.
@@ -115,7 +124,7 @@ def camera_samples(
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
     lanes = copies * count * spp
-    sampler.seed(seed, lanes)
+    _seed(sampler, seed, lanes)
     index = dr.arange(mi.UInt32, lanes) // spp
     if copies > 1:
         index %= count
@@ -148,7 +157,7 @@ def camera_samples_of_many(
         sampler, seed, spp, pixels, count: see `camera_samples`.
     """
     lanes = count * spp
-    sampler.seed(seed, lanes)
+    _seed(sampler, seed, lanes)
     pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, which))
     width, height = dr.gather(mi.UInt32, settings.widths, which), dr.gather(mi.UInt32, settings.heights, which)
     # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.

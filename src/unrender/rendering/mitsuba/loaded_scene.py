@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from unrender.core import arrays, memory
 from unrender.core.errors import InputError
+from unrender.core.text import reason_of
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
@@ -209,12 +210,21 @@ class LoadedScene:
         if any(key in self.poses for key in changed):
             self.poses.write(self.parameters, self._posed)
         elif changed:
-            with _without_warnings():
-                self.parameters.update()
+            self._update(changed)
             self._hold({key: self.leaves.get(key, self._settings[key].value) for key in changed})
         if changed and self._shared:
             plain = [key for key in self._settings if key not in self.poses]
             self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
+
+    def _update(self, changed: Sequence[str]) -> None:
+        """Have the scene take what was written. Raises `InputError` where a plugin of Mitsuba's refuses it."""
+        try:
+            with _without_warnings():
+                self.parameters.update()
+        except RuntimeError as error:
+            raise InputError(
+                f"{', '.join(changed)}: Mitsuba refuses the value, give it bounds: {reason_of(error, 200)}"
+            ) from error
 
     def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
         """Whether the parameter was set to this, and the scene still holds it."""

@@ -119,11 +119,9 @@ def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | No
     while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Medium)):
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
     if isinstance(node, mi.Emitter):
-        return (
-            (0.0, None)
-            if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data")
-            else (None, None)
-        )
+        if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data"):
+            return 0.0, None
+        return {"turbidity": (1.0, 10.0), "albedo": (0.0, 1.0)}.get(role, (None, None))
     if isinstance(node, mi.Medium):
         if role == "emission" and f"{key.rpartition('.emission')[0]}.{COEFFICIENT}1.data" in parameters:
             return None, None

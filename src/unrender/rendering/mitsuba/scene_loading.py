@@ -52,8 +52,8 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
     try:
         if isinstance(description, (str, Path)):
             path = Path(description)
-            if (found := bounded_files.kind(path)) != "file":
-                raise InputError(f"scene {path}: {'not a file' if found else 'no such file'}")
+            if bounded_files.kind(path) != "file":
+                raise InputError(f"scene {path}: {bounded_files.no_file(path)}")
             scene = loading.load(path)
         elif isinstance(description, dict):
             scene = loading.load(description)

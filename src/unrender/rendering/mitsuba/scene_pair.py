@@ -319,7 +319,8 @@ class ScenePair:
             if key.endswith(".data") and dr.is_tensor_v(value):
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
-            return ParameterInfo(shape, False, False, why, perturbable=able)
+            low, high = physical_range(self.current_parameters, key)
+            return ParameterInfo(shape, False, False, why, low, high, perturbable=able)
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)

@@ -47,6 +47,9 @@ class StockSession:
             seed=mi.UInt32(seeds[0]),
             seed_grad=mi.UInt32(seeds[1]),  # pyright: ignore[reportArgumentType]
         )
+        channels = image.shape[2]
+        if channels in (2, 4):  # a film with alpha, which references have not
+            image = image[:, :, : channels - 1]
         seen = mi.TensorXf(dr.detach(image))
         dr.backward(dr.sum(image * weigh(seen), axis=None))
         gradient = scene.take_gradients()

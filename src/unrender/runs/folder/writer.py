@@ -125,6 +125,9 @@ class RunWriter(Hook):
             self._started = True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
+        except KeyboardInterrupt:
+            _clear(self.folder)  # what is whole but for run.json nothing would take for a run
+            raise
 
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
         """Go on after `records`, with which the history is rewritten. Raises `InputError` where that cannot be."""
