@@ -458,3 +458,11 @@ def test_a_run_killed_while_its_folder_was_begun_says_so(tmp_path: Path) -> None
     (tmp_path / "run" / "run.json").unlink()
     with pytest.raises(InputError, match="stopped before its first step; start it again with --overwrite"):
         reader.read_run_record(tmp_path / "run")
+
+
+def test_what_result_save_wrote_says_what_it_lacks(tmp_path: Path) -> None:
+    plain(2).save(tmp_path / "saved")
+    with pytest.raises(InputError, match=r"method\.toml: no such file: Result\.save keeps no run to go on with"):
+        ur.resume(tmp_path / "saved")
+    with pytest.raises(InputError, match=r"problem\.toml: no such file: Result\.save keeps no problem; hand it in"):
+        ur.export(tmp_path / "saved", tmp_path / "scene")

@@ -24,6 +24,11 @@ _SYNONYMS = {
     "batch_size": ("count", "pixels"),
     "depth": ("max_depth",),
     "res": ("resolution",),
+    "mse": ("L2",),
+    "l2_loss": ("L2",),
+    "mae": ("L1",),
+    "l1_loss": ("L1",),
+    "relmse": ("RelativeL2",),
     "size": ("resolution",),
 }
 """What other packages call things, and what they are called here. Only names that are known in a place are suggested there."""

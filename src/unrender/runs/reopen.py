@@ -79,6 +79,11 @@ def problem_of(directory: str | Path) -> Problem:
     folder = Path(directory)
     origin = read_run_record(folder).problem.origin
     path = folder / serialization.FILE
+    if not bounded_files.exists(path):
+        raise InputError(
+            f"{path}: no such file: Result.save keeps no problem; hand it in, as unrender.export((problem, result.parameters), out), or "
+            "keep a whole run, with run_directory="
+        )
     stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
     if "gallery" in stored:
         name, options = stored["gallery"], stored.get("options", {})

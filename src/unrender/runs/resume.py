@@ -13,6 +13,7 @@ from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
+from unrender.io import bounded_files
 from unrender.optimizers.base import Optimizer
 from unrender.problem.fingerprint import differences
 from unrender.problem.problem import Problem
@@ -67,6 +68,10 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     """
     folder = Path(directory)
     record = reader.read_run_record(folder)
+    if not bounded_files.exists(folder / METHOD):
+        raise InputError(
+            f"{folder / METHOD}: no such file: Result.save keeps no run to go on with; run_directory= does"
+        )
     method = method_file.read(folder / METHOD)
     if (process := holder(folder)) is not None:
         raise InputError(f"run folder {folder}: in use by {process}")
