@@ -192,6 +192,12 @@ def wrong_goals(page: str) -> Iterator[str]:
             yield f"{goal}: not in the results: {sorted(given)}"
 
 
+def configurations(entrant: dict[str, Any]) -> int:
+    """How many were tried, on short runs or, of `meta.at_length`, on whole ones."""
+    whole = {f"{each['rate']:.2g}" for each in entrant.get("whole", ())}
+    return len(entrant["tried"]) + len(whole - {f"{each['rate']:.2g}" for each in entrant["tried"] if "rate" in each})
+
+
 @functools.cache
 def baselines() -> list[str]:
     """The rows of the table of baselines that the records ask for, as regular expressions."""
@@ -202,7 +208,7 @@ def baselines() -> list[str]:
             (record[key] for key in ("entries", "tasks", "budgets", "schedules") if key in record), {None: record}
         )
         for task, entry in tasks.items():
-            tried = "; ".join(f"{method}: {len(each['tried']) or '—'}" for method, each in entry["methods"].items())
+            tried = "; ".join(f"{method}: {configurations(each) or '—'}" for method, each in entry["methods"].items())
             cells = [
                 f"`{re.escape(name)}`",
                 re.escape(task) if task else r"[\w-]+",

@@ -39,7 +39,7 @@ POINTS = 60
 TRIAL = 8
 """Steps that tell the cost of one."""
 USUAL_RESOLUTION = 64
-LOWER = 2
+LOWER = 4
 """Lower rates that whole runs try at most."""
 PAPER = "meta, 1 + 2"
 MERGE = ("entries.*.methods",)
