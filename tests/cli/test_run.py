@@ -137,9 +137,6 @@ def test_run_replaces_earlier_results_only_when_told(unrender, problem: Path, mi
     problem.write_text(problem.read_text().replace("truth", "# truth"))
     assert unrender(*words, "--overwrite").status == 0
     assert names(problem.parent / "result") == [name for name in sorted([*FILES, "notes.txt"]) if name != "truth.npz"]
-    (problem.parent / "result" / "run.json").unlink()  # as if killed while the folder was begun
-    assert unrender(*words).error == refused.error
-    assert unrender(*words, "--overwrite").status == 0
 
 
 def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_variant: str, monkeypatch):

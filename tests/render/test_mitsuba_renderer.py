@@ -272,6 +272,10 @@ def test_a_value_that_a_plugin_refuses_is_an_input_error() -> None:
         ur.InputError, match=r"sky\.turbidity: Mitsuba refuses the value, give it bounds: .*out of range"
     ):
         session.image({key: mi.TensorXf([0.6], ())}, SampleRequest(0, 4, 1))
+    refused = mi.TensorXf([0.6], ())
+    for _ in range(3):  # and is refused again, not taken for what the scene has
+        with pytest.raises(ur.InputError, match="Mitsuba refuses"):
+            session.image({key: refused}, SampleRequest(0, 4, 1))
     np.testing.assert_array_equal(
         session.image({key: mi.TensorXf([3.0], ())}, SampleRequest(0, 4, 1)).images[0].numpy(), first
     )

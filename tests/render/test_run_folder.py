@@ -456,6 +456,7 @@ def test_ctrl_c_while_the_folder_is_begun_leaves_nothing_in_it(tmp_path: Path, m
 def test_a_run_killed_while_its_folder_was_begun_says_so(tmp_path: Path) -> None:
     start(tmp_path / "run", steps=2)
     (tmp_path / "run" / "run.json").unlink()
+    (tmp_path / "run" / "lock").touch()
     with pytest.raises(InputError, match="stopped before its first step; start it again with --overwrite"):
         reader.read_run_record(tmp_path / "run")
 

@@ -149,8 +149,12 @@ def test_a_reference_with_saturated_pixels_says_so():
     """Of integers alone: floating-point values have no white."""
     levels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     levels[1, 2, 0] = 255
-    told = "view 0: 5 % of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+    told = "view 0: 5.0% of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
     assert told in problem(views=View(levels)).notices
+    assert told not in problem(views=View(levels), loss=losses.Censored()).notices
+    elsewhere = np.ones((HEIGHT, WIDTH), np.float32)
+    elsewhere[1, 2] = 0
+    assert not any("saturated" in notice for notice in problem(views=View(levels, mask=elsewhere)).notices)
     assert problem(views=View((levels / 255).astype(np.float32))).notices == []
     levels[1, 2, 0] = 254
     assert not any("saturated" in notice for notice in problem(views=View(levels)).notices)
@@ -184,6 +188,8 @@ def test_replaced_is_the_same_scene_with_what_was_given_anew():
     np.testing.assert_array_equal(other.views[0].reference, REFERENCE + 1)
     with pytest.raises(InputError, match="parameters: expected at least one Parameter"):
         made.replaced(parameters=[])
+    with pytest.raises(InputError, match="the scene has no parameter"):
+        made.replaced(parameters=[Parameter(["wall.value"])])  # pyright: ignore[reportArgumentType]
 
 
 # ------------------------------------------------------------------ the loss

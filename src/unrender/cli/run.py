@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["conclude", "exit_status", "run"]
 
-_MARKS = ("run.json", "method.toml", "lock")
-"""Of a run folder; one that was killed before its first step has no record yet."""
-
 
 def run(
     context: typer.Context,
@@ -86,7 +83,7 @@ def run(
             steps, seconds = arguments.budget(steps, seconds)
             chosen.start(given)
             arguments.check_problem(problem, options)
-        folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, *_MARKS)
+        folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)

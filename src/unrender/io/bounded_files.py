@@ -109,7 +109,7 @@ def no_file(path: Path) -> str:
         beside = [
             visible(found.name) for found in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if found.is_file()
         ]
-    except OSError:
+    except (OSError, ValueError):  # the latter of a zero byte in a name
         beside = []
     return f"no such file{did_you_mean(path.name, beside)}"
 

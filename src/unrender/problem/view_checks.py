@@ -22,30 +22,36 @@ _WHITE = 0.001
 """Share of saturated pixels that is told."""
 
 
-def check_views(given: Sequence[View], resolutions: Sequence[tuple[int, int]]) -> tuple[tuple[View, ...], list[str]]:
+def check_views(
+    given: Sequence[View], resolutions: Sequence[tuple[int, int]], tell_saturated: bool = True
+) -> tuple[tuple[View, ...], list[str]]:
     """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
 
     Args:
         given: as the problem was given them.
         resolutions: (height, width) of each sensor's film.
+        tell_saturated: whether references with saturated pixels are worth a notice.
     """
     found, notices = [], []
     known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(given):
-        view, notes = _check_view(number, one, resolutions)
+        view, notes = _check_view(number, one, resolutions, tell_saturated)
         found.append(view if store is None else _stored(view, store))
         notices += notes
     return tuple(found), notices
 
 
-def _check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) -> tuple[View, list[str]]:
+def _check_view(
+    index: int, view: View, resolutions: Sequence[tuple[int, int]], tell_saturated: bool
+) -> tuple[View, list[str]]:
     """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
 
     Args:
         index: of the view in the problem, for messages.
         view: as given.
         resolutions: (height, width) of each sensor's film.
+        tell_saturated: see `check_views`.
     """
     owner = f"view {index}"
 
@@ -59,18 +65,16 @@ def _check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) 
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
+    limited = False  # to a white
     try:
         if isinstance(view.reference, StoredPicture):
             _check_size(view.reference, height, width, view.sensor)
             reference = view.reference
         else:
             image = images.read(view.reference)
+            limited = bool(image.notice)
             _check_size(image.values, height, width, view.sensor)
             notices += [f"{owner}: reference {image.notice}"] if image.notice else []
-            if image.notice and (white := float(np.mean((image.values >= 1).any(axis=2)))) >= _WHITE:
-                notices.append(
-                    f"{owner}: {100 * white:.2g} % of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
-                )
             if image.values.shape[2] == 1:
                 notices.append(
                     f"{owner}: reference of one channel, which red, green and blue of the image are each compared with"
@@ -90,7 +94,17 @@ def _check_view(index: int, view: View, resolutions: Sequence[tuple[int, int]]) 
                 raise InputError("it is 0 everywhere: no pixel would count")
         except InputError as error:
             raise wrong("mask", error) from error
+    if tell_saturated and limited and (white := _saturated(reference, mask)) >= _WHITE:
+        notices.append(
+            f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+        )
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
+
+
+def _saturated(reference: np.ndarray, mask: np.ndarray | StoredPicture | None) -> float:
+    """The share of pixels that are white in a channel, among those that count."""
+    white = (reference >= 1).any(axis=2)
+    return float(np.mean(white if mask is None else white[np.asarray(mask) > 0]))
 
 
 def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sensor: int) -> None:

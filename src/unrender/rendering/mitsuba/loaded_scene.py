@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import itertools
+import re
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -102,6 +103,10 @@ def share_addresses(others: Sequence[mi.Scene] = ()) -> None:
 
 def _nothing() -> None:
     return None
+
+
+_OF_MITSUBA = re.compile(r"\[\w+\.(h|cpp):\d+\]")
+"""Where a plugin threw: its errors begin so, those of Dr.Jit, such as that there is no memory left, do not."""
 
 
 @dataclass(frozen=True)
@@ -222,6 +227,10 @@ class LoadedScene:
             with _without_warnings():
                 self.parameters.update()
         except RuntimeError as error:
+            if not _OF_MITSUBA.search(str(error)):
+                raise
+            for key in changed:  # what the scene holds now is not what it shows
+                self._settings[key] = replace(self._settings[key], spent=True)
             raise InputError(
                 f"{', '.join(changed)}: Mitsuba refuses the value, give it bounds: {reason_of(error, 200)}"
             ) from error

@@ -136,7 +136,7 @@ def read_run_record(folder: Path) -> RunRecord:
             p.name for p in itertools.islice(folder.iterdir(), _MOST_LISTED) if (p / schema.RECORD).is_file()
         )
         hint = f" (run folders inside it: {', '.join(inside[:5])})" if inside else ""
-        if not hint and (folder / schema.METHOD).is_file():
+        if not hint and (folder / schema.METHOD).is_file() and (folder / schema.LOCK).is_file():
             hint = ": the run was stopped before its first step; start it again with --overwrite"
         raise InputError(f"{folder}: not a run folder: {schema.RECORD} is missing{hint}")
     return read_record(folder / schema.RECORD, folder)

@@ -6,6 +6,7 @@ a kill would have left at the last checkpoint, or later.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -126,7 +127,8 @@ class RunWriter(Hook):
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
         except KeyboardInterrupt:
-            _clear(self.folder)  # what is whole but for run.json nothing would take for a run
+            with contextlib.suppress(OSError):
+                _clear(self.folder)  # what is whole but for run.json nothing would take for a run
             raise
 
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
