@@ -65,14 +65,13 @@ def _check_view(
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
-    limited = False  # to a white
+    limited = None  # in values, to a white
     try:
         if isinstance(view.reference, StoredPicture):
             _check_size(view.reference, height, width, view.sensor)
             reference = view.reference
         else:
             image = images.read(view.reference)
-            limited = bool(image.notice)
             _check_size(image.values, height, width, view.sensor)
             notices += [f"{owner}: reference {image.notice}"] if image.notice else []
             if image.values.shape[2] == 1:
@@ -80,6 +79,7 @@ def _check_view(
                     f"{owner}: reference of one channel, which red, green and blue of the image are each compared with"
                 )
             reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
+            limited = reference if image.notice else None
     except InputError as error:
         raise wrong("reference", error) from error
     mask = view.mask
@@ -94,17 +94,18 @@ def _check_view(
                 raise InputError("it is 0 everywhere: no pixel would count")
         except InputError as error:
             raise wrong("mask", error) from error
-    if tell_saturated and limited and (white := _saturated(reference, mask)) >= _WHITE:
+    counted = None if mask is None else np.asarray(mask) > 0
+    if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
         notices.append(
             f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
         )
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
 
 
-def _saturated(reference: np.ndarray, mask: np.ndarray | StoredPicture | None) -> float:
-    """The share of pixels that are white in a channel, among those that count."""
-    white = (reference >= 1).any(axis=2)
-    return float(np.mean(white if mask is None else white[np.asarray(mask) > 0]))
+def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
+    """The share of pixels that are white in a channel, among those that count; None for all."""
+    white = np.any(reference >= 1, axis=2)
+    return float(np.mean(white if counted is None else white[counted]))
 
 
 def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sensor: int) -> None:
