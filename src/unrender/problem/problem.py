@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.evaluation.surfaces import Surface, surface_error
-from unrender.losses import L2, Censored, Loss
+from unrender.losses import L2, Loss
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import notebook
@@ -159,9 +159,7 @@ class Problem(ViewLosses):
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
-        self.views, notices = check_views(
-            self.given_views, self.renderer.resolutions(), not isinstance(self.loss, Censored)
-        )
+        self.views, notices = check_views(self.given_views, self.renderer.resolutions(), self.loss)
         self.notices += notices
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth = self._checked_truth(truth or {})

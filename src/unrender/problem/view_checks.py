@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
+from unrender.losses import Censored, Loss
 from unrender.problem.errors import FieldError
 from unrender.problem.references import ON_DEVICE
 from unrender.problem.validation import is_number
@@ -23,20 +24,20 @@ _WHITE = 0.001
 
 
 def check_views(
-    given: Sequence[View], resolutions: Sequence[tuple[int, int]], tell_saturated: bool = True
+    given: Sequence[View], resolutions: Sequence[tuple[int, int]], loss: Loss
 ) -> tuple[tuple[View, ...], list[str]]:
     """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
 
     Args:
         given: as the problem was given them.
         resolutions: (height, width) of each sensor's film.
-        tell_saturated: whether references with saturated pixels are worth a notice.
+        loss: one that knows of saturated pixels needs no notice of them.
     """
     found, notices = [], []
     known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(given):
-        view, notes = _check_view(number, one, resolutions, tell_saturated)
+        view, notes = _check_view(number, one, resolutions, not isinstance(loss, Censored))
         found.append(view if store is None else _stored(view, store))
         notices += notes
     return tuple(found), notices
@@ -51,7 +52,7 @@ def _check_view(
         index: of the view in the problem, for messages.
         view: as given.
         resolutions: (height, width) of each sensor's film.
-        tell_saturated: see `check_views`.
+        tell_saturated: whether a reference with saturated pixels is worth a notice.
     """
     owner = f"view {index}"
 
