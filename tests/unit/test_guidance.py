@@ -116,7 +116,7 @@ def test_what_is_no_estimator_or_optimizer_is_one_line(estimator: Any, optimizer
 # ------------------------------------------------------------------ keys
 
 ABLE, NAMELESS = ParameterInfo((3,)), ParameterInfo((3,), False, False, "no id", perturbable=False)
-POSES = {f"box.{part}": ABLE for part in ("translation", "rotation", "scale")}
+POSES = {f"box.{part}": ParameterInfo((3,), rigid=True) for part in ("translation", "rotation", "scale")}
 
 
 def test_an_object_without_an_id_is_not_taken_for_another_one() -> None:
@@ -133,6 +133,8 @@ def test_a_transformation_leads_to_the_pose() -> None:
     )
     assert "box.rotation" in near_key("bax.to_world", known)
     assert instead_of("lamp.to_world", known).endswith("has no pose")
+    sky = {"sky.to_world": NAMELESS, "sky.scale": ParameterInfo(())}  # its brightness
+    assert instead_of("sky.to_world", sky).endswith("has no pose")
     assert instead_of("box.bsdf.reflectance.value", known) == ""
 
 

@@ -98,9 +98,8 @@ def _read(path: Path, linearise: bool) -> Picture:
         encoded = bool(bitmap.srgb_gamma())
         stored = np.array(bitmap)
         bits = 8 * stored.itemsize
-        transparent = (
-            bitmap.has_alpha() and bool((stored[..., -1] < np.iinfo(stored.dtype).max).any()) if encoded else False
-        )
+        told = encoded and linearise
+        transparent = told and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
         single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
         kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
         if encoded and not linearise:
@@ -111,7 +110,7 @@ def _read(path: Path, linearise: bool) -> Picture:
     except Exception as error:  # Mitsuba throws what its image libraries throw
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
-    if not (encoded and linearise):
+    if not told:
         return Picture(values)
     return Picture(values, f"{bits}-bit sRGB, linearised{', its alpha left out' if transparent else ''}")
 

@@ -336,7 +336,7 @@ def _unreachable(problem: Problem) -> str:
     """Why path gradients of the parameters do not serve; "" where they do."""
     known = problem.renderer.parameters()
     if rigid := next((key for key in problem.shapes() if known[key].rigid), ""):
-        other = "" if _refusal(problem) else "; --method plain has path gradients"
+        other = "; --method plain has path gradients" if known[rigid].differentiable else ""
         return f"parameter {rigid} moves a shape or sensor as a whole, with plateaus of the loss{other}"
     return _refusal(problem)
 

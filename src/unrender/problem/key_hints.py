@@ -55,10 +55,8 @@ def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
 
 
 def _poses(owner: str, known: Mapping[str, ParameterInfo]) -> str:
-    found = [f"{owner}.{part}" for part in _POSE if f"{owner}.{part}" in known]
-    if not any(name.endswith((".translation", ".rotation")) for name in found):
-        return ""  # the scale of an emitter is its brightness
-    return ", ".join(found)
+    found = [f"{owner}.{part}" for part in _POSE]
+    return ", ".join(key for key in found if key in known and known[key].rigid)  # an emitter's scale is its brightness
 
 
 def _is_nameless(key: str) -> bool:
