@@ -6,11 +6,13 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE / "extensions"))
+sys.path[:0] = [str(HERE / "extensions"), str(HERE.parent)]
 
+from benchmarks.runner.results_page import write_pages  # noqa: E402
 from unrender.backend import variant  # noqa: E402
 
 variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))  # some public classes are Mitsuba's own subclasses
+write_pages(HERE / "benchmarks")
 
 project = "unrender"
 author = "the unrender contributors"

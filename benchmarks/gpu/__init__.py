@@ -5,5 +5,5 @@ states.py     what became of each, one file a slice, in records/
 execute.py    runs a slice's commands within its minutes
 outcomes.py   pytest's plug-in that records each test's outcome, and leaves out those that have one
 cli.py        the command
-page.py       the list, and what docs/results.md shows beside the processor's figures
+page.py       the list, and what benchmark pages show beside the figures of the CPU
 """

@@ -275,17 +275,6 @@ SLICES: tuple[Slice, ...] = (
         (3, "adaptive.cross_channels --paths 16777216"),
         (5, "adaptive.fig6_differential --resolution 256 --count 8192"),
     ),
-    _one("adaptive-cost", "cost of the importance map to 4096²", (5, "adaptive.cost --largest 4096")),
-    _one(
-        "adaptive-samples",
-        "variance times cost over samples",
-        (6, "adaptive.samples --problem ajar spiral indirect-room caustic --resolution 128 --runs 16"),
-    ),
-    _one(
-        "adaptive-tails",
-        "what removes the gradient's heavy tails",
-        (8, "adaptive.tails --problem ajar spiral --resolution 96 --chains 12"),
-    ),
     *(
         _one(
             f"volumes-nerf-{number}",
@@ -315,7 +304,6 @@ SLICES: tuple[Slice, ...] = (
         "volumes-cost",
         "cost of volumes, dense and sparse",
         (3, "volumes.cost --resolution 256 --grid 128"),
-        (3, "volumes.sparse_cost --resolution 256 --grid 256"),
     ),
     _one(
         "memory",

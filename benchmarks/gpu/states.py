@@ -99,5 +99,6 @@ def full() -> Folder:
 
 
 def toy() -> Folder:
-    """Of toy sizes: the states are kept with the plan, the records below out/."""
-    return Folder(PACKAGE / "gpu" / "toy", ROOT / "out" / "benchmarks" / "gpu-toy", is_toy=True)
+    """Return the folder of toy sizes, below out/."""
+    folder = ROOT / "out" / "benchmarks" / "gpu-toy"
+    return Folder(folder, folder, is_toy=True)

@@ -12,9 +12,9 @@ ROOT = Path(__file__).resolve().parents[2]
 """The repository."""
 PACKAGE = ROOT / "benchmarks"
 ORDER = (
-    "speed", "own_loop", "rcv.fig9_reconstruction", "real_input", "rcv", "meta", "higher_order", "adaptive", "together",
-    "volumes", "shapes", "coarse_to_fine", "checkpoints", "durability", "sweeps", "watch", "workers",
-)  # fmt: skip
+    *("suite", "own_loop", "speed", "peers", "rcv.fig9_reconstruction", "rcv", "meta", "higher_order", "adaptive"),
+    *("volumes", "shapes", "together"),
+)
 """The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""
 
 

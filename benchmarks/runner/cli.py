@@ -2,7 +2,7 @@
 
 python -m benchmarks                       list them
 python -m benchmarks NAME [options]        run one; `--help` tells its options
-python -m benchmarks results               write docs/results.md from all records
+python -m benchmarks results               write a page per benchmark, with figures, to docs/benchmarks
 python -m benchmarks gpu                   the plan for a GPU, in slices; `--help` tells its options
 """
 
@@ -31,9 +31,9 @@ def main(arguments: Sequence[str]) -> int:
             print(f"{name:{width}}  {benchmark.summary}")
         return 0
     if arguments[0] == "results":
-        from benchmarks.runner.results_page import write_page
+        from benchmarks.runner.results_page import write_pages
 
-        print(f"wrote {write_page()}")
+        print(f"wrote {write_pages()}")
         return 0
     if arguments[0] == "gpu":
         from benchmarks.gpu.cli import main as gpu
@@ -78,7 +78,7 @@ def execute(benchmark: Benchmark, arguments: Sequence[str]) -> int:
         print(f"no results.json in {folder}", file=sys.stderr)
         return 2
     if benchmark.has("plot"):
-        draw(benchmark, record, folder)
+        draw(benchmark, record, folder / "figure.png")
     if benchmark.has("table"):
         print(benchmark.module("table").table(record))
     return 0
@@ -110,8 +110,8 @@ def measure(benchmark: Benchmark, settings: dict[str, Any], folder: Path, keep: 
         records.write(folder, record)
 
 
-def draw(benchmark: Benchmark, record: Record, folder: Path) -> None:
-    """Write figure.png."""
+def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
+    """Write the figure of a record. Return whether it could be drawn: some figures need images that a record may lack."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -121,9 +121,10 @@ def draw(benchmark: Benchmark, record: Record, folder: Path) -> None:
         if "maps" in record or error.args != ("maps",):
             raise
         print("no figure: this record keeps no images", file=sys.stderr)
-        return
-    figure.savefig(folder / "figure.png", dpi=100)
-    print(f"wrote {folder / 'figure.png'}", flush=True)
+        return False
+    figure.savefig(file, dpi=100)
+    print(f"wrote {file}", flush=True)
+    return True
 
 
 def _plain(settings: dict[str, Any]) -> Record:

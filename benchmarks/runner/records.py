@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.runner.catalogue import ROOT
 
 Record = dict[str, Any]
+_DIGITS, _WIDTH = 6, 140
 
 
 def command() -> str:
@@ -54,13 +55,38 @@ def write(folder: Path, record: Record) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     figures = {key: value for key, value in record.items() if key != "maps"}
     part = folder / "results.json.part"
-    part.write_text(json.dumps(figures, indent=1) + "\n")
+    part.write_text(_compact(_rounded(figures)) + "\n")
     os.replace(part, folder / "results.json")
     if record.get("maps"):
         images: dict[str, Any] = {name: np.float32(image) for name, image in record["maps"].items()}
         np.savez_compressed(folder / "maps.part.npz", **images)
         os.replace(folder / "maps.part.npz", folder / "maps.npz")
     print(f"wrote {folder / 'results.json'}", flush=True)
+
+
+def _rounded(value: Any) -> Any:
+    """Round every float of a tree to six significant digits."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(entry) for entry in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _compact(value: Any, indent: int = 0) -> str:
+    """Write JSON with one line for what fits into one, and for each list of numbers or of points."""
+    line = json.dumps(value)
+    if not isinstance(value, (dict, list)) or not value or len(line) + indent <= _WIDTH:
+        return line
+    pad = " " * (indent + 1)
+    if isinstance(value, dict):
+        parts = [f"{pad}{json.dumps(key)}: {_compact(entry, indent + 1)}" for key, entry in value.items()]
+        return "{\n" + ",\n".join(parts) + "\n" + " " * indent + "}"
+    if not any(
+        isinstance(x, dict) or (isinstance(x, list) and any(isinstance(y, (dict, list)) for y in x)) for x in value
+    ):
+        return json.dumps(value, separators=(",", ":"))
+    return "[\n" + ",\n".join(pad + _compact(entry, indent + 1) for entry in value) + "\n" + " " * indent + "]"
 
 
 def merge(old: Mapping[str, Any], new: Mapping[str, Any], path: Sequence[str], top: bool = True) -> Record:

@@ -1,4 +1,4 @@
-"""docs/results.md: notes, tables and figures of all benchmarks that were measured, and beside them what a GPU gave."""
+"""Pages of the documentation site, one per benchmark: notes, command, table and figure, built from its record."""
 
 from __future__ import annotations
 
@@ -8,24 +8,49 @@ from benchmarks.gpu.page import beside
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
-HEAD = """# Results
+__all__ = ["section", "split_notes", "write_pages"]
 
-Written by `python -m benchmarks results` from each benchmark's `notes.md`, `results.json` and `table.py`; losses as plainly as wins.
-Ratios are of one run on one machine; times are not comparable between sections.
+_FOLDER = ROOT / "docs" / "benchmarks"
+_INDEX = """# Benchmarks
 
-RCV: Nicolet et al. 2023, *Recursive Control Variates for Inverse Rendering*. Meta: Balint et al. 2023, *Joint Sampling and Optimisation for
-Inverse Rendering*. HO: Wang et al. 2025, *Stochastic Gradient Estimation for Higher-order Differentiable Rendering*. Adaptive: *Image-space
-Adaptive Sampling for Fast Inverse Rendering*. [The papers](papers.md) has their own figures and tables beside these."""
+One page per benchmark: its question, the command, the table of its record and the figure. Ratios are of one run on one
+machine; times are not comparable between pages. [Results](../results.md) has the summary.
+
+```{{toctree}}
+:maxdepth: 1
+
+{names}
+```
+"""
 
 
-def write_page(file: Path = ROOT / "docs" / "results.md") -> Path:
-    """Write the page; its path."""
-    file.write_text("\n\n".join([HEAD, *filter(None, map(section, benchmarks().values()))]) + "\n")
-    return file
+def write_pages(folder: Path = _FOLDER, figures: bool = True) -> Path:
+    """Write a page per benchmark and an index.
+
+    Args:
+        folder: receives the pages.
+        figures: whether to draw each benchmark's figure beside its page.
+
+    Returns:
+        The index.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = []
+    for name, benchmark in benchmarks().items():
+        text = section(benchmark)
+        if text is None:
+            continue
+        names.append(name)
+        if figures and benchmark.has("plot"):
+            text += _figure(benchmark, folder)
+        (folder / f"{name}.md").write_text(f"{text[1:]}\n")
+    index = folder / "index.md"
+    index.write_text(_INDEX.format(names="\n".join(names)))
+    return index
 
 
 def section(benchmark: Benchmark) -> str | None:
-    """One benchmark's part of the page; None where it was not measured."""
+    """Return one benchmark's text under a heading of level two; None without a record."""
     record = records.read(benchmark.folder)
     if record is None:
         return None
@@ -36,12 +61,21 @@ def section(benchmark: Benchmark) -> str | None:
         f"Mitsuba {versions['mitsuba']}."
     )
     parts = [f"## {title}", measured, notes, benchmark.module("table").table(record)]
-    if (benchmark.folder / "figure.png").is_file():
-        parts.append(f"![{title}](../{(benchmark.folder / 'figure.png').relative_to(ROOT).as_posix()})")
     return "\n\n".join(filter(None, [*parts, *beside(benchmark)]))
 
 
 def split_notes(benchmark: Benchmark) -> tuple[str, str]:
-    """The title and the findings in notes.md."""
+    """Return the title and the findings of notes.md."""
     head, _, body = (benchmark.folder / "notes.md").read_text().partition("\n")
     return head.removeprefix("# ").strip(), body.strip()
+
+
+def _figure(benchmark: Benchmark, folder: Path) -> str:
+    """Draw the figure from the record. Return the Markdown that shows it, "" where the record has no images to draw."""
+    from benchmarks.runner.cli import draw
+
+    record = records.read(benchmark.folder)
+    file = folder / f"{benchmark.name}.png"
+    if record is None or not draw(benchmark, record, file):
+        return ""
+    return f"\n\n![{split_notes(benchmark)[0]}]({file.name})"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.workers.scale.stand_in import stand_ins
+from tests.campaigns.stand_in import stand_ins
 from tests.contract import analytic
 from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
 from unrender.backend import variant

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.durability.faults import Killed, operations
-from benchmarks.durability.survivors import recording
+from tests.campaigns.faults import Killed, operations
+from tests.campaigns.survivors import recording
 from unrender.runs.folder import checkpoint, reader
 
 RATE, STEPS = "rate", 6

@@ -57,10 +57,23 @@ def test_the_table_of_the_readme_is_what_the_suite_found() -> None:
     assert len(rows) >= 12
 
 
-def test_the_results_page_is_what_the_records_say(tmp_path: Path) -> None:
-    written = results_page.write_page(tmp_path / "results.md").read_text()
-    assert written == (ROOT / "docs" / "results.md").read_text()
-    assert written.count("\n## ") == len(ALL)
+def test_every_benchmark_has_a_page(tmp_path: Path) -> None:
+    index = results_page.write_pages(tmp_path, figures=False).read_text()
+    for name, each in ALL.items():
+        page = (tmp_path / f"{name}.md").read_text()
+        assert page.startswith(f"# {results_page.split_notes(each)[0]}\n")
+        assert f"\n{name}\n" in index
+    assert len(list(tmp_path.glob("*.md"))) == len(ALL) + 1
+
+
+def test_a_record_keeps_six_digits_and_reads_back(tmp_path: Path) -> None:
+    points = [[0.1, 123456.789], [2.0, 1e-9]]
+    records.write(tmp_path, {"runs": {"a": points, "b": [[[1, 2.5]]]}, "note": "x" * 200, "none": None})
+    record = records.read(tmp_path)
+    assert record is not None
+    assert record["runs"] == {"a": [[0.1, 123457.0], [2.0, 1e-9]], "b": [[[1, 2.5]]]}
+    assert record["note"] == "x" * 200
+    assert record["none"] is None
 
 
 def test_nothing_is_added_to_the_search_path() -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.durability.faults import Killed, operations
-from benchmarks.durability.survivors import recording
+from tests.campaigns.faults import Killed, operations
+from tests.campaigns.survivors import recording
 from unrender.io import files
 
 DEAD = 2**22 + 1

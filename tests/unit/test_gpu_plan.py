@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.gpu import cli, execute, outcomes, page
 from benchmarks.gpu.plan import SLICES, Command, Slice
-from benchmarks.gpu.states import Folder, device, full, toy
+from benchmarks.gpu.states import Folder, device, full
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.options import add_options
 from unrender.backend import variant
@@ -207,8 +207,3 @@ def test_a_record_of_a_gpu_is_of_a_gpu() -> None:
     for part in SLICES:
         state = full().read(part)
         assert not state or state["device"]["variant"] == variant.CUDA
-
-
-def test_the_toy_plan_has_run_through() -> None:
-    for part in SLICES:
-        assert toy().summary(part) == "done", part.name

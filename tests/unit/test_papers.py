@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from benchmarks.runner.catalogue import ROOT, benchmarks
+from benchmarks.runner.results_page import section as section_of
 
 KNOWN = benchmarks()
 PAGE = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
@@ -167,9 +168,9 @@ def numbers(text: str) -> frozenset[str]:
 
 @functools.cache
 def results() -> dict[str, str]:
-    """The section of docs/results.md of each benchmark."""
-    found = re.split(r"\n## ", (ROOT / "docs" / "results.md").read_text(encoding="utf-8"))[1:]
-    return {commands(text)[0][0]: text for text in found}
+    """The page of each benchmark that has a record."""
+    pages = {name: section_of(each) for name, each in KNOWN.items()}
+    return {name: text for name, text in pages.items() if text is not None}
 
 
 def wrong_numbers(page: str) -> Iterator[str]:

@@ -98,7 +98,7 @@ def test_idle_connections_do_not_keep_the_owner_out(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_idle_and_busy_strangers_do_not_keep_the_owner_out(tmp_path: Path) -> None:
     """A small form of the benchmark `watch.connections`, by its clients."""
-    clients = Path(__file__).parents[2] / "benchmarks" / "watch" / "connections" / "clients.py"
+    clients = Path(__file__).parents[1] / "clients.py"
     with served(write_run(tmp_path / "run"), refusal_seconds=0.5) as address:
         assert status(address) == 200
         words = [sys.executable, str(clients), address.url, "300", "30", "5"]

@@ -1,7 +1,7 @@
 """A run's step to a finer resolution: the parameters, and what optimizer, estimator and pixel sampler remember.
 
 How states are carried is in `problem.upsampling`. By default (`CoarseToFine.states`) the estimator's state is carried and the
-optimizer's is not. That came out best, or as good as any, in `benchmarks/coarse_to_fine`: a control variate is what a run has paid for
+optimizer's is not. That came out best, or as good as any, by equal steps: a control variate is what a run has paid for
 and stays true, while Adam's mean squares take a thousand steps to follow.
 """
 

@@ -1,1 +1,0 @@
-"""What the loss sees where a mesh moves."""

@@ -1,0 +1,60 @@
+"""Long campaigns of power cuts and kills. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; without it they are skipped.
+
+    UNRENDER_CAMPAIGN=50 python -m pytest tests/campaigns -s
+
+Power cuts and killed nodes need root: for an ext4 file system on a loop device, and for network namespaces.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.campaigns import cuts, kills, worker_kills
+from tests.campaigns.cluster_machines import Link, Machines
+from tests.campaigns.machine import Victims
+
+COUNT = int(os.environ.get("UNRENDER_CAMPAIGN", "0"))
+STEPS = 60
+SEED = 0
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not COUNT, reason="set UNRENDER_CAMPAIGN to the number of faults")]
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+
+
+@pytest.fixture(scope="module")
+def victims() -> Iterator[Victims]:
+    with Victims() as process:
+        yield process
+
+
+@needs_root
+@pytest.mark.parametrize("method", cuts.METHODS)
+def test_a_power_cut_loses_nothing_after_the_last_checkpoint(method: str, victims: Victims, tmp_path: Path) -> None:
+    summary = cuts.campaign(victims, tmp_path, method, COUNT, random.Random(SEED))
+    print(method, summary)
+    for outcome in ("resumed", "same_bits", "from_the_last_checkpoint", "nothing_left_over"):
+        assert summary[outcome] == summary["cuts"], summary["rows"]
+
+
+@pytest.mark.parametrize("command", kills.COMMANDS)
+def test_a_killed_command_leaves_a_folder_that_goes_on(command: str, victims: Victims, tmp_path: Path) -> None:
+    summary = kills.campaign(victims, tmp_path, command, COUNT)
+    print(command, summary)
+    assert summary["killed"] > 0
+    assert summary["wrong"] == []
+
+
+@needs_root
+@pytest.mark.parametrize("method", worker_kills.METHODS)
+def test_a_distributed_run_survives_kills_and_a_slow_worker(method: str, tmp_path: Path) -> None:
+    dice = random.Random(SEED)
+    with Link() as link, Machines(link) as machines:
+        summary = list(worker_kills.campaign(machines, tmp_path / method, method, COUNT, STEPS, dice))[-1]
+        slow = worker_kills.straggler(machines, tmp_path / method, method, STEPS, dice)
+    print(method, summary, slow)
+    assert summary["right"] == summary["kills"] > 0, summary
+    assert slow["right"], slow
