@@ -24,7 +24,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
-from unrender.estimators.sample_groups import gather, leave_one_out_groups
+from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
 from unrender.evaluation import denoising
 from unrender.evaluation.metrics import srgb
 from unrender.gallery import parts, volumes
@@ -200,7 +200,7 @@ def coupled_gradients(
 ) -> tuple[Tree, Tree]:
     """Gradients F of the current state and H of the previous one, from the same samples."""
     request = PairRequest(previous, space)
-    found = gather(problem, current, ur.images.Plain(), PlainState(), spp, key, pair_request=request)
+    found = GradientRequest(current, ur.images.Plain(), PlainState(), spp, key, pair_request=request).carry_out(problem)
     if found.previous is None:
         raise RuntimeError("the pair has no previous gradient")
     return found.gradient, found.previous
@@ -358,7 +358,9 @@ def gradient_of(
     """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
     for the scene's own."""
     request = None if emitters is None else EmitterRequest(emitters, {})
-    found = gather(problem, parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request)
+    found = GradientRequest(
+        parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request
+    ).carry_out(problem)
     coordinates = problem.coordinates
     moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
     return [arrays.numpy(value) for value in moved.values()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from scipy import stats
 import unrender as ur
 from unrender.core import arrays
 from unrender.core.random import Key
-from unrender.estimators.sample_groups import gather
+from unrender.estimators.sample_groups import GradientRequest
 from unrender.pixels.base import DrawStatistics, MiniBatch
 from unrender.problem.batches import WholeView
 from unrender.problem.sample_counts import SampleCounts, SampleShares, rounded
@@ -115,7 +115,7 @@ def test_gradients_are_unbiased_whatever_the_numbers(image: Any, monkeypatch: py
             for step in range(3 if isinstance(image, CV) else 1):
                 shares = last if step != 1 else tuple(rng.random((4, 4)) ** 6 for _ in range(2))
                 batch = MiniBatch(None, shares=SampleShares(2, shares, (rng.random(), rng.random())))
-                found = gather(asked, at, image, state, 5, Key(seed, step), batch=batch)
+                found = GradientRequest(at, image, state, 5, Key(seed, step), batch=batch).carry_out(asked)
                 state = found.image
             assert found is not None
             rows.append(np.concatenate([g.ravel() for g in found.gradient.values()]))
@@ -143,7 +143,7 @@ def test_the_variance_of_a_control_variate_is_known_with_other_numbers_at_each_s
         state, found = image.init(asked, at), None
         for step, shares in enumerate(schedule):
             batch = MiniBatch(None, shares=SampleShares(2, shares, (0.5,)))
-            found = gather(asked, at, image, state, 6, Key(seed, step), batch=batch)
+            found = GradientRequest(at, image, state, 6, Key(seed, step), batch=batch).carry_out(asked)
             state = found.image
         assert found is not None
         images.append(found.images[0])
@@ -236,10 +236,6 @@ def test_losses_of_whole_images_and_views_of_workers_are_refused() -> None:
     asked = problem()
     asked.loss = Whole()
     with pytest.raises(ur.InputError, match="Whole is of whole images, in which each pixel needs as many samples"):
-        Counts().init(asked, asked.initial())
-    asked = problem()
-    asked.gatherer = cast("Any", object())
-    with pytest.raises(ur.InputError, match="cannot be dealt to workers"):
         Counts().init(asked, asked.initial())
 
 

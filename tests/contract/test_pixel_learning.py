@@ -11,7 +11,7 @@ from analytic import problem
 
 import unrender as ur
 from unrender.core.random import Key
-from unrender.estimators.sample_groups import gather
+from unrender.estimators.sample_groups import GradientRequest
 from unrender.images.plain import PlainState
 from unrender.pixels import pixel_statistics
 from unrender.pixels.pooling import pool
@@ -54,7 +54,7 @@ def test_draws_tell_both_factors_of_their_pixels(spp: int) -> None:
         tangents = pixel_statistics.random_tangents(asked, at, scales, key.fold(3))
         batch = dataclasses.replace(sampler.redraw(asked, state, key), tangents=tangents)
         assert batch.sample is not None
-        draws = gather(asked, at, ur.images.Plain(), PlainState(), spp, key, batch=batch).draws
+        draws = GradientRequest(at, ur.images.Plain(), PlainState(), spp, key, batch=batch).carry_out(asked).draws
         assert draws is not None
         told = draws.squares.sum(axis=1)
         np.add.at(sums[0][step % 20], batch.sample.pixels, told)

@@ -17,7 +17,7 @@ from tests.contract import analytic
 from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
 from unrender.backend import variant
 from unrender.cluster import Workers, connect
-from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.executor import DistributedExecutor
 from unrender.dealing.messages import Call
 from unrender.dealing.outbox import Outbox
 from unrender.dealing.ray_hosts import RayHosts
@@ -69,7 +69,7 @@ class Kill(ur.Callback):
 
     def on_step(self, run: Any, record: Any) -> None:
         if run.step == 6:
-            hosts = run.problem.gatherer._hosts
+            hosts = run.problem.executor._hosts
             assert isinstance(hosts, RayHosts)
             os.kill(hosts._of[-1].place.process, signal.SIGKILL)  # pyright: ignore[reportOptionalMemberAccess]
 
@@ -93,9 +93,9 @@ def test_two_workers_descend_as_one_process_and_a_kill_changes_nothing() -> None
     with ur.deal(problem, workers=2, threads=1, tell=lines.append) as together:
         whole = run(together)
         broken = run(together, Kill())
-        gatherer = together.gatherer
-        assert isinstance(gatherer, DealtViews)
-        assert gatherer.traffic.lost == 1
+        executor = together.executor
+        assert isinstance(executor, DistributedExecutor)
+        assert executor.traffic.lost == 1
     assert len(lines) == 1
     assert "of views 1, 3: lost; others take over" in lines[0]
     for key, value in alone.items():

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -217,9 +217,6 @@ def test_what_cannot_take_other_probabilities_is_refused() -> None:
     refused(problem(2, cloud=cloud), "participating media")
     refused(problem(2, keys=("wall0.translation",)), "shapes or sensors move")
     refused(problem(2, keys=("camera.translation",)), "shapes or sensors move")
-    dealt = problem(2)
-    dealt.gatherer = cast("Any", object())
-    refused(dealt, "dealt to workers")
     moving = problem(2, keys=("camera.translation",))
     session = moving.renderer.prepare(["camera.translation"], None)
     from unrender.rendering.renderer import SampleRequest

@@ -19,7 +19,7 @@ from unrender.cluster import Workers, share
 from unrender.core import arrays
 from unrender.dealing import capacity
 from unrender.dealing.assignment import deal, total
-from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.executor import DistributedExecutor
 from unrender.dealing.hosts import LocalHosts
 from unrender.dealing.messages import Call, Reply
 from unrender.dealing.outbox import Outbox
@@ -113,7 +113,7 @@ class Crowded(LocalHosts):
 
 def dealt(problem: ur.Problem, count: int, compress: bool = False, lose: Sequence[int] = ()) -> ur.Problem:
     shares = deal([16] * len(problem.views), count)
-    return problem.gathered_by(DealtViews(problem, shares, Losing(problem, shares, lose), compress))
+    return problem.executed_by(DistributedExecutor(problem, shares, Losing(problem, shares, lose), compress))
 
 
 def descend(problem: ur.Problem, name: str, **options: Any) -> ur.Result:
@@ -160,7 +160,7 @@ def test_importance_maps_come_from_the_workers() -> None:
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     together = dealt(problem, 3)
     descend(together, "adaptive")
-    hosts = together.gatherer._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    hosts = together.executor._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     assert hosts.pilots == 3 * (1 + 3)  # three patterns of signs, in the warm-up and every five of twelve steps
 
 
@@ -178,8 +178,8 @@ def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     whole, broken = dealt(problem, 2), dealt(problem, 2, lose=(5, 9, 10, 16))
     assert apart(descend(whole, name), descend(broken, name)) == 0
-    assert broken.gatherer.traffic.lost == 4  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
-    assert (broken.gatherer.traffic.repeated > 0) == (name not in ("plain", "adaptive"))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert broken.executor.traffic.lost == 4  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert (broken.executor.traffic.repeated > 0) == (name not in ("plain", "adaptive"))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize("name", ["plain", "rcv", "rcv of mini-batches"])
@@ -192,7 +192,7 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     whole = descend(dealt(problem, 3, compress=True), name)
     for die in (2, 5, 8, 11):
         hosts = Crowded(problem, shares, (die, die + 1, die + 5))
-        assert apart(whole, descend(problem.gathered_by(DealtViews(problem, shares, hosts, True)), name)) == 0
+        assert apart(whole, descend(problem.executed_by(DistributedExecutor(problem, shares, hosts, True)), name)) == 0
 
 
 def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +200,7 @@ def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypat
     step = sum(np.asarray(value).nbytes for value in problem.initial().values())
     monkeypatch.setattr("unrender.dealing.memories._MOST_BYTES", 3 * step)
     together, collected = dealt(problem, 2), list[int]()
-    hosts: Any = together.gatherer._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    hosts: Any = together.executor._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     fetch = hosts.fetch
     monkeypatch.setattr(hosts, "fetch", lambda number: collected.append(number) or fetch(number))
     descend(together, "rcv", steps=30)
@@ -220,7 +220,7 @@ def test_exposures_of_all_views_are_sent_to_each_share() -> None:
     problem = ur.Problem(given.renderer, unknown, bright)
     shares = deal([16] * 3, 2)
     held = [ViewShare(unpacked(packed(problem, views, WITHOUT_RAY), WITHOUT_RAY), views) for views in shares]
-    together = problem.gathered_by(DealtViews(problem, shares, LocalHosts(tuple(held))))
+    together = problem.executed_by(DistributedExecutor(problem, shares, LocalHosts(tuple(held))))
     alone = descend(problem, "plain")
     assert np.ptp(alone.parameters["exposure"], axis=0).min() > 0.05
     assert apart(alone, descend(together, "plain")) < 1e-12
@@ -245,8 +245,8 @@ def test_files_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mon
 def test_the_workers_of_a_resumed_run_have_the_variant_that_they_had(tmp_path: Path) -> None:
     problem = analytic.problem(views=2)
     shares = deal([16] * 2, 2)
-    gatherer = DealtViews(problem, shares, LocalHosts(shares_of(problem, shares)), variant="cuda_ad_rgb")
-    descend(problem.gathered_by(gatherer), "plain", steps=1, run_directory=tmp_path / "dealt")
+    executor = DistributedExecutor(problem, shares, LocalHosts(shares_of(problem, shares)), variant="cuda_ad_rgb")
+    descend(problem.executed_by(executor), "plain", steps=1, run_directory=tmp_path / "dealt")
     descend(problem, "plain", steps=1, run_directory=tmp_path / "alone")
     before, never = (load_run(tmp_path / name, steps=2).record for name in ("dealt", "alone"))
     assert before.variant != "cuda_ad_rgb"  # the driver's
@@ -282,11 +282,11 @@ def test_only_what_changed_is_sent() -> None:
     given = analytic.problem(views=2)
     rates = [ur.Parameter("colour", learning_rate=0.02), ur.Parameter("map", learning_rate=1e-30)]
     problem = dealt(ur.Problem(given.renderer, rates, given.given_views), 1)
-    gatherer = problem.gatherer
-    assert isinstance(gatherer, DealtViews)
+    executor = problem.executor
+    assert isinstance(executor, DistributedExecutor)
     ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(learning_rate=1.0), steps=3, progress=False)
-    assert gatherer.traffic.sent == 3 * 8  # the colour alone
-    assert gatherer.traffic.received == 7 * 8
+    assert executor.traffic.sent == 3 * 8  # the colour alone
+    assert executor.traffic.received == 7 * 8
 
 
 def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
@@ -295,6 +295,18 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
         ur.optimize(dealt(analytic.problem(views=2), 2), smoothed, adam, steps=1)
     with pytest.raises(ur.InputError, match="HybridGradient renders all views"):
         ur.optimize(dealt(analytic.problem(views=2), 2), ur.HybridGradient(keys=("colour",)), adam, steps=1)
+    for refused, words in (
+        (ur.PathGradient(differential_bsdf=True), "differential_bsdf is not supported by workers"),
+        (ur.PathGradient(emitters="adaptive"), 'emitters="adaptive" is not supported by workers'),
+        (
+            ur.PathGradient(spp=4, pixels=ur.pixels.AdaptiveCounts()),
+            r"pixels=AdaptiveCounts\(...\) is not supported by workers",
+        ),
+    ):
+        with pytest.raises(ur.InputError, match=words):
+            ur.optimize(dealt(analytic.problem(views=2), 2), refused, adam, steps=1)
+        with pytest.raises(ur.InputError, match=words):
+            ur.estimate(dealt(analytic.problem(views=2), 2), refused)
     memory, drawn = ur.images.RecursiveControlVariate(), ur.pixels.Uniform(8)
     remembering = ur.MetaEstimator(coupled=True, image=memory, pixels=drawn)
     with pytest.raises(ur.InputError, match="a control variate of images and mini-batches of pixels at once"):

@@ -12,7 +12,7 @@ from unrender.backend.variant import cores
 from unrender.cluster import Workers, connect
 from unrender.core.errors import InputError
 from unrender.dealing.assignment import deal as dealt_views
-from unrender.dealing.gatherer import DealtViews
+from unrender.dealing.executor import DistributedExecutor
 from unrender.dealing.ray_hosts import RayHosts
 from unrender.dealing.transfer import packed
 from unrender.problem.problem import Problem
@@ -78,7 +78,7 @@ def deal(
         blobs = tuple(packed(problem, share, cluster.ray) for share in shares)
         hosts = RayHosts(cluster, shares, blobs, threads, tell)
         try:
-            yield problem.gathered_by(DealtViews(problem, shares, hosts, compress, cluster.variant))
+            yield problem.executed_by(DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
         finally:
             hosts.close()
 

@@ -93,7 +93,7 @@ class Pilot:
 
 @dataclass(frozen=True)
 class Call:
-    """One gradient of a share of the views: a `GatherRequest` in numbers.
+    """One gradient of a share of the views: a `GradientRequest` in numbers.
 
     Attributes:
         arrays: {number: array} that the worker does not have yet.

@@ -12,11 +12,11 @@ from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.dealing.assignment import total
 from unrender.dealing.messages import Batch, Call, Difference, Pair, Pilot, References, Reply
-from unrender.estimators.sample_groups import TREES, GatherRequest, gather_frame, leave_one_out_groups
+from unrender.estimators.sample_groups import TREES, GradientRequest, estimate_frame, leave_one_out_groups
 from unrender.images.base import PairRequest
 from unrender.images.recursive_control_variate import RecursiveControlVariateState
 from unrender.pixels.base import MiniBatch
-from unrender.pixels.pixel_statistics import PilotRequest, pilot
+from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView
 from unrender.problem.problem import Problem
 from unrender.runs.folder.state import Packed, pack, unpack
@@ -56,7 +56,7 @@ class ViewShare:
             sample = self._sample(call.batch)
             frames = [(-1, PixelBatch(self.problem, sample))]
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
-        parts = [gather_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
+        parts = [estimate_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
         kept = tuple(part.kept for part in parts)
         found = {name: [getattr(part, name) for part in parts] for name in TREES}
         arrays.evaluate(kept, found, [part.loss for part in parts])
@@ -106,7 +106,7 @@ class ViewShare:
     def _tree(self, references: References) -> Tree:
         return {key: self._arrays[number] for key, number in references.items()}
 
-    def _request(self, call: Call) -> GatherRequest:
+    def _request(self, call: Call) -> GradientRequest:
         parameters = self._tree(call.parameters)
         state = call.image.init(self.problem, parameters)
         if call.state is not None and call.state.memory is not None and call.state.parameters is not None:
@@ -119,7 +119,7 @@ class ViewShare:
         elif call.state is not None:
             state = RecursiveControlVariateState(step=call.state.step)
         pair = call.pair and self._pair_request(call.pair)
-        return GatherRequest(
+        return GradientRequest(
             parameters,
             call.image,
             state,
@@ -150,9 +150,9 @@ class ViewShare:
         references = tuple(self.problem.renderer.array(reference) for reference in asked.references)
         sample, tangents = self._sample(call.batch), self._tree(call.tangents)
         request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
-        return tuple(pilot(self.problem, request))
+        return tuple(request.carry_out(self.problem))
 
-    def _replayed(self, call: Call, request: GatherRequest) -> tuple[Any, ...]:
+    def _replayed(self, call: Call, request: GradientRequest) -> tuple[Any, ...]:
         """What a step of whole views leaves, without its gradient."""
         groups = leave_one_out_groups(call.spp, call.adjoint_spp)
         kept = tuple(

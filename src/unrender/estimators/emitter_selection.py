@@ -111,10 +111,8 @@ class EmitterState:
 def init(owner: str, problem: Problem, session: RenderSession) -> EmitterState | None:
     """The state before the first step; None where the scene has one emitter at most, and there is nothing to choose.
 
-    Raises `InputError` where the renderer takes no probabilities of emitters, or views are dealt to workers.
+    Raises `InputError` where the renderer takes no probabilities of emitters.
     """
-    if problem.gatherer is not None:
-        raise InputError(f'{owner}: emitters="adaptive" cannot be dealt to workers; leave emitters="scene"')
     try:
         start = drawing_emitters(session).emitters()
     except InputError as error:

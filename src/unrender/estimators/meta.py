@@ -14,7 +14,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
-from unrender.estimators.sample_groups import PIXELS, GradientSample, check_pixels, draws_pixels, gather, prepared
+from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
 from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
@@ -284,11 +284,11 @@ class MetaEstimator:
         first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
         """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`: as for
-        `_gather`."""
+        `_sample`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
         at_once = self.difference_images == "proportional" and not fresh
         asked = replace(pair_request, difference_spp=difference_spp) if at_once else None
-        step, pixels = self._gather(problem, parameters, state, spp, key.fold(_PROPORTIONAL), asked, first=first)
+        step, pixels = self._sample(problem, parameters, state, spp, key.fold(_PROPORTIONAL), asked, first=first)
         coordinates = problem.coordinates
         slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
         F = coordinates.pull_back(step.gradient, slopes)
@@ -297,7 +297,7 @@ class MetaEstimator:
         current, previous, samples = step.paired, step.previous, step.samples
         if not at_once:
             again, further = replace(state, pixels=pixels), key.fold(_DIFFERENCE)
-            pair, pixels = self._gather(problem, parameters, again, difference_spp, further, pair_request, first=False)
+            pair, pixels = self._sample(problem, parameters, again, difference_spp, further, pair_request, first=False)
             current, previous, samples = pair.gradient, pair.previous, samples + pair.samples
         now, then = coordinates.pull_back(current, slopes), coordinates.pull_back(previous, before)
         difference = trees.subtract(now, then)
@@ -314,16 +314,16 @@ class MetaEstimator:
         key: Key,
         first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: as for `_gather`."""
+        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: as for `_sample`."""
         del fresh
         spp = self.spp or _COUPLED_SPP
-        step, pixels = self._gather(problem, parameters, state, spp, key, pair_request, first=first)
+        step, pixels = self._sample(problem, parameters, state, spp, key, pair_request, first=first)
         coordinates = problem.coordinates
         F = coordinates.pull_back(step.gradient, coordinates.slopes(parameters))
         H = coordinates.pull_back(step.previous, coordinates.slopes(pair_request.previous))
         return F, H, step, pixels
 
-    def _gather(
+    def _sample(
         self,
         problem: Problem,
         parameters: Tree,
@@ -343,12 +343,13 @@ class MetaEstimator:
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
         else:
             batch, pixels = self.pixels.redraw(problem, state.pixels, draw_key), state.pixels
-        step = gather(problem, parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
+        request = GradientRequest(parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
+        step = problem.executor.estimate_gradient(problem, request)
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
             pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
             if drawn and batch.sample is None:
-                step = replace(step, image=prepared(problem, self.image, step.image))
+                step = replace(step, image=problem.executor.prepare_images(problem, self.image, step.image))
         return step, pixels
 
     def _whole(self, parameters: Tree, state: MetaState) -> bool:

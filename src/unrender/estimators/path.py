@@ -14,7 +14,13 @@ from unrender.estimators import emitter_selection
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.estimators.emitter_selection import EmitterSelection, EmitterState
-from unrender.estimators.sample_groups import PIXELS, check_pixels, draws_pixels, gather, leave_one_out_groups, prepared
+from unrender.estimators.sample_groups import (
+    PIXELS,
+    GradientRequest,
+    check_pixels,
+    draws_pixels,
+    leave_one_out_groups,
+)
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
@@ -151,10 +157,6 @@ class PathGradient:
         """The problem by the renderer that is asked for."""
         if not self.differential_bsdf:
             return problem
-        if problem.gatherer is not None:
-            raise InputError(
-                "PathGradient: differential_bsdf does not work on views that are dealt to workers: leave it out"
-            )
         return problem.rendered_by(with_differential_bsdf(problem.renderer))
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
@@ -180,8 +182,7 @@ class PathGradient:
         emitters, asked = state.emitters, None
         if emitters is not None:
             asked = emitter_selection.request(problem, parameters, emitters, key.fold(_EMITTERS))
-        step = gather(
-            problem,
+        request = GradientRequest(
             parameters,
             self.image,
             state.image,
@@ -193,6 +194,7 @@ class PathGradient:
             fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
             emitters=asked,
         )
+        step = problem.executor.estimate_gradient(problem, request)
         by_u = problem.coordinates.by_u(step.gradient, parameters)
         pixels = self.pixels.observe(problem, pixels, by_u)
         if emitters is not None:
@@ -200,7 +202,7 @@ class PathGradient:
         pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         whole, image = batch.sample is None, step.image
         if whole and drawn:
-            image = prepared(problem, self.image, image)
+            image = problem.executor.prepare_images(problem, self.image, image)
         next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1, emitters)
         arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)
         loss = sum(arrays.number(value) for value in step.losses)

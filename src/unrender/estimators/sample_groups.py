@@ -33,14 +33,13 @@ __all__ = [
     "PIXELS",
     "TREES",
     "FrameGradient",
-    "GatherRequest",
+    "GradientRequest",
     "GradientSample",
     "check_pixels",
+    "draws_pixels",
+    "estimate_frame",
     "fresh_weights",
-    "gather",
-    "gather_frame",
     "leave_one_out_groups",
-    "prepared",
 ]
 
 PIXELS = 1 << 32
@@ -88,19 +87,24 @@ class GradientSample:
 
 
 @dataclass(frozen=True)
-class GatherRequest:
-    """What `gather` is asked for; see there.
+class GradientRequest:
+    """A request for the loss gradient at some parameters, to be carried out by `Problem.executor`.
+
+    With several leave-one-out groups, each group's adjoint is weighted by the loss derivative at the image of all other groups
+    (`PathGradient`). A single group traces `adjoint_spp` separate paths for the adjoint.
 
     Attributes:
-        parameters: the current ones.
-        image, state: the image estimator and its state.
-        spp, adjoint_spp: samples per pixel.
-        key: of the random numbers.
-        pair_request: of the previous state's gradient.
-        batch: the pixels; None for whole views.
-        tolerance: see `PathGradient`.
-        fresh: whether the gradient of this step's samples alone is wanted, too.
-        emitters: the probabilities of emitters; None for the scene's own.
+        parameters: Current parameters.
+        image, state: Image estimator and its state. The state advances where whole views are rendered.
+        spp: Samples per pixel of the image.
+        key: Random numbers of the step.
+        adjoint_spp: Samples per pixel of the adjoint if it has paths of its own; None for `spp` where there is one group.
+        pair_request: Requests the gradient of the previous state, on the same paths and weighted by its own images. With its
+            `difference_spp` both are on separate paths, weighted by the images of all groups, which are independent of them.
+        batch: Pixel mini-batch, rendered in one launch for all views; None for whole views.
+        tolerance: See `PathGradient`.
+        fresh: Whether to add the gradient from this step's samples alone.
+        emitters: Selection probabilities of emitters; None for the scene's own.
     """
 
     parameters: Tree
@@ -122,6 +126,42 @@ class GatherRequest:
         if self.batch is None or (self.pair_request is not None and self.batch.shares is None):
             return {}
         return self.batch.tangents
+
+    def carry_out(self, problem: Problem) -> GradientSample:
+        """Estimate the gradient in this process, frame by frame."""
+        batch = self.batch
+        sample, shares = (batch.sample, batch.shares) if batch else (None, None)
+        likely = None if self.emitters is None else self.emitters.probabilities
+        whole = sample is None
+        frames = whole_views(problem, shares, self.spp, likely) if whole else [PixelBatch(problem, sample, likely)]
+        sums = {name: GradientSum() for name in TREES}
+        parts = []
+        for index, frame in enumerate(frames):
+            part = estimate_frame(problem, self, frame, self.key.fold(index))
+            for name, total in sums.items():
+                total.add(getattr(part, name))
+            parts.append(replace(part, **{name: {} for name in TREES}))
+            del part
+        info: dict[str, dict[int, Any]] = (
+            {"pixel_probability": batch.probability} if batch and batch.probability else {}
+        )
+        images: dict[int, Array] = {}
+        for frame, part in zip(frames, parts, strict=True):
+            if isinstance(frame, WholeView):
+                images[frame.view] = part.image
+                for name, value in part.info.items():
+                    info.setdefault(name, {})[frame.view] = value
+        told = [part.connections for part in parts if part.connections is not None]
+        return GradientSample(
+            **{name: total.result() for name, total in sums.items()},
+            losses=[part.loss for part in parts],
+            images=images,
+            samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
+            info=info,
+            image=_image_state(problem, self, sample, parts),
+            draws=_joined([part.draws for part in parts if part.draws is not None]),
+            connections=functools.reduce(operator.add, told) if told else None,
+        )
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
@@ -160,70 +200,8 @@ def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, ad
         )
 
 
-def gather(
-    problem: Problem,
-    parameters: Tree,
-    image: ImageEstimator,
-    state: Any,
-    spp: int,
-    key: Key,
-    adjoint_spp: int | None = None,
-    pair_request: PairRequest | None = None,
-    batch: MiniBatch | None = None,
-    tolerance: float = 0.0,
-    fresh: bool = False,
-    emitters: EmitterRequest | None = None,
-) -> GradientSample:
-    """The loss gradient, each group's adjoint weighted by the loss derivative at the image of all other groups (`PathGradient`).
-
-    A single group gets `adjoint_spp` paths of its own for the adjoint, `spp` where that is None. With `pair_request`, also the gradient of
-    the previous state, on the same paths and weighted by its own images: the noise of the two is correlated as far as the space allows, and
-    their difference is a finite difference of gradients. With its `difference_spp` these two are on paths of their own, beside the gradient
-    of the images' paths, and weighted by the images of all groups, which are independent of them. With a pixel mini-batch, of its pixels
-    alone, in one launch for all views; the image estimator's state advances where whole views are rendered. For `tolerance` see
-    `PathGradient`.
-
-    Where the problem's views are dealt to workers, they do it (`Problem.gatherer`).
-    """
-    request = GatherRequest(
-        parameters, image, state, spp, key, adjoint_spp, pair_request, batch, tolerance, fresh, emitters
-    )
-    if problem.gatherer is not None:
-        return problem.gatherer.gather(request)
-    sample, shares = (batch.sample, batch.shares) if batch else (None, None)
-    likely = None if emitters is None else emitters.probabilities
-    whole = sample is None
-    frames = whole_views(problem, shares, spp, likely) if whole else [PixelBatch(problem, sample, likely)]
-    sums = {name: GradientSum() for name in TREES}
-    parts = []
-    for index, frame in enumerate(frames):
-        part = gather_frame(problem, request, frame, key.fold(index))
-        for name, total in sums.items():
-            total.add(getattr(part, name))
-        parts.append(replace(part, **{name: {} for name in TREES}))
-        del part
-    info: dict[str, dict[int, Any]] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
-    images: dict[int, Array] = {}
-    for frame, part in zip(frames, parts, strict=True):
-        if isinstance(frame, WholeView):
-            images[frame.view] = part.image
-            for name, value in part.info.items():
-                info.setdefault(name, {})[frame.view] = value
-    told = [part.connections for part in parts if part.connections is not None]
-    return GradientSample(
-        **{name: total.result() for name, total in sums.items()},
-        losses=[part.loss for part in parts],
-        images=images,
-        samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
-        info=info,
-        image=_image_state(problem, request, sample, parts),
-        draws=_joined([part.draws for part in parts if part.draws is not None]),
-        connections=functools.reduce(operator.add, told) if told else None,
-    )
-
-
 def _image_state(
-    problem: Problem, request: GatherRequest, sample: PixelSample | None, parts: list[FrameGradient]
+    problem: Problem, request: GradientRequest, sample: PixelSample | None, parts: list[FrameGradient]
 ) -> Any:
     """The image estimator's next."""
     image, state = request.image, request.state
@@ -238,11 +216,6 @@ def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:
         return draws[0] if draws else None
     squares, moments = (np.concatenate([getattr(part, name) for part in draws]) for name in ("squares", "moments"))
     return DrawStatistics(squares, moments, np.concatenate([part.counts for part in draws if part.counts is not None]))
-
-
-def prepared(problem: Problem, image: ImageEstimator, state: Any) -> Any:
-    """`ImageEstimator.prepare`, by the workers where the problem's views are dealt to some."""
-    return image.prepare(problem, state) if problem.gatherer is None else problem.gatherer.prepared(state)
 
 
 @dataclass(frozen=True)
@@ -262,7 +235,7 @@ class FrameGradient:
     connections: EmitterMoments | None = None
 
 
-def gather_frame(problem: Problem, request: GatherRequest, frame: Frame, key: Key) -> FrameGradient:
+def estimate_frame(problem: Problem, request: GradientRequest, frame: Frame, key: Key) -> FrameGradient:
     """The part of one frame; `key` is the frame's own."""
     parameters, image, state, spp, adjoint_spp = (
         request.parameters,

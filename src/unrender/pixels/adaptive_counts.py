@@ -117,16 +117,12 @@ class AdaptiveCounts:
             raise InputError(f"AdaptiveCounts: uniform must be a share in (0, 1], got {share!r}")
 
     def init(self, problem: Problem, parameters: Tree) -> AdaptiveCountsState:
-        """See `PixelSampler.init`. Raises `InputError` where the loss of a pixel depends on others, or views are dealt to workers."""
+        """See `PixelSampler.init`. Raises `InputError` where the loss of a pixel depends on others."""
         del parameters
         if not problem.loss.pixelwise:
             raise InputError(
                 f"AdaptiveCounts: {type(problem.loss).__name__} is of whole images, in which each pixel needs as many samples; "
                 "use unrender.pixels.All()"
-            )
-        if problem.gatherer is not None:
-            raise InputError(
-                "AdaptiveCounts: its numbers of samples cannot be dealt to workers; use unrender.pixels.All()"
             )
         ones = np.ones(len(_tiles(problem).views))
         uniform = uniform_share.MOST if self.uniform is None else self.uniform

@@ -25,7 +25,6 @@ __all__ = [
     "costs",
     "estimate_statistics",
     "observed",
-    "pilot",
     "random_signs",
     "random_tangents",
     "reference_means",
@@ -66,14 +65,14 @@ class PixelStatistics:
 
 @dataclass(frozen=True)
 class PilotRequest:
-    """What `pilot` is asked for.
+    """A request for one path through each pixel of a sample, to be carried out by `Problem.executor`.
 
     Attributes:
-        parameters: what to render.
-        sample: the pixels, weights of 1.
-        key: of the random numbers.
-        references: (N, 3) each: what the paths are compared with beside their pixels' own references.
-        tangents: of the parameters; {} for none.
+        parameters: Current parameters.
+        sample: Pixels, with weights of 1.
+        key: Random numbers.
+        references: (N, 3) each; compared with the paths besides the pixels' own references.
+        tangents: Tangents of the parameters; {} for none.
     """
 
     parameters: Tree
@@ -81,6 +80,25 @@ class PilotRequest:
     key: Key
     references: tuple[Array, ...]
     tangents: Tree
+
+    def carry_out(self, problem: Problem) -> list[np.ndarray]:
+        """Trace one path through each pixel of the sample, in this process.
+
+        Returns:
+            (N, 3) each: the loss derivative at the pixels' own references, at each of `references`, and, with tangents, the squared
+            derivative along them.
+        """
+        batch = PixelBatch(problem, self.sample)
+        session = problem.renderer.prepare(list(self.parameters), None)
+        rendering = session.image(self.parameters, batch.request(1, self.key.uint32()))
+        image = rendering.images[0]
+        _, factor = batch.targets
+        found = [batch.loss_derivative(image)]
+        found += [problem.loss.derivative(image, reference) * factor for reference in self.references]
+        if self.tangents:
+            found.append(session.tangent_moment(self.parameters, rendering.paths, self.tangents))
+        arrays.evaluate(found)
+        return [arrays.numpy(x) for x in found]
 
 
 def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
@@ -184,27 +202,7 @@ def _round(
     if scales:
         tangents = random_tangents(problem, parameters, scales, key.fold(2))
     request = PilotRequest(parameters, sample, key.fold(1), own, tangents)
-    return pilot(problem, request) if problem.gatherer is None else problem.gatherer.pilot(request)
-
-
-def pilot(problem: Problem, request: PilotRequest) -> list[np.ndarray]:
-    """Trace one path through each pixel of a sample.
-
-    Returns:
-        (N, 3) each: the loss derivative at the pixels' own references, at each of the request's, and, with tangents, the squared derivative
-        along them.
-    """
-    batch = PixelBatch(problem, request.sample)
-    session = problem.renderer.prepare(list(request.parameters), None)
-    rendering = session.image(request.parameters, batch.request(1, request.key.uint32()))
-    image = rendering.images[0]
-    _, factor = batch.targets
-    found = [batch.loss_derivative(image)]
-    found += [problem.loss.derivative(image, reference) * factor for reference in request.references]
-    if request.tangents:
-        found.append(session.tangent_moment(request.parameters, rendering.paths, request.tangents))
-    arrays.evaluate(found)
-    return [arrays.numpy(x) for x in found]
+    return problem.executor.trace_pilot(problem, request)
 
 
 def random_tangents(problem: Problem, parameters: Tree, scales: Tree, key: Key) -> Tree:

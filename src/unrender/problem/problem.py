@@ -23,7 +23,7 @@ from unrender.problem import notebook
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
-from unrender.problem.gatherer import Gatherer
+from unrender.problem.executor import LOCAL, Executor
 from unrender.problem.mesh_checks import (
     check_remeshings,
     check_self_intersections,
@@ -103,7 +103,7 @@ class Problem(ViewLosses):
         first_values: {key: float32 array inside the bounds}, where parameters start. Read-only: may be the scene's own memory.
         faces: {key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh.
         remeshed_from: the problem with the meshes that it began with, where it has others now; else None.
-        gatherer: computes gradients in place of this process, with the views dealt to workers; None where there is none.
+        executor: computes gradients, in this process unless the views are distributed.
 
     Raises:
         InputError: in one line, which field is wrong and what was expected.
@@ -167,7 +167,7 @@ class Problem(ViewLosses):
         check_surfaces(self.surfaces, self.faces)
         self.remeshings = check_remeshings(self.parameters, known, self.texture_coordinates)
         self.self_intersections = check_self_intersections(self.parameters, self.faces)
-        self.gatherer: Gatherer | None = None
+        self.executor: Executor = LOCAL
         self.references = References(self.views, self.renderer.array)
         self._references, self._masks = dict[int, Array](), dict[int, Array | None]()
         self._as_given: Problem | None = None
@@ -287,15 +287,15 @@ class Problem(ViewLosses):
         made = Problem(
             renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
         )
-        made.origin, made.gatherer, made._as_given = self.origin, self.gatherer, self.as_given
+        made.origin, made.executor, made._as_given = self.origin, self.executor, self.as_given
         made.remeshed_from = self.remeshed_from or self
         return made
 
-    def gathered_by(self, gatherer: Gatherer | None) -> Problem:
-        """The same problem, its gradients computed by workers that its views are dealt to."""
-        found = copy.copy(self)
-        found.gatherer = gatherer
-        return found
+    def executed_by(self, executor: Executor) -> Problem:
+        """Return the same problem with another executor of its gradients."""
+        made = copy.copy(self)
+        made.executor = executor
+        return made
 
     def rendered_by(self, renderer: Renderer) -> Problem:
         """The same problem, its scene rendered by another renderer of the same arrays."""

@@ -83,12 +83,7 @@ def prepare(
     seed: int,
 ) -> tuple[Run, RunState]:
     """A run before its first step."""
-    if problem.gatherer is not None:
-        problem.gatherer.check(estimator)
-        if problem.remeshings:
-            raise InputError(
-                f"{next(iter(problem.remeshings))}: remeshing: meshes of dealt runs keep their triangles: leave it out"
-            )
+    problem.executor.check(estimator)
     if isinstance(optimizer, Reparameterising):
         problem = problem.reparameterised(optimizer.parameterisations)
     if isinstance(optimizer, Preconditioning):

@@ -114,7 +114,7 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
             "views": len(problem.views),
             "loss": loss,
             "max_depth": problem.max_depth,
-            **({} if problem.gatherer is None else {"workers": problem.gatherer.variant}),
+            **({} if problem.executor.variant is None else {"workers": problem.executor.variant}),
         },
         "truth": problem.truth,
         "meshes": arrays_of(problem),

@@ -186,6 +186,7 @@ def estimate(
         seed: of its random numbers.
     """
     estimator = components.resolve_estimator(problem, estimator, "estimate")
+    problem.executor.check(estimator)
     point = as_tree(problem, parameters)
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))

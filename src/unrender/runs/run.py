@@ -111,15 +111,15 @@ class RunState:
 
 def snapshot(run: Run, state: RunState) -> dict[str, Any]:
     """All that decides what the next steps do: what a checkpoint holds, for `state.pack`."""
-    noise, gatherer = state.noise, run.problem.gatherer
-    sent = None if gatherer is None else gatherer.snapshot()
+    noise, executor = state.noise, run.problem.executor
+    sent = executor.snapshot()
     return {
         "parameters": run.parameters,
         "step": run.step,
         "clock": run.clock,
         "skipped": run.skipped,
         "warnings": list(run.warnings),
-        "estimator": state.estimator if gatherer is None else gatherer.collected(state.estimator),
+        "estimator": executor.collect(state.estimator),
         "optimizer": state.optimizer,
         "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
         "zero_gradient": dict(state.zero_gradient),
@@ -141,8 +141,7 @@ def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
     state.noise = GradientNoise(**saved["noise"])
     state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
     state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
-    if run.problem.gatherer is not None:
-        run.problem.gatherer.restore(saved.get("sent"))
+    run.problem.executor.restore(saved.get("sent"))
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from unrender.dealing.outbox import Outbox, Sent
 from unrender.estimators.filtered import FilteredGradient
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
-from unrender.estimators.sample_groups import GatherRequest, GradientSample
+from unrender.estimators.sample_groups import GradientRequest, GradientSample
 from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import (
@@ -31,12 +31,13 @@ from unrender.images.recursive_control_variate import (
     RecursiveControlVariateState,
     Snapshot,
 )
+from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.problem.problem import Problem
 from unrender.runs.folder.state import pack, unpack
 
-__all__ = ["DealtViews", "Traffic"]
+__all__ = ["DistributedExecutor", "Traffic"]
 
 _MOST_LOSSES = 5
 """Times that shares may be lost in one step."""
@@ -64,15 +65,15 @@ class Traffic:
     repeated: int = 0
 
 
-class DealtViews:
-    """A `Gatherer`: each share of the views computes its part of a step, sums are in the shares' order.
+class DistributedExecutor:
+    """An `Executor` whose worker processes hold shares of the views; it sums their gradients in the order of the shares.
 
     Args:
         problem: the whole one.
         shares: the views of each.
         hosts: where they live.
         compress: see `Outbox`.
-        variant: see `Gatherer.variant`.
+        variant: see `Executor.variant`.
 
     Attributes:
         traffic: of the last step.
@@ -97,10 +98,9 @@ class DealtViews:
         self._collection = 0
         self.traffic = Traffic()
 
-    # ------------------------------------------------------------------ Gatherer
+    # ------------------------------------------------------------------ Executor
 
     def check(self, estimator: Any) -> None:
-        """See `Gatherer.check`."""
         found = estimator
         while isinstance(found, FilteredGradient):
             found = found.inner
@@ -110,6 +110,14 @@ class DealtViews:
                 f"{name} renders all views of a problem itself, so they cannot be dealt to workers; "
                 "methods plain, rcv, meta, coupled, adaptive and most choices of auto can"
             )
+        if getattr(found, "differential_bsdf", False):
+            raise InputError(f"{name}: differential_bsdf is not supported by workers; leave it out")
+        if getattr(found, "emitters", "scene") == "adaptive":
+            raise InputError(f'{name}: emitters="adaptive" is not supported by workers; leave emitters="scene"')
+        if isinstance(found.pixels, AdaptiveCounts):
+            raise InputError(
+                f"{name}: pixels=AdaptiveCounts(...) is not supported by workers; use unrender.pixels.All()"
+            )
         image = found.image.inner if isinstance(found.image, Denoised) else found.image
         if not isinstance(image, (Plain, RecursiveControlVariate)):
             raise InputError(f"{name}: what {type(image).__name__} remembers of views cannot be dealt to workers")
@@ -117,10 +125,12 @@ class DealtViews:
             raise InputError(
                 f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
             )
+        for key in self._problem.remeshings:
+            raise InputError(f"{key}: remeshing: meshes of distributed runs keep their triangles; leave it out")
         capacity.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
 
-    def gather(self, request: GatherRequest) -> GradientSample:
-        """See `Gatherer.gather`."""
+    def estimate_gradient(self, problem: Problem, request: GradientRequest) -> GradientSample:
+        del problem  # each share has its own
         self._restart_traffic()
         memory = self._memory(request.state)
         sample = None if request.batch is None else request.batch.sample
@@ -140,8 +150,8 @@ class DealtViews:
         told = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
         return replace(found, draws=joined([(part, draws) for part, draws in told if draws is not None]))
 
-    def pilot(self, request: PilotRequest) -> list[np.ndarray]:
-        """See `Gatherer.pilot`."""
+    def trace_pilot(self, problem: Problem, request: PilotRequest) -> list[np.ndarray]:
+        del problem
         self._restart_traffic()
         known, tangents = self._outbox.numbered(request.parameters), self._outbox.once(request.tangents)
         sent = {one.number: one for tree in (known, tangents) for one in tree.values()}
@@ -168,34 +178,31 @@ class DealtViews:
             self.traffic = Traffic(lost=self.traffic.lost, repeated=self.traffic.repeated)
         self._in_step = True
 
-    def prepared(self, state: Any) -> Any:
-        """See `Gatherer.prepared`."""
+    def prepare_images(self, problem: Problem, image: Any, state: Any) -> Any:
+        del problem, image
         if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
             return replace(state, snapshot=state.views)
         return state
 
-    def collected(self, state: Any) -> Any:
-        """See `Gatherer.collected`."""
+    def collect(self, state: Any) -> Any:
         if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
             whole = replace(state, views=self._views(state.views.recipe), snapshot=None)
             return whole if state.snapshot is None else replace(whole, snapshot=_snapshot(whole))
         if dataclasses.is_dataclass(state) and not isinstance(state, type):
             parts = {each.name: getattr(state, each.name) for each in dataclasses.fields(state) if each.init}
-            found = {name: self.collected(part) for name, part in parts.items()}
+            found = {name: self.collect(part) for name, part in parts.items()}
             changed = {name: part for name, part in found.items() if part is not parts[name]}
             return replace(state, **changed) if changed else state
         if isinstance(state, (tuple, list)) and type(state) in (tuple, list):
-            found = [self.collected(part) for part in state]
+            found = [self.collect(part) for part in state]
             same = all(a is b for a, b in zip(found, state, strict=True))
             return state if same else type(state)(found)
         return state
 
     def snapshot(self) -> Any:
-        """See `Gatherer.snapshot`."""
         return self._outbox.snapshot()
 
     def restore(self, saved: Any) -> None:
-        """See `Gatherer.restore`."""
         self._outbox.restore(saved)
 
     # ------------------------------------------------------------------ from a request to calls
@@ -209,7 +216,7 @@ class DealtViews:
         packed = (pack(tuple(state.views[view] for view in share)) for share in self._shares)
         return self._memories.stored(tuple(packed))
 
-    def _call(self, request: GatherRequest, memory: Memory | None) -> tuple[Call, dict[int, Sent]]:
+    def _call(self, request: GradientRequest, memory: Memory | None) -> tuple[Call, dict[int, Sent]]:
         """The call that all shares have in common, and its arrays."""
         sent: dict[int, Sent] = {}
 
@@ -353,7 +360,7 @@ class DealtViews:
 
     # ------------------------------------------------------------------ from replies to a sum
 
-    def _sample(self, request: GatherRequest, replies: Sequence[Reply], kept: Any) -> GradientSample:
+    def _sample(self, request: GradientRequest, replies: Sequence[Reply], kept: Any) -> GradientSample:
         def summed(of: Callable[[Reply], Mapping[str, np.ndarray]]) -> Tree:
             return {key: self._problem.renderer.array(x) for key, x in total(map(of, replies)).items()}
 

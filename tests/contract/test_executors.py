@@ -1,0 +1,66 @@
+"""Every executor gives the run that one process gives, with checkpoints that any other executor takes up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from tests.contract import analytic
+from unrender.dealing.assignment import deal
+from unrender.dealing.executor import DistributedExecutor
+from unrender.dealing.hosts import LocalHosts
+from unrender.dealing.share import ViewShare
+from unrender.problem.executor import Executor, LocalExecutor
+
+VIEWS, STEPS = 3, 6
+
+
+class Counting(LocalExecutor):
+    """An executor of one file, as another package would write it."""
+
+    def __init__(self) -> None:
+        self.requests = 0
+
+    def estimate_gradient(self, problem: Any, request: Any) -> Any:
+        self.requests += 1
+        return super().estimate_gradient(problem, request)
+
+
+def distributed(problem: ur.Problem) -> DistributedExecutor:
+    shares = deal([16] * VIEWS, 2)
+    parts = [problem.replaced(views=[problem.given_views[view] for view in views]) for views in shares]
+    hosts = LocalHosts(tuple(ViewShare(part, views) for part, views in zip(parts, shares, strict=True)))
+    return DistributedExecutor(problem, shares, hosts)
+
+
+EXECUTORS: dict[str, Callable[[ur.Problem], Executor]] = {
+    "local": lambda problem: LocalExecutor(),
+    "distributed": distributed,
+    "of another package": lambda problem: Counting(),
+}
+
+
+def run(problem: ur.Problem, folder: Path, steps: int) -> ur.Result:
+    estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+    return ur.optimize(problem, estimator, ur.optimizers.Adam(0.02), steps, run_directory=folder, progress=False)
+
+
+@pytest.mark.parametrize("name", EXECUTORS)
+def test_runs_are_alike_and_change_executors_on_the_way(name: str, tmp_path: Path) -> None:
+    problem = analytic.problem(views=VIEWS)
+    alone = run(problem, tmp_path / "alone", STEPS)
+    executor = EXECUTORS[name](problem)
+    other = problem.executed_by(executor)
+    whole = run(other, tmp_path / "whole", STEPS)
+    run(other, tmp_path / "begun", STEPS // 2)
+    resumed = ur.resume(tmp_path / "begun", problem, steps=STEPS)
+    for key, value in alone.parameters.items():
+        np.testing.assert_allclose(whole.parameters[key], value, rtol=1e-6)
+        np.testing.assert_allclose(resumed.parameters[key], value, rtol=1e-6)
+    if isinstance(executor, Counting):
+        assert executor.requests >= STEPS + STEPS // 2
