@@ -4,6 +4,7 @@ python -m benchmarks                       list them
 python -m benchmarks NAME [options]        run one; `--help` tells its options
 python -m benchmarks results               write a page per benchmark, with figures, to docs/benchmarks
 python -m benchmarks gpu                   the plan for a GPU, in slices; `--help` tells its options
+python -m benchmarks golden                compare short descents with their record; `--record` writes it
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ def main(arguments: Sequence[str]) -> int:
         from benchmarks.gpu.cli import main as gpu
 
         return gpu(arguments[1:])
+    if arguments[0] == "golden":
+        from benchmarks.golden.cli import main as golden
+
+        return golden(arguments[1:])
     if arguments[0] not in known:
         print(f"no benchmark {arguments[0]!r}; python -m benchmarks lists them", file=sys.stderr)
         return 2

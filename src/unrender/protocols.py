@@ -21,6 +21,7 @@ from unrender.estimators.capabilities import (
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.losses.base import Loss
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.transforms.base import StepTransform, StepUpdate, TransformState
 from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.preconditioners.base import Preconditioner
@@ -57,6 +58,9 @@ __all__ = [
     "SampleRequest",
     "Schedule",
     "Smoothing",
+    "StepTransform",
+    "StepUpdate",
     "Transform",
+    "TransformState",
     "Variance",
 ]

@@ -20,6 +20,7 @@ from unrender.core.random import Key
 from unrender.estimators.capabilities import FreshGradient
 from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
+from unrender.optimizers import transforms
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import MARGIN
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -138,8 +139,11 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(learning_rate=0.1),
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
-    "DoWG": lambda: ur.optimizers.DoWG(),
-    "Prodigy": lambda: ur.optimizers.Prodigy(schedule=ur.optimizers.schedules.Exponential(100)),
+    "Chain": lambda: ur.optimizers.Chain(
+        (transforms.PerParameter(("map",), (transforms.GradientMean(),)), transforms.ScaleByRms()),
+        0.02,
+        ur.optimizers.schedules.Exponential(100),
+    ),
     "ScheduleFree": lambda: ur.optimizers.ScheduleFree(0.03),
     "Newton": lambda: ur.optimizers.Newton(trust_radius=15.0, step_scale=0.1),
     "AveragedNewton": lambda: ur.optimizers.AveragedNewton(trust_radius=0.3),

@@ -30,6 +30,7 @@ from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
 from unrender.methods import method
+from unrender.optimizers.chain import ChainState
 from unrender.problem.upsampling import SQUARES
 from unrender.runs import loop, multiresolution
 
@@ -177,6 +178,11 @@ def innermost(state: Any) -> Any:
     return state.halves[1] if isinstance(state, FilteredGradientState) else state
 
 
+def held(state: ChainState, field: str) -> np.ndarray:
+    """What a transform of the chain holds of the parameter."""
+    return next(getattr(part, field)[KEY] for part in state.states if hasattr(part, field))
+
+
 def by_hand(value: np.ndarray, power: float = 0.0) -> np.ndarray:
     return upsampled(value, TRUTH.shape[:-1]) / 4**power
 
@@ -190,10 +196,12 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
     old, new = before.optimizer, memory.optimizer
     assert new.step == old.step == 5
     if name == "momentum":
-        np.testing.assert_allclose(new.velocity[KEY], by_hand(old.velocity[KEY], 1), rtol=1e-10)
-    elif "meta" not in type(new).__name__.lower():
-        np.testing.assert_allclose(new.first_moment[KEY], by_hand(old.first_moment[KEY], 1), rtol=1e-10, atol=1e-18)
-        np.testing.assert_allclose(new.second_moment[KEY], by_hand(old.second_moment[KEY], SQUARES), rtol=1e-10)
+        np.testing.assert_allclose(held(new, "velocity"), by_hand(held(old, "velocity"), 1), rtol=1e-10)
+    elif "MetaAdam" not in type(run.optimizer).__name__:
+        first, before_first = (held(state, "first_moment") for state in (new, old))
+        np.testing.assert_allclose(first, by_hand(before_first, 1), rtol=1e-10, atol=1e-18)
+        second, before_second = (held(state, "second_moment") for state in (new, old))
+        np.testing.assert_allclose(second, by_hand(before_second, SQUARES), rtol=1e-10)
         assert new.begun == 0
     old, new = innermost(before.estimator), innermost(memory.estimator)
     image, past = new.image, old.image
@@ -246,8 +254,8 @@ def test_reset_states_know_nothing_but_the_step(name: str) -> None:
     fresh = optimizer.init(run.parameters, run.problem.learning_rates)
     assert memory.optimizer.step == before.optimizer.step == 5
     for field in ("first_moment", "second_moment", "velocity"):
-        if hasattr(fresh, field):
-            np.testing.assert_array_equal(getattr(memory.optimizer, field)[KEY], np.zeros(TRUTH.shape))
+        if any(hasattr(part, field) for part in fresh.states):
+            np.testing.assert_array_equal(held(memory.optimizer, field), np.zeros(TRUTH.shape))
     fresh = innermost(estimator.init(run.problem, run.parameters))
     assert repr(innermost(memory.estimator).image) == repr(fresh.image)
     if isinstance(memory.estimator, MetaState):
@@ -341,7 +349,7 @@ def test_by_default_the_estimator_remembers_and_the_optimizer_starts_anew() -> N
         memory.estimator.image.parameters[KEY], by_hand(before.estimator.image.parameters[KEY]), rtol=1e-12
     )
     assert (memory.optimizer.step, memory.optimizer.begun) == (5, 5)
-    assert not memory.optimizer.first_moment[KEY].any()
+    assert not held(memory.optimizer, "first_moment").any()
     assert parameters[KEY].shape != run.parameters[KEY].shape
 
 
@@ -702,10 +710,10 @@ def test_a_schedule_that_makes_no_sense_is_told_with_its_line(folder: Path) -> N
     [
         (ur.PathGradient(image=rcv(), spp=2), ur.optimizers.ScheduleFree(0.2)),
         (ur.MetaEstimator(coupled=True), ur.optimizers.MetaAdam(0.004)),
-        (ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=2, denoiser="none"), spp=2), ur.optimizers.Prodigy()),
-        (ur.PathGradient(spp=2), ur.optimizers.DoWG()),
+        (ur.PathGradient(pixels=ur.pixels.Adaptive(16, refresh=2, denoiser="none"), spp=2), ur.optimizers.Adam(0.1)),
+        (ur.PathGradient(spp=2), ur.optimizers.SGD(0.5, momentum=0.5)),
     ],
-    ids=["rcv", "coupled", "adaptive", "dowg"],
+    ids=["rcv", "coupled", "adaptive", "momentum"],
 )
 def test_a_parameterised_run_comes_to_its_resolution_and_repeats_when_resumed(
     estimator: Any, optimizer: Any, states: str, tmp_path: Path

@@ -146,7 +146,8 @@ def edit(folder: Path, step: int, change: Any) -> None:
 def _spoil_adam(packed: Packed) -> None:
     """The second moment is no number."""
     nodes = dict(packed.skeleton["dict"])
-    moment = dict(nodes["optimizer"]["fields"]["second_moment"]["dict"])[RATE]
+    _, mean_square = nodes["optimizer"]["fields"]["states"]["tuple"]
+    moment = dict(mean_square["fields"]["second_moment"]["dict"])[RATE]
     number = str(moment["array"])
     packed.tensors[number] = np.full_like(packed.tensors[number], np.nan)
 
@@ -156,7 +157,7 @@ def _other_shape(packed: Packed) -> Packed:
 
 
 def _other_class(packed: Packed) -> Packed:
-    text = json.dumps(packed.skeleton).replace("AdamState", "SGDState")
+    text = json.dumps(packed.skeleton).replace("MeanSquare", "Velocity")
     return Packed(json.loads(text), packed.tensors)
 
 
@@ -183,7 +184,7 @@ def test_where_no_checkpoint_can_be_used_the_last_one_s_fault_is_told(tmp_path: 
     for step in (2, 4, 6):
         edit(folder, step, _spoil_adam)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match=r"^checkpoint of step 6: optimizer\.second_moment\['rate'\]: not finite$"):
+    with pytest.raises(InputError, match=r"^checkpoint of step 6: optimizer\.states\[1\]\.second_moment\['rate'\]: not finite$"):
         ur.resume(folder, steps=12)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

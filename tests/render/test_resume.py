@@ -16,7 +16,9 @@ import unrender as ur
 from tiers import quick
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.optimizers.adam import AdamState
+from unrender.optimizers.chain import ChainState
+from unrender.optimizers.transforms.momentum import MeanDirection
+from unrender.optimizers.transforms.scale import MeanSquare
 from unrender.problem.fingerprint import differences, fingerprint
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
 from unrender.runs.reopen import problem_of
@@ -329,7 +331,7 @@ def test_states_come_back_as_they_were() -> None:
     rng = np.random.default_rng(0)
     texture = mi.TensorXf(rng.random((2, 3), np.float32))
     state: dict[Any, Any] = {
-        "adam": AdamState(3, {"k": 0.1}, {"k": texture}, {"k": mi.TensorXf(0.0)}),
+        "adam": ChainState(3, {"k": 0.1}, (MeanDirection({"k": texture}), MeanSquare({"k": mi.TensorXf(0.0)}))),
         "shared": (texture, [None, True, float("nan"), float("-inf"), 1 << 70, "text"]),
         "flat": (mi.Float([1, 2]), mi.UInt32([1, 4_000_000_000]), mi.Bool([True, False])),
         "host": (np.zeros((0, 3), np.int32), np.float32(3), np.arange(6).reshape(2, 3).T),
@@ -338,9 +340,9 @@ def test_states_come_back_as_they_were() -> None:
     packed = pack(state)
     again = unpack(Packed(json.loads(json.dumps(packed.skeleton)), packed.tensors))
     assert list(again) == list(state)
-    assert again["shared"][0] is again["adam"].first_moment["k"]
+    assert again["shared"][0] is again["adam"].of(MeanDirection).first_moment["k"]
     np.testing.assert_array_equal(again["shared"][0].numpy(), texture.numpy())
-    assert again["adam"].second_moment["k"].shape == ()
+    assert again["adam"].of(MeanSquare).second_moment["k"].shape == ()
     assert repr(again["shared"][1]) == repr(state["shared"][1])
     for before, after in zip((*state["flat"], state[7]), (*again["flat"], again[7]), strict=True):
         assert type(before) is type(after)
@@ -366,7 +368,7 @@ def test_states_of_another_form_are_told(other: Any) -> None:
 
 def test_what_comes_later_is_let_in() -> None:
     """Such as tables that an estimator makes after twenty steps, when a warm-up takes two."""
-    check_alike({"a": AdamState(0, {}, {}, {})}, [{"a": None}, {"a": ()}])
+    check_alike({"a": ChainState(0, {}, ())}, [{"a": None}, {"a": ()}])
     with pytest.raises(InputError, match="expected NoneType or int, got str"):
         check_alike({"a": "text"}, [{"a": None}, {"a": 3}])
 

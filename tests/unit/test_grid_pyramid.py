@@ -8,7 +8,8 @@ import pytest
 from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.optimizers import ScheduleFree
-from unrender.optimizers.signal_share import signal_share
+from unrender.optimizers.transforms.fitted_sobolev import FittedSobolevState
+from unrender.optimizers.transforms.wiener_shrinkage import signal_share
 from unrender.preconditioners import Sobolev, grid, grid_pyramid
 from unrender.preconditioners.grid_pyramid import GridPyramid
 
@@ -95,7 +96,7 @@ def test_a_pattern_of_noise_and_detail_is_recovered_as_with_transforms(monkeypat
             estimate = Estimate(0.0, {"x": x["x"] - truth + 0.3 * normal(step, shape)})
             steps, state = optimizer.update(estimate, state, x)
             x = {"x": x["x"] + steps["x"]}
-        assert bool(len(state.strengths["x"].last)) == (grid_pyramid.LARGEST_EXACT == 256)
+        assert bool(len(state.of(FittedSobolevState).strengths["x"].last)) == (grid_pyramid.LARGEST_EXACT == 256)
         return float(np.sqrt(np.mean((x["x"] - truth) ** 2)))
 
     exact = error()

@@ -12,8 +12,13 @@ import pytest
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.optimizers import Adam, ScheduleFree, schedule_free
-from unrender.optimizers.strength import StrengthFit
+from unrender.optimizers import Adam, ScheduleFree
+from unrender.optimizers.transforms import agreement_rate
+from unrender.optimizers.transforms.agreement_rate import Agreement
+from unrender.optimizers.transforms.fitted_sobolev import StrengthFit
+from unrender.optimizers.transforms.scale import MeanSquare
+from unrender.optimizers.transforms.schedule_free_average import Iterates
+from unrender.optimizers.transforms.wiener_shrinkage import GradientProducts
 from unrender.preconditioners import Sobolev
 from unrender.schedules import Cosine
 
@@ -41,17 +46,19 @@ def noise(step: int, x: np.ndarray) -> np.ndarray:
 def test_the_average_has_weights_that_grow_as_a_power_of_the_step(power: int):
     optimizer = ScheduleFree(0.1, averaging=power)
     _, states = descend(optimizer, np.zeros(5), noise, 40)
-    iterates = np.array([state.fast["x"] for state in states])
+    iterates = np.array([state.of(Iterates).fast["x"] for state in states])
     weights = np.array([math.comb(step + power, power) for step in range(40)], float)
     for count in (1, 2, 17, 40):
         expected = np.tensordot(weights[:count] / weights[:count].sum(), iterates[:count], 1)
-        np.testing.assert_allclose(states[count - 1].average["x"], expected, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(states[count - 1].of(Iterates).average["x"], expected, rtol=1e-10, atol=1e-14)
 
 
 def test_the_parameters_lie_between_iterate_and_average():
     seen, states = descend(ScheduleFree(0.1, beta=0.8), np.zeros(5), noise, 20)
     for x, state in zip(seen[1:], states, strict=True):
-        np.testing.assert_allclose(x, 0.2 * state.fast["x"] + 0.8 * state.average["x"], rtol=1e-12)
+        np.testing.assert_allclose(
+            x, 0.2 * state.of(Iterates).fast["x"] + 0.8 * state.of(Iterates).average["x"], rtol=1e-12
+        )
 
 
 def test_the_rate_of_a_constant_gradient_stays_or_grows():
@@ -59,30 +66,33 @@ def test_the_rate_of_a_constant_gradient_stays_or_grows():
         return np.array([1.0, -2.0, 0.5])
 
     _, states = descend(ScheduleFree(0.1, growth=0.0), np.zeros(3), along, 30)
-    assert states[-1].log_rate["x"] == pytest.approx(0.0, abs=1e-12)
-    moved = states[-1].fast["x"] - states[-2].fast["x"]
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(0.0, abs=1e-12)
+    moved = states[-1].of(Iterates).fast["x"] - states[-2].of(Iterates).fast["x"]
     np.testing.assert_allclose(moved, [-0.1, 0.1, -0.1], rtol=1e-9)
-    rises = [states[0].fast["x"][1], states[1].fast["x"][1] - states[0].fast["x"][1]]
+    rises = [
+        states[0].of(Iterates).fast["x"][1],
+        states[1].of(Iterates).fast["x"][1] - states[0].of(Iterates).fast["x"][1],
+    ]
     np.testing.assert_allclose(rises, [0.05, 0.1], rtol=1e-9)
     _, states = descend(ScheduleFree(0.1, growth=0.2), np.zeros(3), along, 30)
-    assert states[-1].log_rate["x"] == pytest.approx(29 * 0.2 * (1 - 2 / math.sqrt(27)))
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(29 * 0.2 * (1 - 2 / math.sqrt(27)))
 
 
 def test_the_rate_grows_no_further_than_the_parameter():
     """From 1 along a constant gradient: at most 3 times the first rate, and times what the root mean square has grown by."""
     _, states = descend(ScheduleFree(0.01, growth=0.2), np.ones(20), lambda step, x: np.ones_like(x), 40)
-    assert states[-1].log_rate["x"] == pytest.approx(math.log(3.0), abs=1e-9)  # it has come near 0
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(math.log(3.0), abs=1e-9)  # it has come near 0
     xs, states = descend(ScheduleFree(0.1, growth=0.2), np.ones(20), lambda step, x: -np.ones_like(x), 60)
-    assert states[-1].log_rate["x"] > math.log(5.0)
-    assert states[-1].log_rate["x"] <= math.log(3.0 * np.abs(xs[-1]).max())
+    assert states[-1].of(Agreement).log_rate["x"] > math.log(5.0)
+    assert states[-1].of(Agreement).log_rate["x"] <= math.log(3.0 * np.abs(xs[-1]).max())
     _, states = descend(ScheduleFree(0.1, growth=0.2), np.zeros(20), lambda step, x: np.ones_like(x), 30)
-    assert states[0].sizes == {"x": 1.0}
+    assert states[0].of(Agreement).sizes == {"x": 1.0}
 
 
 def test_steps_that_gradients_contradict_become_shorter():
     """A gradient that turns at every step: the mean correlation is -1 at last, and the rate shrinks by 2 q (1 - s) a step."""
     _, states = descend(ScheduleFree(0.1, decay=0.0), np.zeros(9), lambda step, x: (-1.0) ** step * np.ones(9), 60)
-    shrunk = states[-1].log_rate["x"] - states[-2].log_rate["x"]
+    shrunk = states[-1].of(Agreement).log_rate["x"] - states[-2].of(Agreement).log_rate["x"]
     assert shrunk == pytest.approx(-2 * 0.1 * (1 - 1 / 9), rel=1e-3)
 
 
@@ -94,10 +104,10 @@ def test_single_numbers_that_agree_by_chance_do_not_speed_up(monkeypatch: pytest
             descend(ScheduleFree(0.1, decay=0.0), np.zeros(1), lambda step, x, n=n: noise(100 * n + step, x), 60)[1]
             for n in range(40)
         )
-        return sum(max(state.log_rate["x"] for state in states) > 0.15 for states in found)
+        return sum(max(state.of(Agreement).log_rate["x"] for state in states) > 0.15 for states in found)
 
     assert grown() <= 2
-    monkeypatch.setattr(schedule_free, "_PAIRS", math.inf)
+    monkeypatch.setattr(agreement_rate, "_PAIRS", math.inf)
     assert grown() >= 20
 
 
@@ -105,13 +115,15 @@ def test_the_rate_of_uncorrelated_gradients_falls_by_its_power():
     """Gradients that alternate between two axes have no correlation at all: the mean correlation is then 0.8^t."""
     _, states = descend(ScheduleFree(0.1, decay=0.4, growth=0.0), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200)
     expected = -0.4 * sum((1 - 0.8**step) / (step + 10) for step in range(1, 200))
-    assert states[-1].log_rate["x"] == pytest.approx(expected, rel=1e-9)
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(expected, rel=1e-9)
     _, states = descend(
         ScheduleFree(0.1, decay=50.0, growth=0.0), np.zeros(2), lambda step, x: np.eye(2)[step % 2], 200
     )
-    assert states[-1].log_rate["x"] == pytest.approx(-0.6 * sum(1 / (step + 10) for step in range(1, 200)), rel=1e-9)
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(
+        -0.6 * sum(1 / (step + 10) for step in range(1, 200)), rel=1e-9
+    )
     _, states = descend(ScheduleFree(0.1, decay=0.0, growth=0.0), np.zeros(2), noise, 50)
-    assert states[-1].log_rate["x"] == 0.0
+    assert states[-1].of(Agreement).log_rate["x"] == 0.0
 
 
 def test_the_schedule_is_a_further_factor():
@@ -121,7 +133,9 @@ def test_the_schedule_is_a_further_factor():
     _, plain = descend(ScheduleFree(0.1, growth=0.0), np.zeros(1), along, 12)
     _, scheduled = descend(ScheduleFree(0.1, growth=0.0, schedule=Cosine(10, 0.25)), np.zeros(1), along, 12)
     for step in range(1, 12):
-        moved, as_scheduled = (found[step].fast["x"] - found[step - 1].fast["x"] for found in (plain, scheduled))
+        moved, as_scheduled = (
+            found[step].of(Iterates).fast["x"] - found[step - 1].of(Iterates).fast["x"] for found in (plain, scheduled)
+        )
         np.testing.assert_allclose(as_scheduled, Cosine(10, 0.25)(step) * moved, rtol=1e-9)
 
 
@@ -134,9 +148,9 @@ def test_the_mean_square_is_of_all_gradients_once_there_are_many():
         (30, 2 / 3 * (1 - 0.95**20)),
         (60, (1 - 0.95**20) / 3),
     ):
-        np.testing.assert_allclose(states[made - 1].second_moment["x"], expected, rtol=1e-12)
+        np.testing.assert_allclose(states[made - 1].of(MeanSquare).second_moment["x"], expected, rtol=1e-12)
     _, states = descend(ScheduleFree(0.1, growth=0.0), np.zeros(2), lambda step, x: 2.0 + 0 * x, 60)
-    moved = states[-1].fast["x"] - states[-2].fast["x"]
+    moved = states[-1].of(Iterates).fast["x"] - states[-2].of(Iterates).fast["x"]
     np.testing.assert_allclose(moved, -0.1, rtol=1e-9)  # debiased by the sum of these weights
 
 
@@ -153,13 +167,13 @@ def test_where_smoothing_becomes_stronger_the_iterate_begins_again_at_the_mean(
     optimizer = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",), growth=0.0, decay=0.0)
     g = np.ones((4, 4, 1), np.float32)
     _, states = descend(optimizer, np.zeros((4, 4, 1)), lambda step, x: g, 3)
-    begun = states[1].average["x"] if gain < 1 else states[1].fast["x"]
+    begun = states[1].of(Iterates).average["x"] if gain < 1 else states[1].of(Iterates).fast["x"]
     expected = 0.95 * (1 - 0.95**2) * 4 + 0.05
-    np.testing.assert_allclose(states[2].second_moment["x"], expected, rtol=1e-3)
+    np.testing.assert_allclose(states[2].of(MeanSquare).second_moment["x"], expected, rtol=1e-3)
     root = math.sqrt(expected / (1 - 0.95**3))
     rate = 0.03 if gain > 1 else 0.1
-    np.testing.assert_allclose(states[2].fast["x"] - begun, -rate / root, rtol=0.04)
-    assert np.abs(states[1].fast["x"] - states[1].average["x"]).min() > 0.02
+    np.testing.assert_allclose(states[2].of(Iterates).fast["x"] - begun, -rate / root, rtol=0.04)
+    assert np.abs(states[1].of(Iterates).fast["x"] - states[1].of(Iterates).average["x"]).min() > 0.02
 
 
 def test_noise_is_averaged_where_a_constant_rate_leaves_it():
@@ -196,10 +210,10 @@ def test_the_preconditioner_acts_on_gradient_and_direction():
     _, states = descend(optimizer, np.zeros((6, 5, 1)), lambda step, x: g, 1)
     inner = smooth.apply(g.astype(np.float32))
     expected = -0.05 * smooth.apply(inner / (np.abs(inner) + 1e-12))
-    np.testing.assert_allclose(states[0].fast["x"], expected, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(states[0].of(Iterates).fast["x"], expected, rtol=1e-4, atol=1e-7)
     plain = ScheduleFree(0.1, preconditioner=smooth)
     _, states = descend(plain, np.zeros((6, 5, 1)), lambda step, x: g, 1)
-    np.testing.assert_allclose(states[0].fast["x"], -0.05 * np.sign(g), rtol=1e-6)
+    np.testing.assert_allclose(states[0].of(Iterates).fast["x"], -0.05 * np.sign(g), rtol=1e-6)
 
 
 def test_steps_are_as_long_as_the_share_of_signal_in_their_neighbourhood():
@@ -214,11 +228,11 @@ def test_steps_are_as_long_as_the_share_of_signal_in_their_neighbourhood():
     assert product.min() > 0
     share = 0.2 * np.minimum(product / square, 1) + 0.8
     second = (0.95 * 0.05 * g * g + 0.05 * h * h) / (1 - 0.95**2)
-    moved = states[1].fast["x"] - states[0].fast["x"]
+    moved = states[1].of(Iterates).fast["x"] - states[0].of(Iterates).fast["x"]
     np.testing.assert_allclose(moved, -0.1 * smooth.apply(h / np.sqrt(second)) * share, rtol=1e-3, atol=1e-6)
     _, states = descend(replace(optimizer, wiener=False), np.zeros((6, 5, 2)), lambda step, x: gradients[step], 2)
-    assert states[1].product == states[1].square == {}
-    moved = states[1].fast["x"] - states[0].fast["x"]
+    assert states[1].of(GradientProducts).product == states[1].of(GradientProducts).square == {}
+    moved = states[1].of(Iterates).fast["x"] - states[0].of(Iterates).fast["x"]
     np.testing.assert_allclose(moved, -0.1 * smooth.apply(h / np.sqrt(second)), rtol=1e-3, atol=1e-6)
 
 

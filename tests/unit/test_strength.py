@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from unrender.estimators.base import Estimate
-from unrender.optimizers import ScheduleFree, strength
-from unrender.optimizers.strength import STEPS, StrengthFit
+from unrender.optimizers import ScheduleFree
+from unrender.optimizers.transforms import fitted_sobolev
+from unrender.optimizers.transforms.fitted_sobolev import STEPS, FittedSobolevState, StrengthFit
 from unrender.preconditioners import LargeSteps, Sobolev
 
 SHAPE = (32, 32, 1)
@@ -116,7 +117,7 @@ def test_detail_that_falls_in_smoothed_steps_too_is_left_to_them(monkeypatch: py
     """A third of the first gradients is less than step^(-3/4) leaves of them; what then stays waits, what has halved again does not."""
     assert [fit.share < 0.1 for fit in watched(0.3, 0.03)] == [False, False, True]
     assert [fit.share for fit in watched(0.3, 0.03, late=0.5)] == [1.0] * 3
-    monkeypatch.setattr(strength, "_SLOWEST", 2.0)
+    monkeypatch.setattr(fitted_sobolev, "_SLOWEST", 2.0)
     assert watched(0.3, 0.03, late=0.5)[1].share < 0.1, "without that condition"
 
 
@@ -124,15 +125,15 @@ def test_little_that_is_left_is_not_worth_the_noise_of_single_texels(monkeypatch
     """Detail that waits, of a tenth and of a thirtieth of the first gradients."""
     assert watched(0.3, 0.03, scales=(0.4, 0.4, 0.4))[-1].share < 0.1
     assert [fit.share for fit in watched(0.3, 0.03, scales=(0.1, 0.1, 0.1))] == [1.0] * 3
-    monkeypatch.setattr(strength, "_LEAST_LEFT", 0.0)
+    monkeypatch.setattr(fitted_sobolev, "_LEAST_LEFT", 0.0)
     assert watched(0.3, 0.03, scales=(0.1, 0.1, 0.1))[-1].share < 0.1, "without that condition"
 
 
 def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPatch):
     assert [fit.share for fit in watched(0.0, 1.0)] == [1.0] * 3
     assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"
-    monkeypatch.setattr(strength, "_CONFIRMED", 0.1)
-    monkeypatch.setattr(strength, "_KEPT", 0.1)
+    monkeypatch.setattr(fitted_sobolev, "_CONFIRMED", 0.1)
+    monkeypatch.setattr(fitted_sobolev, "_KEPT", 0.1)
     assert watched(0.7, 1.0)[-1].share < 0.1, "without the share that has to be confirmed"
 
 
@@ -205,5 +206,8 @@ def test_the_optimizer_says_what_it_has_chosen():
     for _ in range(3):
         _, state = optimizer.update(Estimate(0.0, {"x": BOARD, "y": np.ones(2, np.float32)}), state, x)
     smoothing, rate = optimizer.choices(state)
-    assert smoothing == f"smoothing, as a share of the strongest: x {state.strengths['x'].share:.2g}"
+    assert (
+        smoothing
+        == f"smoothing, as a share of the strongest: x {state.of(FittedSobolevState).strengths['x'].share:.2g}"
+    )
     assert rate == "learning rate, over the first: x 1.2, y 1.1"

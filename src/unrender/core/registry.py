@@ -88,6 +88,7 @@ KINDS: dict[str, Kind] = {
         _kind("image estimator", "unrender.images", "unrender.images.base.ImageEstimator", "init estimate advance"),
         _kind("estimator", "unrender.estimators", "unrender.estimators.base.Estimator", "init estimate"),
         _kind("optimizer", "unrender.optimizers", "unrender.optimizers.base.Optimizer", "init update"),
+        _kind("step transform", "unrender.optimizers.transforms", "unrender.optimizers.transforms.base.StepTransform"),
         _kind("method", "unrender.methods", "unrender.methods.base.Options", in_tables=False),
         _kind(
             "gallery problem", "unrender.gallery", "unrender.gallery.specification.Specification",

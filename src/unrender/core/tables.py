@@ -137,6 +137,8 @@ def _value(value: Any, hint: Any, key: str, folder: Path | None, depth: int) -> 
         return value
     choices = (hint, *typing.get_args(hint))
     kind = next((kind for kind in map(registry.kind_of_protocol, choices) if kind), None)
+    if kind is not None and typing.get_origin(hint) is tuple and isinstance(value, (list, tuple)):
+        return tuple(_value(part, choices[1], f"{key}[{index}]", folder, depth) for index, part in enumerate(value))
     if kind is not None or (isinstance(value, Mapping) and _TYPE in value):
         try:
             return _component(value, kind, folder, depth + 1)

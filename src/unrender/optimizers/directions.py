@@ -18,7 +18,8 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Smoothing
 from unrender.optimizers import rates
-from unrender.optimizers.adam import Adam, AdamState
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.chain import ChainState
 from unrender.problem.upsampling import NotCarried, Upsampler
 from unrender.schedules.functions import Schedule
 
@@ -37,7 +38,7 @@ class NewtonState:
 
     step: int
     learning_rates: dict[str, float]
-    adam: AdamState | None = None
+    adam: ChainState | None = None
 
     def upsampled(self, upsampler: Upsampler) -> NewtonState:
         """See `Upsamplable`. Raises `NotCarried` with an inner Adam, whose moments are on the host."""
@@ -91,8 +92,7 @@ def init_state(
     own = rates.per_parameter(owner, parameters, options.learning_rate, learning_rates)
     adam = None
     if options.inner_optimizer is not None:
-        zeros = {key: np.zeros(arrays.shape(x)) for key, x in parameters.items()}
-        adam = options.inner_optimizer.init(zeros, learning_rates)
+        adam = options.inner_optimizer.init(_on_host(parameters), learning_rates)
     return NewtonState(0, own, adam)
 
 
@@ -114,8 +114,13 @@ def apply_direction(
         direction = np.zeros_like(direction)
     step, adam = options.step_scale * direction, state.adam
     if options.inner_optimizer is not None and adam is not None:
-        opposite = vectors.unravel(-direction, adam.first_moment)
+        opposite = vectors.unravel(-direction, _on_host(parameters))
         steps, adam = options.inner_optimizer.update(Estimate(0.0, opposite), adam, opposite)
         step = vectors.ravel(steps)
     factor = rates.factor(owner, options.schedule, state.step)
     return vectors.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)
+
+
+def _on_host(parameters: Tree) -> Tree:
+    """Return zeros of the parameters' shapes, in double precision."""
+    return {key: np.zeros(arrays.shape(x)) for key, x in parameters.items()}

@@ -3,47 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
-from unrender.core import arrays, checks
+from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.core.trees import Tree
-from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
 from unrender.optimizers import rates
-from unrender.problem.upsampling import Upsampler
+from unrender.optimizers.chain import Recipe
+from unrender.optimizers.transforms.base import StepTransform
+from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation
 from unrender.schedules.functions import Schedule
 
-__all__ = ["MetaAdam", "MetaAdamState"]
-
-
-@dataclass(frozen=True)
-class MetaAdamState:
-    """State between steps.
-
-    Attributes:
-        step: steps made so far.
-        learning_rates: of each parameter, before the schedule.
-    """
-
-    step: int
-    learning_rates: dict[str, float]
-
-    def upsampled(self, upsampler: Upsampler) -> MetaAdamState:
-        """See `Upsamplable`: nothing in it has a parameter's shape."""
-        del upsampler
-        return self
-
-    def restarted(self, fresh: MetaAdamState) -> MetaAdamState:
-        """See `Restartable`: the schedule goes on."""
-        return replace(fresh, step=self.step)
+__all__ = ["MetaAdam"]
 
 
 @register
 @dataclass(frozen=True)
-class MetaAdam:
+class MetaAdam(Recipe):
     """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator provides.
 
     Adam divides by the root mean square of many gradients, which it assumes independent; a meta-estimate is an average already and
@@ -59,7 +36,8 @@ class MetaAdam:
     steps of a long memory fall as 1 / √n by themselves. What a gradient moves an element by, relative to what noise does, is about the
     same by both rules, and Adam's: no factor of the step changes that.
 
-    At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's.
+    At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's. The chain is `ScaleByDeviation`, and
+    `ClipDirection` with `longest`.
 
     Args:
         learning_rate: η, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
@@ -84,26 +62,7 @@ class MetaAdam:
         if self.rule not in ("deviation", "walk"):
             raise InputError(f"MetaAdam: rule must be one of deviation, walk, got {self.rule!r}")
 
-    @property
-    def requires(self) -> Capabilities:
-        """A gradient and its variance; by the rule "walk" the weight of the past in it, too."""
-        return Capabilities(Gradient, Variance, *([PastWeight] if self.rule == "walk" else []))
-
-    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> MetaAdamState:
-        """See `Optimizer.init`."""
-        return MetaAdamState(0, rates.per_parameter("MetaAdam", parameters, self.learning_rate, learning_rates))
-
-    def update(self, estimate: Estimate, state: MetaAdamState, parameters: Tree) -> tuple[Tree, MetaAdamState]:
-        """See `Optimizer.update`. Lazy on Dr.Jit."""
-        del parameters
-        variance = estimate.require("MetaAdam", Variance).values
-        past = estimate.require("MetaAdam", PastWeight).values if self.rule == "walk" else {}
-        factor = rates.factor("MetaAdam", self.schedule, state.step)
-        steps: Tree = {}
-        for key, gradient in estimate.gradient.items():
-            rate = arrays.scalar(-state.learning_rates[key] * factor, gradient)
-            step = gradient / arrays.sqrt(variance[key] + self.epsilon)
-            if past:
-                step = step * arrays.sqrt((1.0 - past[key]) / (1.0 + past[key]))
-            steps[key] = rate * (step if self.longest is None else arrays.clip(step, -self.longest, self.longest))
-        return steps, replace(state, step=state.step + 1)
+    def compose(self) -> tuple[StepTransform, ...]:
+        """See `Recipe.compose`."""
+        scale = ScaleByDeviation(self.epsilon, self.rule)
+        return (scale,) if self.longest is None else (scale, ClipDirection(self.longest))

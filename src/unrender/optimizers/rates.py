@@ -6,14 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from unrender.core import arrays, checks
-from unrender.core.arrays import Array
+from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.core.trees import Tree
 from unrender.schedules.functions import Schedule
 
-__all__ = ["check", "elements", "factor", "from_sizes", "per_parameter"]
+__all__ = ["check", "factor", "per_parameter"]
 
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
@@ -46,19 +44,6 @@ def per_parameter(
             raise InputError(f'{owner}: learning rate given for unknown parameter "{key}"{hint}')
         checks.number(owner, f'learning rate of "{key}"', rate, above=0.0)
     return {key: float(own.get(key, common)) for key in keys}
-
-
-def from_sizes(owner: str, parameters: Tree, share: float, own: Mapping[str, float] | None) -> dict[str, float]:
-    """{key: a first length in units of the parameter}: its own where it has one, else `share` of the root mean square of its values, or
-    of 1 where they are 0. Raises `InputError` as `per_parameter` does. Waits for the device."""
-    given = per_parameter(owner, parameters, share, own)
-    sizes = {key: math.sqrt(arrays.number(arrays.total(x * x)) / elements(x)) for key, x in parameters.items()}
-    return {key: rate if key in (own or {}) else rate * (sizes[key] or 1.0) for key, rate in given.items()}
-
-
-def elements(x: Array) -> int:
-    """How many an array has, 1 at least."""
-    return max(1, math.prod(arrays.shape(x)))
 
 
 def factor(owner: str, schedule: Schedule | None, step: int) -> float:

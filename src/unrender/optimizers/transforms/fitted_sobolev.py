@@ -1,17 +1,35 @@
-"""How much a Sobolev preconditioner smooths: its strength, fitted to successive gradients."""
+"""Sobolev gradients whose strength is fitted to successive gradients."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, trees
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.core.text import listed
+from unrender.core.trees import Tree
+from unrender.estimators.capabilities import FreshGradient
+from unrender.optimizers.transforms.base import (
+    GRADIENTS,
+    SmoothingChange,
+    StepTransform,
+    StepUpdate,
+    TransformState,
+    checked_keys,
+)
 from unrender.preconditioners import Sobolev
+from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.mesh import MeshTopology
+from unrender.problem.upsampling import Upsampler
 
-__all__ = ["STEPS", "StrengthFit"]
+__all__ = ["STEPS", "ApplyPreconditioner", "FittedSobolev", "FittedSobolevState", "StrengthFit"]
 
 STEPS = 10
 """The pairs of gradients that the strength is fitted to at first: later ones tell more of noise than of what is still to do."""
@@ -237,3 +255,138 @@ def _share(sums: np.ndarray) -> float:
         return 1.0
     part = (descent[first] - least) / (descent[first] - descent[first - 1])
     return float(_FACTOR ** (part - first))
+
+
+# ------------------------------------------------------------------------------------------------------ transforms
+
+
+@dataclass(frozen=True)
+class FittedSobolevState(TransformState):
+    """State of `FittedSobolev`.
+
+    Attributes:
+        gradient: Gradient of the last step, preconditioned; zeros before the first.
+        strengths: {key: fit of the strength}, of the parameters whose preconditioner is a `Sobolev`.
+    """
+
+    gradient: Tree = field(metadata=GRADIENTS)
+    strengths: dict[str, StrengthFit] = field(default_factory=dict)
+
+    def upsampled(self, upsampler: Upsampler) -> FittedSobolevState:
+        """See `Upsamplable`: the strength is fitted anew."""
+        strengths = {key: StrengthFit() if key in upsampler.shares else fit for key, fit in self.strengths.items()}
+        return replace(super().upsampled(upsampler), strengths=strengths)
+
+
+@register
+@dataclass(frozen=True)
+class FittedSobolev(StepTransform):
+    """Precondition gradients, and remember them for the transforms that follow.
+
+    The strength of a `Sobolev` is the greatest that is of use: it is fitted to successive gradients, see `StrengthFit`. Any other
+    preconditioner is applied as it is. Gradients of other parameters stay as they are. The gradient keeps its unit.
+
+    Args:
+        preconditioner: S; None for none.
+        preconditioned: Keys of the parameters to precondition.
+    """
+
+    preconditioner: Preconditioner | None = None
+    preconditioned: tuple[str, ...] = ()
+    _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def __post_init__(self):
+        keys = checked_keys("FittedSobolev: preconditioned", self.preconditioned)
+        object.__setattr__(self, "preconditioned", keys)
+
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> FittedSobolev:
+        """See `OnMeshes.on_meshes`."""
+        smooth, bound = self.preconditioner, {}
+        if isinstance(smooth, MeshPreconditioner):
+            found = {key: topology(key) for key in self.preconditioned}
+            bound = {key: (mesh, smooth.on_mesh(mesh)) for key, mesh in found.items() if mesh is not None}
+        transform = replace(self)
+        object.__setattr__(transform, "_on_meshes", bound)
+        return transform
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> FittedSobolevState:
+        """See `StepTransform.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
+        del learning_rates
+        for key in self.preconditioned:
+            if key not in parameters:
+                raise InputError(f'FittedSobolev: preconditioned: unknown parameter "{key}"')
+            if self.preconditioner is not None:
+                self._smooth(key).check(key, arrays.shape(parameters[key]))
+        fitted = self.preconditioned if isinstance(self.preconditioner, Sobolev) else ()
+        return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()))
+
+    def update(self, update: StepUpdate, state: FittedSobolevState) -> tuple[StepUpdate, FittedSobolevState]:
+        """See `StepTransform.update`. Waits for the device where a strength is fitted."""
+        raw = update.gradient
+        if update.made == 0:
+            strengths = {key: fit.begun(self._sobolev(key), raw[key]) for key, fit in state.strengths.items()}
+        else:
+            found = update.estimate.get(FreshGradient)
+            fresh: Mapping[str, Array] = {} if found is None else found.values
+            strengths = {
+                key: fit.after(self._sobolev(key), state.gradient[key], raw[key], fresh.get(key))
+                for key, fit in state.strengths.items()
+            }
+        smoothing = (
+            {} if self.preconditioner is None else {k: self._smoothing(k, strengths) for k in self.preconditioned}
+        )
+        gradient = dict(raw)
+        for key, change in smoothing.items():
+            if key in raw and change.preconditioner is not None:
+                gradient[key] = change.preconditioner.apply(raw[key])
+        following = replace(state, gradient=gradient, strengths=strengths)
+        return replace(
+            update, gradient=gradient, direction=gradient, previous=state.gradient, smoothing=smoothing
+        ), following
+
+    def choices(self, state: FittedSobolevState, made: int) -> tuple[str, ...]:
+        """See `StepTransform.choices`: how strongly gradients are smoothed."""
+        del made
+        fitted = [f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count]
+        return (f"smoothing, as a share of the strongest: {listed(fitted)}",) if fitted else ()
+
+    def _smoothing(self, key: str, strengths: Mapping[str, StrengthFit]) -> SmoothingChange:
+        smooth, fit = self._smooth(key), strengths.get(key)
+        vertices = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
+        if fit is None:
+            return SmoothingChange(smooth, vertices=vertices)
+        scaled = smooth.scaled(fit.share) if isinstance(smooth, Sobolev) else smooth
+        return SmoothingChange(scaled, fit.gain, fit.level, fit.confirmed, vertices)
+
+    def _smooth(self, key: str) -> Preconditioner:
+        """Return the preconditioner of a parameter in `preconditioned`, at full strength."""
+        found = self._on_meshes[key][1] if key in self._on_meshes else self.preconditioner
+        assert found is not None
+        return found
+
+    def _sobolev(self, key: str) -> Sobolev:
+        return cast("Sobolev", self._smooth(key))
+
+
+@register
+@dataclass(frozen=True)
+class ApplyPreconditioner(StepTransform):
+    """Apply the preconditioner of this step to the direction.
+
+    With `FittedSobolev` before it and a scaling between the two, the parameter moves along S (S g / scale).
+    """
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
+        """See `StepTransform.init`."""
+        del parameters, learning_rates
+
+    def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
+        """See `StepTransform.update`."""
+        del state
+        direction = dict(update.direction)
+        for key, change in update.smoothing.items():
+            if key in direction and change.preconditioner is not None:
+                direction[key] = change.preconditioner.apply(direction[key])
+        return replace(update, direction=direction), None

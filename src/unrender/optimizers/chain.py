@@ -1,0 +1,137 @@
+"""Optimizers as chains of transforms."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+from unrender.core import arrays
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import Capabilities, Gradient
+from unrender.optimizers import rates
+from unrender.optimizers.base import OnMeshes
+from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_transforms
+from unrender.preconditioners.mesh import MeshTopology
+from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.schedules.functions import Schedule
+
+__all__ = ["Chain", "ChainState", "Recipe"]
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """State of a chain between steps.
+
+    Attributes:
+        step: Number of steps made so far.
+        learning_rates: {key: η} before schedule and factors.
+        states: States of the transforms, in their order.
+        begun: Step at which these states began.
+    """
+
+    step: int
+    learning_rates: dict[str, float]
+    states: tuple[Any, ...]
+    begun: int = 0
+
+    def of(self, kind: type[S]) -> S:
+        """Return the first state of this type. Raise `KeyError` where there is none."""
+        for state in self.states:
+            if isinstance(state, kind):
+                return state
+        raise KeyError(kind.__name__)
+
+    def upsampled(self, upsampler: Upsampler) -> ChainState:
+        """See `Upsamplable`: as each of the states."""
+        return replace(self, states=tuple(upsampled(state, upsampler) for state in self.states))
+
+    def restarted(self, fresh: ChainState) -> ChainState:
+        """See `Restartable`: the schedule goes on; the transforms begin at this step."""
+        pairs = zip(self.states, fresh.states, strict=True)
+        states = tuple(restarted(state, begun) for state, begun in pairs)
+        return replace(fresh, step=self.step, begun=self.step, states=states)
+
+
+class Recipe(ABC):
+    """An optimizer that is a composition of transforms. Subclasses are registered frozen dataclasses."""
+
+    learning_rate: Any
+    schedule: Schedule | None
+
+    @abstractmethod
+    def compose(self) -> tuple[StepTransform, ...]:
+        """Return the transforms, first to last."""
+
+    @cached_property
+    def _composed(self) -> tuple[StepTransform, ...]:
+        return self.compose()
+
+    @property
+    def requires(self) -> Capabilities:
+        """A gradient, and what the transforms require."""
+        return Capabilities(Gradient, *(kind for part in self._composed for kind in part.requires))
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
+        """See `Optimizer.init`."""
+        own = rates.per_parameter(type(self).__name__, parameters, self.learning_rate, learning_rates)
+        return ChainState(0, own, tuple(part.init(parameters, own) for part in self._composed))
+
+    def update(self, estimate: Estimate, state: ChainState, parameters: Tree) -> tuple[Tree, ChainState]:
+        """See `Optimizer.update`. Lazy on Dr.Jit unless a transform waits: evaluate steps and state together."""
+        factor = rates.factor(type(self).__name__, self.schedule, state.step)
+        made, gradient = state.step - state.begun, estimate.gradient
+        update = StepUpdate(estimate, parameters, made, state.learning_rates, gradient, gradient, factor)
+        states = []
+        for part, before in zip(self._composed, state.states, strict=True):
+            update, after = part.update(update, before)
+            states.append(after)
+        steps = {
+            key: update.steps[key] if key in update.steps else arrays.scalar(-update.rate(key), x) * x
+            for key, x in update.direction.items()
+        }
+        return steps, replace(state, step=state.step + 1, states=tuple(states))
+
+    def choices(self, state: ChainState) -> tuple[str, ...]:
+        """See `Choosing`."""
+        made, pairs = state.step - state.begun, zip(self._composed, state.states, strict=True)
+        return tuple(line for part, own in pairs for line in part.choices(own, made))
+
+
+@register
+@dataclass(frozen=True)
+class Chain(Recipe):
+    """Transforms one after the other, and last a step against the direction: −η × direction.
+
+        Chain((GradientMean(0.9), ScaleByRms(0.999)), learning_rate=0.01)
+
+    This example is Adam. A transform receives the gradient as its predecessor has left it, so the order matters.
+
+    Args:
+        transforms: First to last; see `unrender.optimizers.transforms`.
+        learning_rate: η, in units of the parameter for a direction of size 1, > 0. Or {key: rate, "*": of the others}.
+        schedule: Factor of every learning rate by step; see `unrender.schedules.functions`.
+    """
+
+    transforms: tuple[StepTransform, ...] = ()
+    learning_rate: float | Mapping[str, float] = 0.01
+    schedule: Schedule | None = None
+
+    def __post_init__(self):
+        rates.check("Chain", self.learning_rate, self.schedule)
+        object.__setattr__(self, "transforms", checked_transforms("Chain: transforms", self.transforms))
+
+    def compose(self) -> tuple[StepTransform, ...]:
+        """See `Recipe.compose`."""
+        return self.transforms
+
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Chain:
+        """See `OnMeshes.on_meshes`."""
+        bound = (part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in self.transforms)
+        return replace(self, transforms=tuple(bound))  # pyright: ignore[reportArgumentType]

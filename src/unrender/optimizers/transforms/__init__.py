@@ -1,0 +1,23 @@
+"""The parts that steps are made of: each has `init` and `update`, and `unrender.optimizers.Chain` composes them."""
+
+from unrender.optimizers.transforms.agreement_rate import AgreementRate
+from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
+from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
+from unrender.optimizers.transforms.per_parameter import PerParameter
+from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation, ScaleByRms
+from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
+from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
+
+__all__ = [
+    "AgreementRate",
+    "ApplyPreconditioner",
+    "ClipDirection",
+    "DecayingSum",
+    "FittedSobolev",
+    "GradientMean",
+    "PerParameter",
+    "ScaleByDeviation",
+    "ScaleByRms",
+    "ScheduleFreeAverage",
+    "WienerShrinkage",
+]

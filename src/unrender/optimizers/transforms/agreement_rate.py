@@ -1,0 +1,135 @@
+"""Learning rates that follow the cosine similarity of successive gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+from unrender.core.memory import inner_products
+from unrender.core.registry import register
+from unrender.core.text import listed
+from unrender.core.trees import Tree
+from unrender.optimizers.transforms.base import (
+    SMOOTHING_UNCHANGED,
+    StepTransform,
+    StepUpdate,
+    TransformState,
+    checked_keys,
+)
+
+__all__ = ["Agreement", "AgreementRate"]
+
+_DELAY = 10.0
+"""τ of the docstring, in steps."""
+_STEEPEST = 0.6
+"""The greatest power of 1/t that the rate falls by: between 1/2 and 1, with averages, as in Polyak and Juditsky 1992."""
+_MEMORY = 0.8
+"""Decay of the mean correlation of successive gradients."""
+_PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
+"""Independent pairs of gradients of which a plain mean would tell as much."""
+_MOST_GROWTH = 3.0
+"""Times the first rate, and times what the parameters themselves have grown by."""
+_REFINED = 0.3
+"""The greatest rate, over the first one, at a step that reduces smoothing."""
+
+
+@dataclass(frozen=True)
+class Agreement(TransformState):
+    """State of `AgreementRate`.
+
+    Attributes:
+        correlation: {key: ρ, the mean correlation of successive gradients}.
+        log_rate: {key: logarithm of the factor of the rate}.
+        sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
+    """
+
+    correlation: dict[str, float]
+    log_rate: dict[str, float]
+    sizes: dict[str, float]
+
+
+@register
+@dataclass(frozen=True)
+class AgreementRate(StepTransform):
+    """Change each parameter's learning rate by the mean correlation ρ of its successive gradients.
+
+        log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
+
+    with τ = 10. The rate grows while gradients agree. It shrinks where they contradict one another, as after steps too long. It falls as
+    t^-0.6 once they are noise. Gradients of n elements agree by chance within s = 1/(3 √n), the standard error of ρ. The rate grows up to 3
+    times the first, and times what the parameter itself has grown by. A step that reduces smoothing has at most 0.3 of the first rate.
+    A `FittedSobolev` before it remembers the last gradient.
+
+    Args:
+        growth: q, >= 0; 0 for a rate that never grows.
+        decay: p, >= 0; 0 for a rate that never falls.
+        unsized: Keys of parameters whose size does not raise the limit of the rate, such as those that move as logarithms.
+    """
+
+    growth: float = 0.1
+    decay: float = 1.5
+    unsized: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        checks.number("AgreementRate", "growth", self.growth, above=0.0, inclusive=True)
+        checks.number("AgreementRate", "decay", self.decay, above=0.0, inclusive=True)
+        object.__setattr__(self, "unsized", checked_keys("AgreementRate: unsized", self.unsized))
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Agreement:
+        """See `StepTransform.init`."""
+        sizes = {
+            key: max(_root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, learning_rates[key])
+            for key, x in parameters.items()
+        }
+        return Agreement(dict.fromkeys(parameters, 1.0), dict.fromkeys(parameters, 0.0), sizes)
+
+    def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
+        """See `StepTransform.update`. Waits for the device: correlations and the parameters' size are read."""
+        previous = update.require_previous("AgreementRate")
+        if update.made > 0:
+            correlation, log_rate = {}, {}
+            for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
+                rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
+                fit, shape = update.smoothing.get(key, SMOOTHING_UNCHANGED), arrays.shape(update.gradient[key])
+                change = self._change(min(rho, rho * fit.confirmed), shape, update.made)
+                grown = 1.0 if key in self.unsized else max(1.0, size / state.sizes[key])
+                most = math.log(_MOST_GROWTH * grown if fit.gain == 1.0 else _REFINED if fit.gain > 1.0 else 1.0)
+                log_rate[key] = min(state.log_rate[key] + change, most)
+            state = replace(state, correlation=correlation, log_rate=log_rate)
+        factors = {key: update.factors.get(key, 1.0) * math.exp(state.log_rate[key]) for key in update.gradient}
+        return replace(update, factors=factors), state
+
+    def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
+        """See `StepTransform.choices`: how far the rates have come."""
+        changed = [f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items()] if made > 0 else []
+        return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
+
+    def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
+        """Return the change of the rate's logarithm in one step."""
+        power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
+        error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
+        change = self.growth * (max(0.0, 2.0 * (correlation - error) - 1.0) - 2.0 * max(0.0, -correlation - error))
+        return change - power / (made + _DELAY)
+
+
+def _root_mean_square(x: Array, square: float) -> float:
+    """Return the root mean square of an array whose squares sum up to `square`; 0 of no elements."""
+    return math.sqrt(square / max(1, math.prod(arrays.shape(x))))
+
+
+def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tuple[float, float]]:
+    """Return {key: (cosine of the angle between two gradients, 0 where one of them is 0; root mean square of the parameter)}."""
+    sums = {
+        key: inner_products([(g, previous[key]), (g, g), (previous[key],) * 2, (parameters[key],) * 2])
+        for key, g in gradient.items()
+    }
+    arrays.evaluate(sums)
+    found = {}
+    for key, parts in sums.items():
+        product, one, other, square = (arrays.number(part) for part in parts)
+        lengths = math.sqrt(one) * math.sqrt(other)
+        found[key] = (product / lengths if lengths > 0 else 0.0, _root_mean_square(parameters[key], square))
+    return found

@@ -1,0 +1,120 @@
+"""Different transforms for different parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from unrender.core.errors import InputError
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.estimators.capabilities import Capability
+from unrender.optimizers.base import OnMeshes
+from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_keys, checked_transforms
+from unrender.preconditioners.mesh import MeshTopology
+from unrender.problem.upsampling import Upsampler, restarted, upsampled
+
+__all__ = ["PerParameter", "PerParameterState"]
+
+_TREES = ("learning_rates", "parameters", "gradient", "direction", "factors", "smoothing", "steps")
+
+
+@dataclass(frozen=True)
+class PerParameterState:
+    """State of `PerParameter`.
+
+    Attributes:
+        own: States of `transforms`.
+        others: States of the transforms of all other parameters.
+    """
+
+    own: tuple[Any, ...]
+    others: tuple[Any, ...]
+
+    def upsampled(self, upsampler: Upsampler) -> PerParameterState:
+        """See `Upsamplable`: as each of the states."""
+        parts = (tuple(upsampled(state, upsampler) for state in part) for part in (self.own, self.others))
+        return PerParameterState(*parts)
+
+    def restarted(self, fresh: PerParameterState) -> PerParameterState:
+        """See `Restartable`: as each of the states."""
+        pairs = ((self.own, fresh.own), (self.others, fresh.others))
+        return PerParameterState(*(tuple(map(restarted, old, new)) for old, new in pairs))
+
+
+@register
+@dataclass(frozen=True)
+class PerParameter(StepTransform):
+    """Apply some transforms to the parameters in `keys`, others to the rest.
+
+    Args:
+        keys: Keys of parameters.
+        transforms: For those, first to last.
+        others: For all others, first to last.
+    """
+
+    keys: tuple[str, ...] = ()
+    transforms: tuple[StepTransform, ...] = ()
+    others: tuple[StepTransform, ...] = ()
+
+    def __post_init__(self):
+        object.__setattr__(self, "keys", checked_keys("PerParameter: keys", self.keys))
+        for name in ("transforms", "others"):
+            object.__setattr__(self, name, checked_transforms(f"PerParameter: {name}", getattr(self, name)))
+
+    @property
+    def requires(self) -> tuple[type[Capability], ...]:
+        """What the transforms require."""
+        return tuple(kind for part in (*self.transforms, *self.others) for kind in part.requires)
+
+    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> PerParameter:
+        """See `OnMeshes.on_meshes`."""
+        own, others = (
+            tuple(part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in parts)
+            for parts in (self.transforms, self.others)
+        )
+        return replace(self, transforms=own, others=others)
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> PerParameterState:
+        """See `StepTransform.init`. Raises `InputError` for a key that is no parameter."""
+        if unknown := next((key for key in self.keys if key not in parameters), None):
+            raise InputError(f'PerParameter: keys: unknown parameter "{unknown}"')
+        states = []
+        for parts, own in ((self.transforms, True), (self.others, False)):
+            values, rates = self._group(parameters, own), self._group(learning_rates, own)
+            states.append(tuple(part.init(values, rates) for part in parts))
+        return PerParameterState(*states)
+
+    def update(self, update: StepUpdate, state: PerParameterState) -> tuple[StepUpdate, PerParameterState]:
+        """See `StepTransform.update`."""
+        results, following = [], []
+        for parts, before, own in ((self.transforms, state.own, True), (self.others, state.others, False)):
+            found, states = self._restricted(update, own), []
+            for part, each in zip(parts, before, strict=True):
+                found, after = part.update(found, each)
+                states.append(after)
+            # The groups' common factors may differ from now on: they become factors of the parameters.
+            scale = found.factor / found.divisor
+            factors = {key: found.factors.get(key, 1.0) * scale for key in found.direction}
+            results.append(replace(found, factors=factors))
+            following.append(tuple(states))
+        own, others = results
+        merged: dict[str, Any] = {name: {**getattr(own, name), **getattr(others, name)} for name in _TREES}
+        previous = {**(own.previous or {}), **(others.previous or {})}
+        complete = previous.keys() == update.direction.keys()
+        following_update = replace(update, **merged, factor=1.0, divisor=1.0, previous=previous if complete else None)
+        return following_update, PerParameterState(*following)
+
+    def choices(self, state: PerParameterState, made: int) -> tuple[str, ...]:
+        """See `StepTransform.choices`."""
+        pairs = zip((*self.transforms, *self.others), (*state.own, *state.others), strict=True)
+        return tuple(line for part, own in pairs for line in part.choices(own, made))
+
+    def _group(self, tree: Mapping[str, Any], own: bool) -> dict[str, Any]:
+        return {key: value for key, value in tree.items() if (key in self.keys) == own}
+
+    def _restricted(self, update: StepUpdate, own: bool) -> StepUpdate:
+        trees: dict[str, Any] = {name: self._group(getattr(update, name), own) for name in _TREES}
+        previous = None if update.previous is None else self._group(update.previous, own)
+        return replace(update, **trees, previous=previous)

@@ -1,0 +1,92 @@
+"""Averaged iterates (Defazio et al. 2024, "The Road Less Scheduled")."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from unrender.core import arrays, checks
+from unrender.core.arrays import Array
+from unrender.core.registry import register
+from unrender.core.trees import Tree
+from unrender.optimizers.transforms.base import SMOOTHING_UNCHANGED, VALUES, StepTransform, StepUpdate, TransformState
+
+__all__ = ["Iterates", "ScheduleFreeAverage"]
+
+_WARMUP = 2
+"""Steps over which the rate rises."""
+_PROJECTED = 1e-5
+"""Difference, relative to parameter and first rate, from which a parameter counts as projected onto its bounds; below it, as rounded."""
+
+
+@dataclass(frozen=True)
+class Iterates(TransformState):
+    """State of `ScheduleFreeAverage`.
+
+    Attributes:
+        fast: z, the iterate that takes the steps.
+        average: x, the weighted mean of z.
+    """
+
+    fast: Tree = field(metadata=VALUES)
+    average: Tree = field(metadata=VALUES)
+
+
+@register
+@dataclass(frozen=True)
+class ScheduleFreeAverage(StepTransform):
+    """Step by step on z, average z in x, and place the parameters y between the two. The last transform of a chain.
+
+        z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
+
+    x is the mean of z with weights that grow as t^r. The rate is halved at the first step. Iterates z and x are projected onto the bounds
+    together with the parameters. Where the smoothing becomes stronger, z starts again at x.
+
+    Args:
+        beta: β, in [0, 1).
+        averaging: r, >= 0.
+    """
+
+    beta: float = 0.9
+    averaging: float = 2.0
+
+    def __post_init__(self):
+        checks.number("ScheduleFreeAverage", "beta", self.beta, above=0.0, below=1.0, inclusive=True)
+        checks.number("ScheduleFreeAverage", "averaging", self.averaging, above=0.0, inclusive=True)
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Iterates:
+        """See `StepTransform.init`."""
+        del learning_rates
+        return Iterates(dict(parameters), dict(parameters))
+
+    def update(self, update: StepUpdate, state: Iterates) -> tuple[StepUpdate, Iterates]:
+        """See `StepTransform.update`."""
+        weight = (1.0 + self.averaging) / (update.made + 1.0 + self.averaging)
+        warm = replace(update, factor=update.factor * min(1.0, (update.made + 1) / _WARMUP))
+        steps: Tree = {}
+        fast: Tree = {}
+        average: Tree = {}
+        for key, direction in update.direction.items():
+            y, tolerance = update.parameters[key], update.learning_rates[key] * _PROJECTED
+            before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
+            if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain < 1.0:
+                before = mean
+            fast[key] = before + arrays.scalar(-warm.rate(key), direction) * direction
+            average[key] = mean + arrays.scalar(weight, direction) * (fast[key] - mean)
+            steps[key] = self._between(fast[key], average[key]) - y
+        return replace(update, steps=steps), Iterates(fast, average)
+
+    def _between(self, fast: Array, average: Array) -> Array:
+        """Return y."""
+        return fast + self.beta * (average - fast)
+
+    def _within_bounds(self, fast: Array, average: Array, y: Array, least: float) -> tuple[Array, Array]:
+        """Return z and x on the same side of a bound as the parameters y, where the bound has moved y by more than `least`."""
+        planned = self._between(fast, average)
+        tolerance = arrays.absolute(planned) * _PROJECTED + least
+        above, below = planned - y > tolerance, y - planned > tolerance
+
+        def moved(x: Array) -> Array:
+            return arrays.where(above, arrays.minimum(x, y), arrays.where(below, arrays.maximum(x, y), x))
+
+        return moved(fast), moved(average)
