@@ -39,6 +39,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
+from unrender.problem.parameter import ParameterSettings
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.mitsuba import turntable_light
@@ -123,6 +124,7 @@ __all__ = [
     "volumes",
     "volumetric",
     "with_differential_bsdf",
+    "with_preconditioner",
 ]
 
 
@@ -395,3 +397,8 @@ def time_run_folder(spent: dict[str, list[float]]) -> Callable[[], None]:
         runs_optimize.RunWriter = RunWriter
 
     return end
+
+
+def with_preconditioner(problem: ur.Problem, preconditioner: Any, *keys: str) -> ur.Problem:
+    """Return the problem with a preconditioner for parameters that have none."""
+    return problem.configured(dict.fromkeys(keys, ParameterSettings(preconditioner=preconditioner)))

@@ -104,8 +104,8 @@ def descend(problem: ur.Problem, method: str, seed: int) -> Trajectory:
     """Take the steps of a method. Raises `InputError` where it does not suit the problem."""
     from unrender.methods import method as named
 
-    choice, trajectory = named(method).choose(problem, METHODS[method]), Trajectory()
-    ur.optimize(problem, choice.estimator, choice.optimizer, STEPS, seed=seed, callbacks=[trajectory], progress=False)
+    choice, trajectory = named(method).plan(problem, METHODS[method]), Trajectory()
+    ur.optimize(problem, choice, STEPS, seed=seed, callbacks=[trajectory], progress=False)
     return trajectory
 
 
@@ -125,7 +125,7 @@ def _on_sheet() -> Any:
     """Schedule-free steps of values at the vertices of a mesh, beside large steps of positions."""
     topology = _sheet(4)
     inner = ur.optimizers.ScheduleFree(0.05, preconditioner=Sobolev(), preconditioned=("vertices",))
-    partitioned = ur.optimizers.Partitioned(("colour",), ur.optimizers.Adam(0.01, uniform=True), inner, LargeSteps(4.0))
+    partitioned = ur.optimizers.Partitioned(("colour",), ur.optimizers.Adam(0.01, uniform=True), inner)
     return partitioned.on_meshes(lambda key: topology if key == "vertices" else None)
 
 
@@ -149,7 +149,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     ),
     "ScheduleFree, smooth": _schedule_free,
     "ScheduleFree, smooth, whole steps": lambda: _schedule_free(wiener=False),
-    "ScheduleFree, logarithms": lambda: _schedule_free(parameterisations={"colour": "log"}),
+    "ScheduleFree, logarithms": lambda: _schedule_free(reparameterised=("colour",)),
     "ScheduleFree, large steps": lambda: ur.optimizers.ScheduleFree(
         0.05, preconditioner=LargeSteps(4.0), preconditioned=("map",)
     ),

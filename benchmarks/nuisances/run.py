@@ -134,8 +134,8 @@ def run(
                 problem, made = imported(Path(scratch), CASES[name], models, size, spp)
                 rows = []
                 for seed in range(seeds):
-                    choice = method("auto").configure({} if pixels is None else {"pixels": pixels}).choose(problem)
-                    result = ur.optimize(problem, choice.estimator, choice.optimizer, steps=steps, seed=seed)
+                    choice = method("auto").configure({} if pixels is None else {"pixels": pixels}).plan(problem)
+                    result = ur.optimize(problem, choice, steps=steps, seed=seed)
                     rows.append(errors(problem, result.parameters, made, seen))
             part[way] = {key: [row[key] for row in rows] for key in rows[0]}
             print(name, way, part[way], flush=True)

@@ -159,9 +159,9 @@ def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.nda
     steps = 0
     for index, (stage, share) in enumerate(zip(stages.stages, shares, strict=True)):
         problem = whole.of_stage(stage, values, folder / "scenes" / stage.name)
-        parts = method_parts(stage.method or stages.method, problem, stages.settings_of(stage))
+        plan = plan_of(stage.method or stages.method, problem, stages.settings_of(stage))
         clock = Clock(share)
-        result = ur.optimize(problem, *parts, steps=1_000_000, seed=seed + index, callbacks=[clock])
+        result = ur.optimize(problem, plan, steps=1_000_000, seed=seed + index, callbacks=[clock])
         values |= {key: np.asarray(value) for key, value in result.parameters.items()}
         steps += clock.steps
     return values, steps
@@ -241,8 +241,8 @@ def run(
                     values, steps = in_stages(judge.folder, seconds, 100 * seed)
                 else:
                     clock = Clock(seconds)
-                    parts = method_parts(who, problem, METHODS[who])
-                    result = ur.optimize(problem, *parts, steps=1_000_000, seed=seed, callbacks=[clock])
+                    plan = plan_of(who, problem, METHODS[who])
+                    result = ur.optimize(problem, plan, steps=1_000_000, seed=seed, callbacks=[clock])
                     values, steps = result.parameters, clock.steps
                 found["psnr"].append(judge.of(values))
                 found["steps"].append(steps)
@@ -289,7 +289,6 @@ def tuned(
     return found
 
 
-def method_parts(name: str, problem: ur.Problem, settings: dict[str, Any]) -> tuple[Any, Any]:
-    """Estimator and optimizer of a method for the problem."""
-    choice = methods.method(name).choose(problem, settings)
-    return choice.estimator, choice.optimizer
+def plan_of(name: str, problem: ur.Problem, settings: dict[str, Any]) -> Any:
+    """Return the plan of a method for the problem."""
+    return methods.method(name).plan(problem, settings)

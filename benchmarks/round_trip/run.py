@@ -118,8 +118,8 @@ def run(
         options = ur.ImportOptions(resolution=size, texture=texture, faces=faces, unknowns=UNKNOWNS[name])
         ur.import_capture(given, folder, options)
         problem = ur.Problem.from_file(folder / "problem.toml")
-        choice = method("auto").configure({"pixels": pixels}).choose(problem)
-        result = ur.optimize(problem, choice.estimator, choice.optimizer, steps=steps, seed=seed)
+        choice = method("auto").configure({"pixels": pixels}).plan(problem)
+        result = ur.optimize(problem, choice, steps=steps, seed=seed)
         held_out = ur.Problem.from_file(folder / "held-out.toml")
         found = compare(problem, held_out, result.parameters, folder / "export", spp)
         for kind, row in found.items():

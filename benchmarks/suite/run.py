@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +97,8 @@ def ours(
 ) -> tuple[Points, dict[str, Any]]:
     """A run with no option given, or one of `auto`'s, as "spp=2"; its curve, and how many steps and seconds of compilation it took."""
     curve = Curve(error, seconds / 100)
-    given = method("auto").choose(problem, dict([option.split("=")])) if option else None
-    estimator, optimizer = (given.estimator, given.optimizer) if given else ("auto", None)
-    result = ur.optimize(problem, estimator, optimizer, seconds=seconds, seed=seed, callbacks=[curve])
+    plan = method("auto").plan(problem, dict([option.split("=")]) if option else {})
+    result = ur.optimize(problem, plan, seconds=seconds, seed=seed, callbacks=[curve])
     return curve.points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
 
@@ -148,10 +148,10 @@ def tune_ours(
     What `auto` chooses by itself is not tried again. Figures are of the median over `seeds` runs: the least of several single runs is
     that of the luckiest, where a problem has few numbers.
     """
-    tried, own = [], method("auto").choose(problem)
+    tried, own = [], method("auto").plan(problem)
     for option in ("", *options):
-        chosen = method("auto").choose(problem, dict([option.split("=")])) if option else None
-        if chosen and (chosen.estimator, chosen.optimizer) == (own.estimator, own.optimizer):
+        chosen = method("auto").plan(problem, dict([option.split("=")])) if option else None
+        if chosen and replace(chosen, reasons=()) == replace(own, reasons=()):
             continue
         runs = [ours(problem, error, seconds, TUNING_SEED + seed, option)[0] for seed in range(seeds)]
         curve = middle(runs, seconds)

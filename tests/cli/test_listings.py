@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from unrender import gallery
@@ -67,3 +68,26 @@ def test_gallery_draws_one(unrender, mitsuba_variant, tmp_path):
     drawn = sorted(path.name for path in (tmp_path / "drawn").iterdir())
     assert drawn == ["view0-reference.png", "view0-start.png", "view0-truth.png"]
     assert "8x8" in answer.out
+
+
+def test_a_plan_is_printed_and_its_file_makes_the_same_run(unrender, tmp_path):
+    tiny = ("-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8")
+    common = ("--steps", "4", "--variant", "llvm_ad_rgb", "--final-spp", "1", "--threads", "1")
+    printed = unrender("methods", "--plan", "indirect-room", *tiny)
+    assert printed.status == 0, printed.error
+    assert "# recursive control variates" in printed.out
+    plan = tmp_path / "plan.toml"
+    plan.write_text(printed.out)
+    for name, method in (("named", "auto"), ("planned", str(plan))):
+        answer = unrender("run", "indirect-room", *tiny, *common, "--method", method, "--out", str(tmp_path / name))
+        assert answer.status == 0, answer.error
+    first, second = (np.load(tmp_path / name / "parameters.npz") for name in ("named", "planned"))
+    assert all(np.array_equal(first[key], second[key]) for key in first.files)
+
+    answer = unrender("run", "indirect-room", *tiny, *common, "--method", str(plan), "--set", "spp=2")
+    assert answer.status == 2
+    assert "which has all settings already" in answer.error
+    answer = unrender("run", "indirect-room", *tiny, *common, "--method", str(tmp_path / "none.toml"))
+    assert answer.status == 2
+    assert "none.toml" in answer.error
+    assert len(answer.error.strip().splitlines()) == 1

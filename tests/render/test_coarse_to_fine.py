@@ -30,7 +30,9 @@ from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
 from unrender.methods import method
+from unrender.methods.plan import Plan
 from unrender.optimizers.chain import ChainState
+from unrender.problem.parameter import ParameterSettings
 from unrender.problem.upsampling import SQUARES
 from unrender.runs import loop, multiresolution
 
@@ -163,7 +165,7 @@ def test_what_has_one_resolution_is_refused() -> None:
 def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any, Any]:
     """A run before its change of resolution, and after: (run, memory) each."""
     found = problem(ur.CoarseToFine((steps,), states=states))  # type: ignore
-    run, memory = loop.prepare(found, *PAIRS[name], 9, None, 0)
+    run, memory = loop.prepare(Plan(found, *PAIRS[name]), 9, None, 0)
     for _ in range(steps):
         loop._step(run, memory)
     before = dict(run.parameters), loop.replace(memory)
@@ -357,7 +359,8 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     """−η sign(g), by the schedule's factor of the present step."""
     schedule = ur.optimizers.schedules.Steps(every=3, factor=0.5)
     found = problem(ur.CoarseToFine((3,), states="reset"))
-    run, memory = loop.prepare(found, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02, schedule=schedule), 9, None, 0)
+    plan = Plan(found, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02, schedule=schedule))
+    run, memory = loop.prepare(plan, 9, None, 0)
     for _ in range(3):
         loop._step(run, memory)
     multiresolution.refine(run, memory)
@@ -494,50 +497,49 @@ class Sizes(ur.Callback):
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         self.seen.append(arrays.shape(run.parameters[KEY]))
-        if not run.problem.as_given.coarse_to_fine:
+        if not run.plan.problem.coarse_to_fine:
             assert problem(None).parameter_error(run.parameters)[KEY] < 1
 
 
-def test_an_optimizer_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
+def planned(given: ur.Problem, **settings: Any) -> Plan:
+    """Schedule-free steps, with settings of the parameter."""
+    estimator, optimizer = ur.PathGradient(image=rcv(), spp=2), ur.optimizers.ScheduleFree(0.05)
+    return Plan(given, estimator, optimizer, {KEY: ParameterSettings(**settings)})
+
+
+def test_a_plan_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     """As those of `Parameter`, with states carried; a parameter's own come first."""
     estimator = ur.PathGradient(image=rcv(), spp=2)
-    brings = ur.optimizers.ScheduleFree(0.05, coarse_to_fine={KEY: (3, 6)})
-    whole = ur.optimize(problem(None), estimator, brings, steps=8, seed=1)
+    coarse = ur.CoarseToFine((3, 6), states="carry")
+    brings = planned(problem(None), coarse_to_fine=coarse)
+    whole = ur.optimize(problem(None), brings, steps=8, seed=1)
     given = problem(ur.CoarseToFine((3, 6), states="carry"))
     own = ur.optimize(given, estimator, ur.optimizers.ScheduleFree(0.05), steps=8, seed=1)
     np.testing.assert_array_equal(whole.parameters[KEY], own.parameters[KEY])
     assert [step["resolution"][KEY] for step in whole.history if "resolution" in step] == [(4, 3), (8, 6), (16, 12)]
-    first = ur.optimize(problem((5,)), estimator, brings, steps=6, seed=1)
+    first = ur.optimize(problem((5,)), brings, steps=6, seed=1)
     assert [step["resolution"][KEY] for step in first.history if "resolution" in step] == [(8, 6), (16, 12)]
 
-    ur.optimize(problem(None), estimator, brings, steps=4, seed=1, run_directory=tmp_path / "run", checkpoint_every=1)
+    ur.optimize(problem(None), brings, steps=4, seed=1, run_directory=tmp_path / "run", checkpoint_every=1)
     resumed = ur.resume(tmp_path / "run", problem(None), steps=8)
     np.testing.assert_array_equal(resumed.parameters[KEY], whole.parameters[KEY])
 
     sizes = Sizes()
-    ur.optimize(problem(None), estimator, brings, steps=4, callbacks=[sizes])
+    ur.optimize(problem(None), brings, steps=4, callbacks=[sizes])
     assert sizes.seen == [TRUTH.shape] * 4  # callbacks see nothing that the problem did not ask for
     present = Sizes()
-    ur.optimize(problem((3,)), estimator, brings, steps=4, callbacks=[present])
+    ur.optimize(problem((3,)), brings, steps=4, callbacks=[present])
     assert present.seen == [(8, 6, 1)] * 3 + [TRUTH.shape]
 
-    parts = ur.optimizers.Partitioned((KEY,), brings, ur.optimizers.Adam(0.1))
-    found = ur.optimize(problem(None), estimator, parts, steps=2, seed=1)
-    assert found.history[0]["resolution"][KEY] == (4, 3)
 
-
-def test_resolutions_of_an_optimizer_that_make_no_sense_are_refused() -> None:
-    def descend(**options: Any) -> None:
-        ur.optimize(problem(None), ur.PathGradient(spp=2), ur.optimizers.ScheduleFree(0.05, **options), steps=1)
+def test_resolutions_of_a_plan_that_make_no_sense_are_refused() -> None:
+    def descend(steps: Any) -> None:
+        ur.optimize(problem(None), planned(problem(None), coarse_to_fine=ur.CoarseToFine(steps)), steps=1)
 
     with pytest.raises(InputError, match=f"parameter {KEY}: coarse_to_fine: .*too small to be coarser 5 times by 2"):
-        descend(coarse_to_fine={KEY: (3, 6, 9, 12, 15)})
-    with pytest.raises(InputError, match='coarse_to_fine: unknown parameter "fields"'):
-        descend(coarse_to_fine={"fields": (3,)})
-    with pytest.raises(InputError, match=f"ScheduleFree: {KEY}: steps must be whole numbers"):
-        descend(coarse_to_fine={KEY: (6, 3)})
-    with pytest.raises(InputError, match="coarse_to_fine must be"):
-        descend(coarse_to_fine=[3, 6])
+        descend((3, 6, 9, 12, 15))
+    with pytest.raises(InputError, match="CoarseToFine: steps must be whole numbers"):
+        descend((6, 3))
 
 
 @pytest.mark.parametrize(
@@ -548,9 +550,10 @@ def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: 
     renderer = FieldRenderer(truth)
     unknown = ur.Parameter(KEY, initial=0.5, bounds=(0, 1))
     made = ur.Problem(renderer, [unknown], [ur.View(renderer.at(truth.shape).exact({KEY: truth}))])
-    choice = method("auto").choose(made)
+    choice = method("auto").plan(made)
     assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
-    assert choice.optimizer.coarse_to_fine == ({KEY: steps} if steps else {})
+    coarse = choice.settings[KEY].coarse_to_fine
+    assert coarse == (ur.CoarseToFine(steps, states="carry") if steps else None)
     assert any("coarse to fine" in reason for reason in choice.reasons) == bool(steps)
     detailed = truth + np.arange(cells[0]).reshape(-1, *(1,) * len(cells)) * 0.01
     for others, options in (
@@ -559,9 +562,9 @@ def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: 
         (replace(unknown, coarse_to_fine=(5,)), {}),
     ):
         made = ur.Problem(renderer, [others], [ur.View(renderer.at(truth.shape).exact({KEY: truth}))])
-        choice = method("auto").choose(made, options)
+        choice = method("auto").plan(made, options)
         assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
-        assert choice.optimizer.coarse_to_fine == {}
+        assert choice.settings[KEY].coarse_to_fine is None
         assert not any("coarse to fine" in reason for reason in choice.reasons)
 
 

@@ -184,7 +184,9 @@ def test_where_no_checkpoint_can_be_used_the_last_one_s_fault_is_told(tmp_path: 
     for step in (2, 4, 6):
         edit(folder, step, _spoil_adam)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match=r"^checkpoint of step 6: optimizer\.states\[1\]\.second_moment\['rate'\]: not finite$"):
+    with pytest.raises(
+        InputError, match=r"^checkpoint of step 6: optimizer\.states\[1\]\.second_moment\['rate'\]: not finite$"
+    ):
         ur.resume(folder, steps=12)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

@@ -432,10 +432,10 @@ def test_a_cup_with_its_handle_hidden_looks_the_same_whichever_way_it_is_turned(
 @pytest.mark.slow
 def test_a_cup_s_angle_and_its_label_are_recovered_in_one_run():
     problem = ur.gallery.problem("mug", label=6, resolution=24, reference_spp=256)
-    choice = method("auto").choose(problem, {"sigma": 0.6, "spp": 2})
+    choice = method("auto").plan(problem, {"sigma": 0.6, "spp": 2})
     assert isinstance(choice.estimator, ur.HybridGradient)
     assert choice.estimator.keys == ("mug.rotation.y",)
-    found = ur.optimize(problem, choice.estimator, choice.optimizer, steps=60)
+    found = ur.optimize(problem, choice, steps=60)
     angle, label = problem.parameter_error(found.parameters).values()
     assert angle < 0.06
     assert label < 0.3 * problem.parameter_error(found.initial)["mug.bsdf.brdf_0.bsdf_1.reflectance.data"]

@@ -74,7 +74,7 @@ def test_where_there_is_no_boundary_auto_is_smoothed_and_says_why() -> None:
     ball = {"type": "sphere", "radius": 0.1}
     for key, why in (("ball.translation", "plateaus"), ("thing.translation", "--method plain has path gradients")):
         problem = ur.Problem(lambda: scene(ball=ball), [ur.Parameter(key)], [ur.View(reference)], max_depth=2)
-        choice = method("auto").choose(problem)
+        choice = method("auto").plan(problem)
         assert isinstance(choice.estimator, ur.SmoothedDerivatives)
         assert why in choice.reasons[0]
 
@@ -103,16 +103,16 @@ def test_auto_smooths_colours_of_vertices_over_the_edges_of_their_mesh() -> None
         scene(thing=thing), [ur.Parameter(key, initial=start)], [ur.View(np.full((SIZE, SIZE, 3), 0.1))], max_depth=2
     )
     np.testing.assert_allclose(problem.initial_values()[key], start.ravel(), rtol=1e-6)
-    chosen: Any = method("auto").choose(problem, {})
+    chosen: Any = method("auto").plan(problem, {})
     assert chosen.optimizer.preconditioned == (key,)
     assert "two states would share" in chosen.reasons[0]  # a mesh that is made already: no control variates
     assert chosen.estimator.image == ur.images.Plain()
-    result = ur.optimize(problem, chosen.estimator, chosen.optimizer, steps=3, seed=0)
+    result = ur.optimize(problem, chosen, steps=3, seed=0)
     moved = result.parameters[key] - problem.initial_values()[key]
     assert np.isfinite(moved).all()
     assert (moved != 0).mean() > 0.9  # those behind, too
     positions = ur.Problem(scene(), [ur.Parameter(KEY)], [ur.View(np.zeros((SIZE, SIZE, 3)))], max_depth=2)
-    chosen = method("auto").choose(positions, {})
+    chosen = method("auto").plan(positions, {})
     assert chosen.optimizer.keys == (KEY,)
     assert chosen.optimizer.others.preconditioned == ()
 

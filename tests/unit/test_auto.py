@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 
 from unrender import images, losses, optimizers, pixels
-from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
+from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import first_rates, method
+from unrender.methods.plan import Plan
 from unrender.preconditioners import LargeSteps, Sobolev
-from unrender.problem.parameter import Parameter
+from unrender.problem.parameter import Parameter, ParameterSettings
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -42,7 +45,7 @@ def problem(loss: Any = None, shares_paths: bool = True, noise: float = 0.3, **o
 
 
 def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
-    choice = method("auto").choose(made, settings)
+    choice = method("auto").plan(made, settings)
     return choice.estimator, choice.optimizer
 
 
@@ -57,7 +60,7 @@ def test_images_have_a_memory(loss: Any) -> None:
     assert estimator.image == images.RecursiveControlVariate("primary", max_weight=memory)
     assert chosen(problem(loss), image="plain", spp=6)[0] == PathGradient(spp=6, tolerance=tolerance)
     assert chosen(problem(loss), tolerance=0)[0].tolerance == 0
-    reasons = method("auto").choose(problem(loss), {}).reasons
+    reasons = method("auto").plan(problem(loss), {}).reasons
     assert any("damped where noise exceeds the residual" in line for line in reasons) == (not loss.linear)
 
 
@@ -74,7 +77,7 @@ def test_textures_are_smoothed_unless_they_have_a_preconditioner() -> None:
 def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
     _, optimizer = chosen(problem(), parameterise=False)
     assert optimizer.learning_rate == pytest.approx({"*": 0.1, "map": 0.1, "gain": 10.0})
-    assert optimizer.parameterisations == {}
+    assert optimizer.reparameterised == ()
     _, optimizer = chosen(problem(), learning_rate=0.02, parameterise=False)
     assert optimizer.learning_rate == pytest.approx({"*": 0.02, "map": 0.02, "gain": 2.0})
     state = optimizer.init(problem(learning_rate=0.5).initial(), problem(learning_rate=0.5).learning_rates)
@@ -92,7 +95,8 @@ def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
 
 def test_positive_numbers_move_as_logarithms() -> None:
     _, optimizer = chosen(problem())
-    assert optimizer.parameterisations == {"gain": "log"}
+    assert optimizer.reparameterised == ("gain",)
+    assert method("auto").plan(problem()).settings["gain"].parameterisation == "log"
     assert optimizer.learning_rate == pytest.approx({"*": 0.1, "map": 0.1, "gain": 0.1})
     for change in (
         {"bounds": (0, 500)},
@@ -104,7 +108,7 @@ def test_positive_numbers_move_as_logarithms() -> None:
         base = problem()
         parameters = [dataclasses.replace(p, **change) if p.key == "gain" else p for p in base.parameters]
         other = Problem(base.renderer, parameters, base.given_views)
-        assert chosen(other)[1].parameterisations == {}, change
+        assert chosen(other)[1].reparameterised == (), change
 
 
 def test_a_run_with_logarithms_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
@@ -116,13 +120,11 @@ def test_a_run_with_logarithms_is_taken_up_where_it_stopped(tmp_path: Path) -> N
 
 
 def test_the_problem_is_kept_as_it_was_given() -> None:
-    """What `auto` adds is the method's: the problem of its run folder is anybody's."""
+    """What `auto` adds is the plan's: the problem of its run folder is anybody's."""
     given = problem()
-    moved = given.reparameterised({"gain": "log"})
-    assert list(moved.parameterisations) == ["gain"]
-    assert moved.as_given is given
-    assert moved.reparameterised({"map": "logit"}).as_given is given
-    assert given.as_given is given
+    plan = method("auto").plan(given)
+    assert plan.problem is given
+    assert list(plan.configured().parameterisations) == ["gain"]
     assert given.parameterisations == {}
 
 
@@ -147,13 +149,13 @@ def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_says_what_it_has_chosen_and_why() -> None:
-    said = method("auto").choose(problem(losses.L1())).reasons
+    said = method("auto").plan(problem(losses.L1())).reasons
     assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
     assert said[1] == "L1 damped where noise exceeds the residual"
     assert said[2] == "Sobolev gradients of map"
     assert said[3] == "moved as log (gain)"
     assert said[4] == "schedule-free Adam, first rate 0.1 (map, gain)"
-    assert method("rcv").choose(problem()).reasons == ()
+    assert method("rcv").plan(problem()).reasons == ()
 
 
 def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +166,7 @@ def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(made.renderer, "prepare", prepare)
     assert chosen(made) == method("smoothed").start()
-    (line,) = method("auto").choose(made).reasons
+    (line,) = method("auto").plan(made).reasons
     assert line == "derivatives of a smoothed loss (method smoothed): no path gradients of map"
 
 
@@ -184,9 +186,30 @@ def test_it_is_what_runs_where_nothing_is_said(tmp_path: Path) -> None:
 
 
 def test_it_is_stored_and_made_again() -> None:
-    estimator, optimizer = chosen(problem(losses.L1()))
-    assert tables.component(tables.table(estimator)) == estimator
-    assert tables.component(tables.table(optimizer)) == optimizer
+    made = problem(losses.L1())
+    plan = method("auto").plan(made)
+    again = Plan.from_table(made, toml_lines.parse(tomli_w.dumps(plan.table()), "plan.toml"), "plan.toml")
+    settings = {key: own for key, own in plan.settings.items() if own != ParameterSettings()}
+    assert again == dataclasses.replace(plan, settings=settings, reasons=())
+    first, second = (optimize(made, each, steps=5, progress=False) for each in (plan, again))
+    for key, value in first.parameters.items():
+        np.testing.assert_array_equal(second.parameters[key], value)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"estimator": "why not"}, "plan.toml: estimator: why not; hand it in"),
+        ({"estimator": {"type": "PathGradent"}}, 'plan.toml: estimator: unknown type "PathGradent"'),
+        ({"estimator": {"type": "Adam"}}, "plan.toml: estimator: Adam is no estimator"),
+        ({"settings": {"map": {"colour": 1}}}, "plan.toml: settings: map: expected parameterisation"),
+        ({"settings": {"map": {"preconditioner": {"type": "Adam"}}}}, "plan.toml: settings: map: "),
+    ],
+)
+def test_a_plan_that_says_something_else_is_refused_in_one_line(table: Any, words: str) -> None:
+    made = problem()
+    with pytest.raises(InputError, match=re.escape(words)):
+        Plan.from_table(made, method("plain").plan(made).table() | table, "plan.toml")
 
 
 @pytest.mark.parametrize("loss", [losses.L1(), losses.L2(), losses.RelativeL2()])

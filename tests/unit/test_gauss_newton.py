@@ -105,7 +105,7 @@ def test_what_it_refuses() -> None:
         ur.GaussNewton(shift=0)
     with pytest.raises(ur.InputError, match="damping must be"):
         AveragedNewton(damping=0)
-    made = problem().preconditioned({})
+    made = problem().configured({})
     object.__setattr__(made, "preconditioners", {"a": ur.preconditioners.LargeSteps(1.0)})
     with pytest.raises(ur.InputError, match="parameter a has a preconditioner"):
         ur.GaussNewton().init(made, START)

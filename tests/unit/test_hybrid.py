@@ -231,7 +231,7 @@ def test_what_is_perturbed_has_running_means_where_asked_for() -> None:
 
 def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> None:
     asked = problem()
-    choice = method("auto").choose(asked, {"sigma": "0.3, pose=0.4"})
+    choice = method("auto").plan(asked, {"sigma": "0.3, pose=0.4"})
     assert isinstance(choice.estimator, ur.HybridGradient)
     assert choice.estimator.keys == ("pose",)
     assert isinstance(choice.estimator.path, ur.PathGradient)
@@ -240,7 +240,7 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     assert dict(choice.optimizer.learning_rate)["pose"] == pytest.approx(0.2)  # pyright: ignore[reportArgumentType, reportCallIssue]
     assert choice.reasons[0] == "perturbed renders of pose: it moves"
     settings = {"sigma": "0.3", "step": 0.1, "gradient": "coupled", "image": "rcv", "pixels": 16, "spp": 2}
-    choice = method("hybrid").choose(asked, settings)
+    choice = method("hybrid").plan(asked, settings)
     estimator, optimizer = choice.estimator, choice.optimizer
     assert isinstance(estimator, ur.HybridGradient)
     image, drawn = CV("primary", max_weight=0.95), ur.pixels.Adaptive(16)
@@ -250,8 +250,8 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     assert isinstance(optimizer, ur.optimizers.MetaAdam)
     assert optimizer.learning_rate == pytest.approx({"*": 0.01, "pose": 0.03})
     assert ur.optimize(asked, estimator, optimizer, steps=2).skipped == 0
-    assert isinstance(method("auto").choose(problem(keys=("pose",))).estimator, ur.SmoothedDerivatives)
-    assert isinstance(method("auto").choose(problem(keys=("map",))).estimator, ur.PathGradient)
+    assert isinstance(method("auto").plan(problem(keys=("pose",))).estimator, ur.SmoothedDerivatives)
+    assert isinstance(method("auto").plan(problem(keys=("map",))).estimator, ur.PathGradient)
 
 
 def wrong(given: Any) -> Any:

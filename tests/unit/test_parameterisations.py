@@ -298,7 +298,9 @@ def test_meta_estimates_are_of_the_variable(coupled: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    "optimizer", [ur.optimizers.ScheduleFree(0.1), ur.optimizers.Adam(0.05), ur.optimizers.SGD(0.05, momentum=0.5)], ids=repr
+    "optimizer",
+    [ur.optimizers.ScheduleFree(0.1), ur.optimizers.Adam(0.05), ur.optimizers.SGD(0.05, momentum=0.5)],
+    ids=repr,
 )
 def test_a_resumed_run_is_the_uninterrupted_one(optimizer: Any, tmp_path: Path) -> None:
     chosen = {"estimator": ur.PathGradient(spp=2), "optimizer": optimizer, "seed": 3}

@@ -21,7 +21,7 @@ import unrender as ur
 from benchmarks.higher_order.fig5_mesh import run as fig5_mesh
 from benchmarks.higher_order.fig5_mesh.run import smoothed
 from benchmarks.higher_order.fig5_shapes import shapes
-from benchmarks.internals import dr, vectors
+from benchmarks.internals import dr, vectors, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
 
 TASKS = ("SUZANNE", "BANANA")
@@ -70,7 +70,7 @@ def measure(made: ur.Problem, method: str, seconds: float, runs: int, strength: 
     make, settings = METHODS[method]
     smooth = strength > 0.0 and method != "CMA-ES"
     if smooth:
-        made = made.preconditioned({p.key: ur.preconditioners.LargeSteps(strength) for p in made.parameters})
+        made = with_preconditioner(made, ur.preconditioners.LargeSteps(strength), *(p.key for p in made.parameters))
 
     def descent(setting: float, budget: float, seed: int) -> dict[str, Any]:
         return fig5_mesh.one(made, lambda n: make(setting, n, smooth), budget, seed)

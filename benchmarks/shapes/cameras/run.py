@@ -123,8 +123,8 @@ def case(name: str, assets: Path | None, resolution: int, reference_spp: int) ->
 def descend(made: Case, settings: dict[str, Any], seed: int, seconds: float) -> dict[str, Any]:
     """One run of `auto`: errors of every camera at the end, and the largest of them over seconds, angle and place."""
     problem, kept = made.start(seed), Kept(seconds)
-    choice = method("auto").choose(problem, settings)
-    ur.optimize(blind(problem), choice.estimator, choice.optimizer, steps=1 << 20, seed=seed, callbacks=[kept])
+    choice = method("auto").plan(problem, settings)
+    ur.optimize(blind(problem), choice, steps=1 << 20, seed=seed, callbacks=[kept])
     errors = [np.array(made.errors(values)) for _, values in kept.found]
     curve = [[second, *map(float, error.max(axis=0))] for (second, _), error in zip(kept.found, errors, strict=True)]
     return {"final": errors[-1].tolist(), "curve": [list(x) for x in zip(*curve, strict=True)]}

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, mi
+from benchmarks.internals import dr, mi, with_preconditioner
 from unrender.gallery import meshes
 from unrender.gallery.sphere_to_bunny import SphereToBunny
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -137,7 +137,7 @@ def descents(resolution: int, views: int, subdivisions: int, steps: int, spps: t
     )
     (key,) = problem.faces
     start = problem.parameter_error(problem.initial())[key]
-    problem = problem.preconditioned({key: ur.preconditioners.LargeSteps(4.0 ** (subdivisions - 2))})
+    problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(4.0 ** (subdivisions - 2)), key)
     images = {"plain": ur.images.Plain()} | {space: ur.images.RecursiveControlVariate(space) for space in SPACES}
     found: dict[str, Any] = {}
     for spp in spps:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, PixelSampler
+from benchmarks.internals import Key, PixelSampler, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.timed_runs import Kept, blind, measured
 
@@ -95,7 +95,7 @@ def run(
         options = {} if name == "shadow-art" else {"views": views}
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, **options)
         (key,) = problem.faces
-        problem = problem.preconditioned({key: ur.preconditioners.LargeSteps(strength)})
+        problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(strength), key)
         what = "surface" if problem.surfaces else "pictures"
         found[name] = {"judged by": what, "views": len(problem.views), "methods": {}}
         for way, sampler in samplers(pixels, len(problem.views)).items():

@@ -15,6 +15,7 @@ from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.evaluation import debiased
 from unrender.methods import Method
+from unrender.methods.plan_file import PlanFile
 from unrender.problem.notebook import describe_views
 from unrender.problem.problem import Problem
 from unrender.runs import advice
@@ -27,11 +28,11 @@ from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 
-__all__ = ["Plan", "execute", "image_error", "introduce", "summarise"]
+__all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise"]
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunOrder:
     """What is to be run.
 
     Attributes:
@@ -45,7 +46,7 @@ class Plan:
     """
 
     problem: Problem
-    method: Method
+    method: Method | PlanFile
     settings: Mapping[str, Any]
     steps: int | None
     seconds: float | None
@@ -57,30 +58,30 @@ class Plan:
 
 
 def execute(
-    plan: Plan, directory: Path, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
+    order: RunOrder, directory: Path, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
 ) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came. `callbacks` listen besides."""
-    choice = plan.method.choose(plan.problem, plan.settings)
-    for line in choice.reasons:
-        console.print(f"{plan.method.name}: {escape(line)}", soft_wrap=True)
-    options = plan.method.configure(plan.settings).model_dump()
-    settings = {"options": options, "problem_options": dict(plan.problem_settings)}
+    plan = order.method.plan(order.problem, order.settings)
+    for line in plan.reasons:
+        console.print(f"{order.method.name}: {escape(line)}", soft_wrap=True)
+    options = order.method.options_of(order.settings)
+    settings = {"options": options, "problem_options": dict(order.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
-    for line in advice.remarks(plan.problem, choice.optimizer):
+    for line in advice.remarks(order.problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
-    annotations = RunAnnotations(plan.method.name, settings, choice.reasons, plan.command, plan.final_spp, earlier)
-    live = Live(directory, plan.problem.name, plan.method.name, plan.command)
+    annotations = RunAnnotations(order.method.name, settings, plan.reasons, order.command, order.final_spp, earlier)
+    live = Live(directory, order.problem.name, order.method.name, order.command)
     result = optimize(
-        plan.problem,
-        choice.estimator,
-        choice.optimizer,
-        plan.steps,
-        plan.seconds,
-        plan.seed,
+        order.problem,
+        plan,
+        None,
+        order.steps,
+        order.seconds,
+        order.seed,
         [progress, live, *callbacks],
         directory,
-        plan.checkpoint_every,
+        order.checkpoint_every,
         annotations,
     )
     live.clear()

@@ -38,7 +38,7 @@ def run(
     context: typer.Context,
     problem: ProblemName,
     method_name: Annotated[
-        str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")
+        str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
     ] = "auto",
     settings: Annotated[
         list[str] | None,
@@ -71,10 +71,13 @@ def run(
     given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
-            from unrender.cli.execute import Plan, execute, introduce
+            from unrender.cli.execute import RunOrder, execute, introduce
             from unrender.methods import method
+            from unrender.methods.plan_file import SUFFIX, PlanFile
 
-            chosen, processes = method(method_name), dealing.check(workers, compress)
+            planned = method_name.endswith(SUFFIX)
+            chosen = PlanFile(Path(method_name)) if planned else method(method_name)
+            processes = dealing.check(workers, compress)
             steps, seconds = _budget_settings(given, steps, seconds)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
@@ -90,7 +93,7 @@ def run(
             introduce(console, opened, running)
             rest = (steps, seconds, seed, final_spp, command, options, checkpoint_every)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                result = execute(Plan(dealt, chosen, given, *rest), folder, console, progress)
+                result = execute(RunOrder(dealt, chosen, given, *rest), folder, console, progress)
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)

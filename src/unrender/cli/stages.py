@@ -205,7 +205,7 @@ def _run_stage(
     run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
 ) -> tuple[Problem, Result]:
     """Begin a stage, or go on with it."""
-    from unrender.cli.execute import Plan, execute, introduce
+    from unrender.cli.execute import RunOrder, execute, introduce
     from unrender.methods import method
     from unrender.runs import reopen as runs
     from unrender.runs.folder import schema
@@ -232,8 +232,8 @@ def _run_stage(
     last = index == len(stages.stages) - 1
     spp = run.options.final_spp or (None if last else 1)  # those of many views take minutes
     every = run.options.checkpoint_every
-    plan = Plan(problem, chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
-    return problem, execute(plan, folder, console, progress)
+    order = RunOrder(problem, chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
+    return problem, execute(order, folder, console, progress)
 
 
 def _read(stages: Stages) -> Whole:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from unrender.cli import arguments
-from unrender.cli.execute import Plan, execute
+from unrender.cli.execute import RunOrder, execute
 from unrender.cluster import prepare_worker
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
@@ -117,11 +117,11 @@ def carry_out(
         listeners = [progress, *looking, *callbacks]
         if record is None or record.steps == 0 or not _resumed(folder, problem, listeners, record.command):
             chosen = method(task.method)
-            plan = Plan(
+            order = RunOrder(
                 problem, chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
                 job.problem_settings,
             )  # fmt: skip
-            execute(plan, folder, console, progress, listeners[1:])
+            execute(order, folder, console, progress, listeners[1:])
         return outcome(folder, task, time.perf_counter() - started)
     return outcome(folder, task, 0.0)
 

@@ -22,8 +22,9 @@ from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.base import Choice, Options, method, parameterised
+from unrender.methods.base import Options, method, parameterised
 from unrender.methods.first_rates import first_rates, logarithms
+from unrender.methods.plan import Plan
 from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.averaged_newton import AveragedNewton
@@ -32,6 +33,8 @@ from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
 from unrender.preconditioners import LargeSteps, Sobolev, grid
+from unrender.problem.coarse_to_fine import CoarseToFine
+from unrender.problem.parameter import ParameterSettings
 from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
 from unrender.schedules import Exponential, InverseRoot
@@ -140,34 +143,33 @@ class AutoMethod(Options):
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
         return PathGradient(image, sampler, self.spp or _FEWEST), ScheduleFree(self.learning_rate)
 
-    def choose(self, problem: Problem) -> Choice:
-        """See `Options.choose`."""
-        if _is_of_cameras(problem) and (choice := self._of_cameras(problem)):
-            return choice
+    def plan(self, problem: Problem) -> Plan:
+        if _is_of_cameras(problem) and (plan := self._of_cameras(problem)):
+            return plan
         perturbed = beyond_paths(problem.renderer.parameters(), list(problem.shapes()))
         part = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(perturbed)))
         if 0 < len(perturbed) < len(problem.shapes()) and not _refusal(part):
-            return self._hybrid(part, perturbed)
+            return replace(self._hybrid(part, perturbed), problem=problem)
         if unreachable := _unreachable(problem):
             reason = f"derivatives of a smoothed loss (method smoothed): {unreachable}"
-            return Choice(*method("smoothed").start({"sigma": self.sigma}), (reason,))
+            return Plan(problem, *method("smoothed").start({"sigma": self.sigma}), reasons=(reason,))
         return self._of_paths(problem)
 
-    def _hybrid(self, problem: Problem, perturbed: Sequence[str]) -> Choice:
+    def _hybrid(self, problem: Problem, perturbed: Sequence[str]) -> Plan:
         """Where some parameters are beyond path gradients, and `problem` differentiates the others alone."""
         widths = parse_widths(self.sigma)
         each = widths if isinstance(widths, dict) else {"*": widths}
         rates = {key: _STEP * each.get(key, each["*"]) for key in perturbed}
-        choice = self._of_paths(problem, rates)
+        plan = self._of_paths(problem, rates)
         smoothing = SmoothedDerivatives(
             widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=Exponential(*_ANNEALING), debiased=True
         )
-        estimator = HybridGradient(choice.estimator, smoothing, tuple(perturbed))
+        estimator = HybridGradient(plan.estimator, smoothing, tuple(perturbed))
         known = problem.renderer.parameters()
         reason = f"perturbed renders of {', '.join(f'{key}: {known[key].reason}' for key in perturbed)}"
-        return replace(choice, estimator=estimator, reasons=(reason, *choice.reasons))
+        return replace(plan, estimator=estimator, reasons=(reason, *plan.reasons))
 
-    def _of_paths(self, problem: Problem, given: Mapping[str, float] | None = None) -> Choice:
+    def _of_paths(self, problem: Problem, given: Mapping[str, float] | None = None) -> Plan:
         """By path gradients; `given`: first rates that are known already."""
         given = given or {}
         sampler, drawn = self._sampler(problem)
@@ -175,22 +177,24 @@ class AutoMethod(Options):
         image = self._image(problem, _shows_half(problem, sampler), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = logarithms(problem) if self.parameterise else {}
-        moved = {key: name for key, name in moved.items() if key not in given}
-        problem = problem.reparameterised(moved)
-        moved = {
-            k: type(p).__name__.lower()
-            for k, p in problem.parameterisations.items()
-            if k in problem.coordinates.transforms
-        }
         coarse = {} if meshes or not self.coarse else _coarse(problem)
+        large_steps = LargeSteps(_strength(problem)) if meshes else None
+        settings = {
+            key: ParameterSettings(
+                None if key in given else moved.get(key),
+                large_steps if key in meshes else None,
+                CoarseToFine(coarse[key], states="carry") if key in coarse else None,
+            )
+            for key in problem.shapes()
+        }
+        given_problem, problem = problem, problem.configured(settings)
         rates = {**first_rates(problem, self.learning_rate), **given}
         optimizer: Optimizer = ScheduleFree(
             {"*": self.learning_rate, **{key: rate for key, rate in rates.items() if key not in meshes}},
             preconditioner=Sobolev(correlation=self.correlation) if smoothed else None,
             preconditioned=smoothed,
             wiener=not isinstance(sampler, pixels.Uniform),
-            parameterisations=moved,
-            coarse_to_fine=coarse,
+            reparameterised=tuple(key for key in problem.parameterisations if key in problem.coordinates.transforms),
         )
         biased = problem.loss.pixelwise and not problem.loss.linear
         tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
@@ -215,10 +219,10 @@ class AutoMethod(Options):
         if meshes:
             rate = min(rates[key] for key in meshes)
             descent = Adam(rate, schedule=InverseRoot(_MESH_TIME), uniform=True)
-            optimizer = Partitioned(meshes, descent, optimizer, LargeSteps(_strength(problem)))
-        return Choice(estimator, optimizer, tuple(filter(None, reasons)))
+            optimizer = Partitioned(meshes, descent, optimizer)
+        return Plan(given_problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
 
-    def _of_cameras(self, problem: Problem) -> Choice | None:
+    def _of_cameras(self, problem: Problem) -> Plan | None:
         """Where poses of sensors alone are unknown; None where neither way serves."""
         known = problem.renderer.parameters()
         elements = sum(math.prod(shape) for shape in problem.shapes().values())
@@ -233,9 +237,9 @@ class AutoMethod(Options):
             "the mean of all steps' models"
         )
         tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
-        return Choice(GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), (reason,))
+        return Plan(problem, GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), reasons=(reason,))
 
-    def _of_cameras_by_paths(self, problem: Problem) -> Choice:
+    def _of_cameras_by_paths(self, problem: Problem) -> Plan:
         """Likewise, by path gradients: where they are asked for, by an image or pixels, and where there is no Gauss-Newton step."""
         sampler, drawn = self._sampler(problem)
         spp, rate = self._samples(problem, sampler), _CAMERA_SHARE * self.learning_rate
@@ -244,7 +248,7 @@ class AutoMethod(Options):
             f"path gradients of cameras, {spp} samples per pixel, Adam, first rate {rate:.3g}, halved every 30 steps"
         )
         descent = Adam(rate, beta_2=0.99, schedule=Exponential(30, 0.01))
-        return Choice(PathGradient(image, sampler, spp), descent, tuple(filter(None, (reason, drawn))))
+        return Plan(problem, PathGradient(image, sampler, spp), descent, reasons=tuple(filter(None, (reason, drawn))))
 
     def _image(self, problem: Problem, whole: bool, deforms: bool) -> _Image:
         if self.image == "plain":

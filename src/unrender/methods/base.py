@@ -15,27 +15,14 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import grouped
 from unrender.estimators.base import Estimator
+from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.schedules.functions import Schedule
 
-__all__ = ["SCHEDULE_HELP", "Choice", "Method", "Options", "method", "methods", "parameterised", "parse_schedule"]
+__all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parameterised", "parse_schedule"]
 
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What a method takes for a problem.
-
-    Attributes:
-        estimator, optimizer: the two parts.
-        reasons: what was chosen and why, one line each; none where there was nothing to choose.
-    """
-
-    estimator: Estimator
-    optimizer: Optimizer
-    reasons: tuple[str, ...] = ()
 
 
 class Options(BaseModel):
@@ -50,9 +37,9 @@ class Options(BaseModel):
         """Estimator and optimizer with these options. Raises `InputError` for options that do not go together."""
         raise NotImplementedError(f"{type(self).__name__} has no build")
 
-    def choose(self, problem: Problem) -> Choice:
-        """The two parts that suit a problem. Methods that look at no problem choose what `build` makes."""
-        return Choice(*self.build(), parameterised(problem))
+    def plan(self, problem: Problem) -> Plan:
+        """Return the plan for a problem: what `build` makes, unless a method looks at the problem."""
+        return Plan(problem, *self.build(), reasons=parameterised(problem))
 
 
 @dataclass(frozen=True)
@@ -92,6 +79,10 @@ class Method:
             expected = f"expected {self.expected(name)}, got {detail['input']!r}"
             raise InputError(f"method {self.name}: option {name}: {expected}") from error
 
+    def options_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return all options by name, with `settings` in place of defaults. Raises `InputError`."""
+        return self.configure(settings).model_dump()
+
     def expected(self, name: str) -> str:
         """What values an option takes, in words: "a whole number above 0"."""
         schema = self.options.model_json_schema()["properties"][name]
@@ -104,11 +95,11 @@ class Method:
         with self._named():
             return options.build()
 
-    def choose(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Choice:
-        """Likewise, chosen to suit a problem. Raises `InputError`."""
+    def plan(self, problem: Problem, settings: Mapping[str, Any] | None = None) -> Plan:
+        """Return the plan for a problem, with `settings` in place of defaults. Raises `InputError`."""
         options = self.configure(settings or {})
         with self._named():
-            return options.choose(problem)
+            return options.plan(problem)
 
     @contextmanager
     def _named(self) -> Iterator[None]:

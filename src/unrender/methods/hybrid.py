@@ -19,7 +19,8 @@ from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.adam_options import AdamOptions
-from unrender.methods.base import Choice, parse_schedule
+from unrender.methods.base import parse_schedule
+from unrender.methods.plan import Plan
 from unrender.methods.smoothed import parse_widths
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
@@ -66,8 +67,7 @@ class HybridMethod(AdamOptions):
         """See `Options.build`: without rates of its own for what is perturbed, which a problem has to tell."""
         return self._parts("path" if self.space is None else self.space, {})
 
-    def choose(self, problem: Problem) -> Choice:
-        """See `Options.choose`."""
+    def plan(self, problem: Problem) -> Plan:
         known, keys = problem.renderer.parameters(), list(problem.shapes())
         own = beyond_paths(known, keys) if self._keys is None else self._keys
         space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
@@ -75,7 +75,7 @@ class HybridMethod(AdamOptions):
         each = widths if isinstance(widths, dict) else {"*": widths}
         rates = {key: self.step * each.get(key, each["*"]) for key in own if key in keys}
         reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
-        return Choice(*self._parts(space, rates), (reason,) if own else ())
+        return Plan(problem, *self._parts(space, rates), reasons=(reason,) if own else ())
 
     @property
     def _keys(self) -> tuple[str, ...] | None:

@@ -8,10 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Choosing", "OnMeshes", "Optimizer", "Preconditioning", "Refining", "Reparameterising"]
+__all__ = ["Choosing", "OnMeshes", "Optimizer"]
 
 
 class Optimizer(Protocol):
@@ -35,41 +34,11 @@ class Optimizer(Protocol):
 
 
 @runtime_checkable
-class Reparameterising(Protocol):
-    """An optimizer that has parameterisations for parameters without one of their own."""
-
-    @property
-    def parameterisations(self) -> Mapping[str, Any]:
-        """{key: parameterisation, or its name}; keys that the problem does not have, or that have their own, are left out."""
-        ...
-
-
-@runtime_checkable
-class Refining(Protocol):
-    """An optimizer with which parameters that have no resolutions of their own are coarse at first."""
-
-    @property
-    def coarse_to_fine(self) -> Mapping[str, tuple[int, ...]]:
-        """{key: steps before which the resolution doubles}; keys that have their own are left out. States are carried."""
-        ...
-
-
-@runtime_checkable
 class OnMeshes(Protocol):
-    """An optimizer that has preconditioners which suit values at the vertices of meshes, once they know these."""
+    """An optimizer whose own preconditioners act along the edges of meshes, so it has to know these."""
 
     def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Optimizer:
-        """The same, given the mesh of a parameter's key; None for what has none."""
-        ...
-
-
-@runtime_checkable
-class Preconditioning(Protocol):
-    """An optimizer that has preconditioners for parameters without one of their own."""
-
-    @property
-    def preconditioners(self) -> Mapping[str, Preconditioner]:
-        """{key: preconditioner}; keys of parameters that have their own are left out."""
+        """Return the same optimizer for meshes that `topology` returns by the parameter's key; None for what has no mesh."""
         ...
 
 

@@ -12,8 +12,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Refining, Reparameterising
-from unrender.preconditioners.base import Preconditioner
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem.upsampling import Upsampler, restarted, upsampled
 
@@ -41,19 +40,17 @@ class PartitionedState:
 class Partitioned:
     """One optimizer for the parameters in `keys`, another for the rest: vertices of a mesh beside its texture.
 
-        Partitioned(("vase.vertex_positions",), Adam(0.01, uniform=True), ScheduleFree(0.1), LargeSteps(19.0))
+        Partitioned(("vase.vertex_positions",), Adam(0.01, uniform=True), ScheduleFree(0.1))
 
     Args:
         keys: of parameters.
         optimizer: for those; it requires the gradient alone.
         others: for all others, likewise.
-        preconditioner: of those of `keys` that have none of their own; None for none.
     """
 
     keys: tuple[str, ...] = ()
     optimizer: Optimizer = field(default_factory=lambda: Adam(uniform=True))
     others: Optimizer = field(default_factory=Adam)
-    preconditioner: Preconditioner | None = None
 
     def __post_init__(self):
         if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
@@ -70,31 +67,6 @@ class Partitioned:
     def requires(self) -> Capabilities:
         """A gradient."""
         return Capabilities(Gradient)
-
-    @property
-    def preconditioners(self) -> Mapping[str, Preconditioner]:
-        """See `Preconditioning`."""
-        return {} if self.preconditioner is None else dict.fromkeys(self.keys, self.preconditioner)
-
-    @property
-    def parameterisations(self) -> Mapping[str, Any]:
-        """See `Reparameterising`."""
-        return self._given(lambda part: part.parameterisations if isinstance(part, Reparameterising) else {})
-
-    @property
-    def coarse_to_fine(self) -> Mapping[str, tuple[int, ...]]:
-        """See `Refining`."""
-        return self._given(lambda part: part.coarse_to_fine if isinstance(part, Refining) else {})
-
-    def _given(self, of: Callable[[Optimizer], Mapping[str, Any]]) -> dict[str, Any]:
-        """What both parts give for their own parameters."""
-        pairs = ((part, of(part)) for part in (self.optimizer, self.others))
-        return {
-            k: given
-            for part, found in pairs
-            for k, given in found.items()
-            if (k in self.keys) == (part is self.optimizer)
-        }
 
     def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Partitioned:
         """See `OnMeshes.on_meshes`."""

@@ -19,7 +19,6 @@ from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAve
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.problem.coarse_to_fine import checked_steps
 from unrender.schedules.functions import Schedule
 
 __all__ = ["ScheduleFree"]
@@ -65,9 +64,8 @@ class ScheduleFree(Recipe):
             The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
         wiener: whether the steps of these parameters are shortened by the share of signal.
-        parameterisations: {key: name}, such as "log", of the parameters that move by another variable, whose size tells nothing of how
-            far they have come; given to those that have none of their own. See `unrender.parameterisations`.
-        coarse_to_fine: {key: steps before which the resolution doubles}, of those that have no `CoarseToFine` of their own.
+        reparameterised: Keys of parameters that move by another variable (`unrender.parameterisations`), whose size does not tell how far
+            they have come.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -81,8 +79,7 @@ class ScheduleFree(Recipe):
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
     wiener: bool = True
-    parameterisations: Mapping[str, str] = field(default_factory=dict)
-    coarse_to_fine: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    reparameterised: tuple[str, ...] = ()
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
     def __post_init__(self):
@@ -96,13 +93,8 @@ class ScheduleFree(Recipe):
         keys = checked_keys("ScheduleFree: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
         object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))
-        named = self.parameterisations
-        if not isinstance(named, Mapping) or not all(isinstance(x, str) for pair in named.items() for x in pair):
-            raise InputError(f"ScheduleFree: parameterisations must be {{key: name}}, got {named!r:.80}")
-        if not isinstance(self.coarse_to_fine, Mapping):
-            raise InputError(f"ScheduleFree: coarse_to_fine must be {{key: steps}}, got {self.coarse_to_fine!r:.80}")
-        steps = {key: checked_steps(f"ScheduleFree: {key}", given) for key, given in self.coarse_to_fine.items()}
-        object.__setattr__(self, "coarse_to_fine", steps)
+        moved = checked_keys("ScheduleFree: reparameterised", self.reparameterised)
+        object.__setattr__(self, "reparameterised", moved)
 
     def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> ScheduleFree:
         """See `OnMeshes.on_meshes`."""
@@ -112,7 +104,7 @@ class ScheduleFree(Recipe):
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
         """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
-        for name in ("preconditioned", "parameterisations", "coarse_to_fine"):
+        for name in ("preconditioned", "reparameterised"):
             if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
                 raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')
         return super().init(parameters, learning_rates)
@@ -122,7 +114,7 @@ class ScheduleFree(Recipe):
         shrunk = self.preconditioned if self.wiener and self.preconditioner is not None else ()
         return (
             self._smoothing,
-            AgreementRate(self.growth, self.decay, tuple(self.parameterisations)),
+            AgreementRate(self.growth, self.decay, self.reparameterised),
             ScaleByRms(self.beta_2, self.epsilon, long_memory=True),
             ApplyPreconditioner(),
             WienerShrinkage(shrunk),

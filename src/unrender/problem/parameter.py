@@ -15,7 +15,7 @@ from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.remeshing import Remeshing
 
-__all__ = ["Parameter"]
+__all__ = ["Parameter", "ParameterSettings"]
 
 
 @dataclass(frozen=True)
@@ -54,3 +54,18 @@ class Parameter:
     regularizer: MeshRegularizer | Mapping[str, Any] | None = None
     remeshing: Remeshing | Sequence[int] | Mapping[str, Any] | None = None
     self_intersection: Literal["warn", "prevent", "ignore"] = "warn"
+
+
+@dataclass(frozen=True)
+class ParameterSettings:
+    """What a method decides for a parameter that has no setting of its own; None leaves the setting open.
+
+    Attributes:
+        parameterisation: What the optimizer moves, or its name.
+        preconditioner: Map of gradients and steps.
+        coarse_to_fine: Resolutions over the steps.
+    """
+
+    parameterisation: Parameterisation | str | None = None
+    preconditioner: Preconditioner | None = None
+    coarse_to_fine: CoarseToFine | None = None

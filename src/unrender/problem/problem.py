@@ -17,10 +17,8 @@ from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.losses import L2, Loss
-from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import notebook
-from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.coordinates import Coordinates
 from unrender.problem.errors import FieldError
 from unrender.problem.executor import LOCAL, Executor
@@ -30,7 +28,7 @@ from unrender.problem.mesh_checks import (
     check_surfaces,
     mesh_notices,
 )
-from unrender.problem.parameter import Parameter
+from unrender.problem.parameter import Parameter, ParameterSettings
 from unrender.problem.references import References
 from unrender.problem.validation import (
     Bounds,
@@ -170,7 +168,6 @@ class Problem(ViewLosses):
         self.executor: Executor = LOCAL
         self.references = References(self.views, self.renderer.array)
         self._references, self._masks = dict[int, Array](), dict[int, Array | None]()
-        self._as_given: Problem | None = None
 
     def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """True values as arrays; adds to the notices."""
@@ -218,57 +215,34 @@ class Problem(ViewLosses):
             made.origin = {key: value for key, value in self.origin.items() if key == "scene"}
         return made
 
-    @property
-    def as_given(self) -> Problem:
-        """The problem before an optimizer's parameterisations, preconditioners or resolutions were added."""
-        return self._as_given or self
+    def configured(self, settings: Mapping[str, ParameterSettings]) -> Problem:
+        """Return the same problem where parameters without a setting of their own take the one given here.
 
-    def reparameterised(self, given: Mapping[str, Any]) -> Problem:
-        """The same problem with these parameterisations, {key: one, or its name}, for the parameters that have none of their own.
-
-        Raises `InputError` where bounds do not suit.
+        Raises `InputError` for a setting that does not suit its parameter.
         """
-        missing = self._missing("parameterisation", given)
-        checked = {k: check_parameterisation(g, self.bounds[k], self.first_values[k]) for k, g in missing.items()}
-        made = {key: one for key, (one, _) in checked.items()}
-        found = self._completed("parameterisation", made)
-        found.parameterisations = self.parameterisations | made
-        transforms = {key: transform for key, (_, transform) in checked.items() if transform is not None}
-        found.coordinates = replace(self.coordinates, transforms={**self.coordinates.transforms, **transforms})
-        return found
-
-    def refining(self, given: Mapping[str, CoarseToFine]) -> Problem:
-        """The same problem, parameters with no resolutions of their own coarse at first. Raises `InputError` for what does not suit."""
-        missing, known = self._missing("coarse_to_fine", given), self.renderer.parameters()
-        for key, way in missing.items():
-            check_resolutions(key, way, known[key])
-        found = self._completed("coarse_to_fine", missing)
-        found.coarse_to_fine = self.coarse_to_fine | missing
-        return found
+        known, made = self.renderer.parameters(), copy.copy(self)
+        transforms, parameters = dict(self.coordinates.transforms), []
+        made.parameterisations, made.preconditioners = dict(self.parameterisations), dict(self.preconditioners)
+        made.coarse_to_fine = dict(self.coarse_to_fine)
+        for parameter in self.parameters:
+            key, chosen = parameter.key, vars(settings.get(parameter.key, ParameterSettings()))
+            new = {n: value for n, value in chosen.items() if value is not None and getattr(parameter, n) is None}
+            parameters.append(replace(parameter, **new))
+            if "parameterisation" in new:
+                checked = check_parameterisation(new["parameterisation"], self.bounds[key], self.first_values[key])
+                made.parameterisations[key] = checked[0]
+                transforms |= {} if checked[1] is None else {key: checked[1]}
+            if "preconditioner" in new:
+                made.preconditioners[key] = check_preconditioner(key, new["preconditioner"], known[key])
+            if "coarse_to_fine" in new:
+                check_resolutions(key, new["coarse_to_fine"], known[key])
+                made.coarse_to_fine[key] = new["coarse_to_fine"]
+        made.parameters, made.coordinates = tuple(parameters), Coordinates(transforms, made.preconditioners)
+        return made
 
     def topology(self, key: str) -> MeshTopology | None:
         """Of the mesh at whose vertices a parameter has values, (n V,); None for textures, grids and numbers."""
         return mesh_topology(self.renderer.parameters()[key])
-
-    def preconditioned(self, given: Mapping[str, Preconditioner]) -> Problem:
-        """The same problem with these preconditioners for parameters that have none. Raises `InputError` for one that does not suit."""
-        missing, known = self._missing("preconditioner", given), self.renderer.parameters()
-        found = self._completed("preconditioner", missing)
-        checked = {k: check_preconditioner(k, p, known[k]) for k, p in missing.items()}
-        found.preconditioners = self.preconditioners | checked
-        found.coordinates = replace(self.coordinates, preconditioners=found.preconditioners)
-        return found
-
-    def _missing(self, field: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """What is given for parameters without a `field` of their own."""
-        return {p.key: given[p.key] for p in self.parameters if p.key in given and getattr(p, field) is None}
-
-    def _completed(self, field: str, given: Mapping[str, Any]) -> Problem:
-        """A copy whose parameters have these as `field`; the problem as it was given stays known."""
-        found = copy.copy(self)
-        found._as_given = self.as_given
-        found.parameters = tuple(replace(p, **{field: given[p.key]}) if p.key in given else p for p in self.parameters)
-        return found
 
     def remeshed(self, meshes: Mapping[str, ReplacedMesh]) -> Problem:
         """The same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
@@ -287,7 +261,7 @@ class Problem(ViewLosses):
         made = Problem(
             renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
         )
-        made.origin, made.executor, made._as_given = self.origin, self.executor, self.as_given
+        made.origin, made.executor = self.origin, self.executor
         made.remeshed_from = self.remeshed_from or self
         return made
 

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.methods import method, methods
-from unrender.methods.base import Choice
+from unrender.methods.plan import Plan
 from unrender.problem.problem import Problem
 
 __all__ = ["resolve", "resolve_estimator"]
 
 
-def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Choice:
-    """Both parts, and why a method chose them.
+def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
+    """Return the plan of a method, of two components, or a plan as it is.
 
     Args:
         problem: what methods choose their parts for.
-        estimator: an estimator, or the name of a method, which brings its optimizer along.
+        estimator: an estimator, a `Plan`, or the name of a method, which brings its optimizer along.
         optimizer: an optimizer; None for the method's.
 
     Raises:
         InputError: one of them is missing or something else, such as an optimizer of Mitsuba's or PyTorch's, or a class in place of an
             object.
     """
+    if optimizer is None and isinstance(estimator, Plan):
+        return replace(estimator, problem=problem)
     if optimizer is None and isinstance(estimator, str):
-        return method(estimator).choose(problem)
+        return method(estimator).plan(problem)
     chosen = resolve_estimator(problem, estimator)
     if optimizer is None:
         raise InputError(
@@ -35,13 +38,13 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Choice:
         )
     if not _is_component(optimizer, "requires", "init", "update"):
         raise InputError(f"optimize: optimizer: {_instead_of_optimizer(optimizer)}")
-    return Choice(chosen, optimizer)
+    return Plan(problem, chosen, optimizer)
 
 
 def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize") -> Estimator:
     """An estimator, from itself or a method's name. Raises `InputError` for anything else."""
     if isinstance(estimator, str):
-        return method(estimator).choose(problem).estimator
+        return method(estimator).plan(problem).estimator
     if not _is_component(estimator, "provides", "init", "estimate"):
         names = ", ".join(methods())
         raise InputError(

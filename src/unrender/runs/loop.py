@@ -13,12 +13,12 @@ from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.base import Estimate, Estimator
+from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates, regularized
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer, Preconditioning, Refining, Reparameterising
+from unrender.methods.plan import Plan
+from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
 from unrender.problem.bounds import project
-from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
 from unrender.runs.mesh_guard import guarded
@@ -74,31 +74,18 @@ class Descent:
         return time.perf_counter() - started, snapshot(run, state)
 
 
-def prepare(
-    problem: Problem,
-    estimator: Estimator,
-    optimizer: Optimizer,
-    steps: int | None,
-    seconds: float | None,
-    seed: int,
-) -> tuple[Run, RunState]:
-    """A run before its first step."""
+def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> tuple[Run, RunState]:
+    """Return a run before its first step."""
+    problem, estimator, optimizer = plan.configured(), plan.estimator, plan.optimizer
     problem.executor.check(estimator)
-    if isinstance(optimizer, Reparameterising):
-        problem = problem.reparameterised(optimizer.parameterisations)
-    if isinstance(optimizer, Preconditioning):
-        problem = problem.preconditioned(optimizer.preconditioners)
     if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it
         for key in problem.preconditioners:
             raise InputError(
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
             )
-    if isinstance(optimizer, Refining):
-        ways = {key: CoarseToFine(tuple(steps), states="carry") for key, steps in optimizer.coarse_to_fine.items()}
-        problem = problem.refining(ways)
     if isinstance(optimizer, OnMeshes):
         optimizer = optimizer.on_meshes(problem.topology)
-    run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
+    run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)
     return run, state

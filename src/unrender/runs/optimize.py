@@ -15,6 +15,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.display.notebook_bar import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
+from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree
@@ -51,7 +52,7 @@ __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer
 @exclusive("optimize", long=True)
 def optimize(
     problem: Problem,
-    estimator: Estimator | str = "auto",
+    estimator: Estimator | Plan | str = "auto",
     optimizer: Optimizer | None = None,
     steps: int | None = None,
     seconds: float | None = None,
@@ -66,7 +67,8 @@ def optimize(
 
     Args:
         problem: what to recover, from which images.
-        estimator: where gradients come from; or the name of a method (`unrender methods` lists them), which brings its optimizer along.
+        estimator: Computes gradients. Or a `methods.plan.Plan`, or the name of a method (`unrender methods` lists them): both bring
+            their optimizer along.
         optimizer: what becomes of them; None for the method's. The default method chooses both to suit the problem.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
@@ -97,15 +99,15 @@ def optimize(
             cannot be begun, or cannot be written in the end; a run goes on in another thread.
     """
     named = estimator
-    choice = components.resolve(problem, estimator, optimizer)
-    check(choice.estimator, choice.optimizer, steps, seconds)
+    plan = components.resolve(problem, estimator, optimizer)
+    check(plan.estimator, plan.optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
     if isinstance(named, str) and not annotations.method:
-        annotations = replace(annotations, method=named, choices=choice.reasons)
-    run, state = prepare(problem, choice.estimator, choice.optimizer, steps, seconds, seed)
-    run.warnings += advice.remarks(problem, choice.optimizer)
+        annotations = replace(annotations, method=named, choices=plan.reasons)
+    run, state = prepare(plan, steps, seconds, seed)
+    run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown:
         return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)
@@ -169,7 +171,7 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
     table = method_file.serialize(run, method, checkpoint_every, final_spp)
     # By a closure: resuming replaces the list of warnings.
     return RunWriter(
-        folder, run.problem.as_given, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line)
+        folder, run.plan.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line)
     )
 
 

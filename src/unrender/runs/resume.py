@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
 from unrender.io import bounded_files
+from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.problem.fingerprint import differences
 from unrender.problem.problem import Problem
@@ -98,9 +99,9 @@ def resume_run(
 ) -> Result:
     """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before."""
     folder, method = stored.folder, stored.method
-    parts = method_file.parts(method, folder / METHOD, estimator, optimizer)
-    check(parts.estimator, parts.optimizer, method.steps, method.seconds)
-    run, state = prepare(problem, parts.estimator, parts.optimizer, method.steps, method.seconds, method.seed)
+    plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
+    check(plan.estimator, plan.optimizer, method.steps, method.seconds)
+    run, state = prepare(plan, method.steps, method.seconds, method.seed)
     run.folder = folder
     initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:

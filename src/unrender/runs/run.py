@@ -16,6 +16,7 @@ from unrender.core import arrays
 from unrender.core.signals import GRACEFUL
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
+from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.problem.problem import Problem
 from unrender.runs.noise import GradientNoise
@@ -29,7 +30,9 @@ class Run:
     """A run as callbacks see it.
 
     Attributes:
-        problem, estimator, optimizer, seed: what runs.
+        plan: What the run executes; its problem is as its author gave it.
+        problem: With the plan's settings, and with the present meshes.
+        estimator, optimizer, seed: what runs.
         steps, seconds: the budget; None where there is none.
         folder: the run folder; None for a run without one.
         step: how many steps are done.
@@ -41,6 +44,7 @@ class Run:
         stopped: why it ends after the present step; "" while it goes on.
     """
 
+    plan: Plan
     problem: Problem
     estimator: Estimator
     optimizer: Optimizer
@@ -67,7 +71,7 @@ class Run:
     @contextmanager
     def shown(self) -> Iterator[Run]:
         """The run as callbacks see it: at the scene's own resolution what its optimizer made coarse, and the problem did not ask for."""
-        present, own = self.parameters, self.problem.as_given.coarse_to_fine
+        present, own = self.parameters, self.plan.problem.coarse_to_fine
         shapes, size = self.problem.shapes(), arrays.shape
         coarse = [k for k in self.problem.coarse_to_fine if k not in own and size(present[k]) != shapes[k]]
         if not coarse:

@@ -1,9 +1,7 @@
-"""method.toml: the estimator, the optimizer and the options of a run, and the two components made again from their tables."""
+"""method.toml: the plan and the options of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,14 +9,11 @@ import drjit as dr
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
-from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.estimators.base import Estimator
 from unrender.io import bounded_files, toml_lines
-from unrender.optimizers.base import Optimizer
 from unrender.runs.run import Run
 
-__all__ = ["Method", "Parts", "parts", "read", "serialize"]
+__all__ = ["Method", "read", "serialize"]
 
 _LONGEST = 1 << 20
 _Positive = Annotated[StrictInt, Field(ge=1)]
@@ -34,7 +29,7 @@ class Method(BaseModel):
         seed: of the run.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
         threads: that the run had.
-        estimator, optimizer: tables, see `core.tables`; the reason, as text, where they cannot be stored.
+        estimator, optimizer, settings: See `Plan.table`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -48,14 +43,7 @@ class Method(BaseModel):
     threads: _Positive | None = None
     estimator: dict[StrictStr, Any] | StrictStr
     optimizer: dict[StrictStr, Any] | StrictStr
-
-
-@dataclass(frozen=True)
-class Parts:
-    """The two components that a run is made of."""
-
-    estimator: Estimator
-    optimizer: Optimizer
+    settings: dict[StrictStr, dict[StrictStr, Any]] = Field(default_factory=dict)
 
 
 def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int | None) -> dict[str, Any]:
@@ -68,8 +56,7 @@ def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int 
         "checkpoint_every": checkpoint_every,
         "final_spp": final_spp,
         "threads": dr.thread_count(),
-        "estimator": _table(run.estimator),
-        "optimizer": _table(run.optimizer),
+        **run.plan.table(),
     }
     return {key: value for key, value in found.items() if value is not None}
 
@@ -83,27 +70,3 @@ def read(path: Path) -> Method:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"][:1]) or "the file"
         raise InputError(f"{path}: {field[:80]}: {first['msg'].lower()}, got {repr(first['input'])[:60]}") from error
-
-
-def parts(method: Method, path: Path, estimator: Estimator | None, optimizer: Optimizer | None) -> Parts:
-    """The components that method.toml describes, or those given in their place. Raises `InputError`."""
-
-    def made(name: str, given: Any, words: Mapping[str, Any] | str) -> Any:
-        if given is not None:
-            return given
-        if isinstance(words, str):
-            raise InputError(f"{path}: {name}: {words}; hand it in: unrender.resume(..., {name}=...)")
-        return tables.component(words, where=f"{path}: {name}")
-
-    found = Parts(made("estimator", estimator, method.estimator), made("optimizer", optimizer, method.optimizer))
-    for name, value, asked in (("estimator", found.estimator, "estimate"), ("optimizer", found.optimizer, "update")):
-        if not callable(getattr(value, asked, None)):
-            raise InputError(f"{path}: {name}: {type(value).__name__} is no {name}")
-    return found
-
-
-def _table(component: Any) -> dict[str, Any] | str:
-    try:
-        return tables.table(component)
-    except tables.NotStorable as error:
-        return f"it cannot be made again from a file ({error})"

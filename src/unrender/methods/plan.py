@@ -1,0 +1,117 @@
+"""A plan: all that a method decides for a problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from unrender.core import tables
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimator
+from unrender.optimizers.base import Optimizer
+from unrender.problem.coarse_to_fine import CoarseToFine
+from unrender.problem.parameter import ParameterSettings
+from unrender.problem.problem import Problem
+
+__all__ = ["Plan"]
+
+_COMPONENTS = ("estimator", "optimizer")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that a method decides for a problem. `unrender.optimize` executes it as it is.
+
+    Attributes:
+        problem: What to recover, as its author gave it.
+        estimator: Computes gradients.
+        optimizer: Computes steps from gradients.
+        settings: {key: settings of a parameter that has none of its own}.
+        reasons: What was chosen and why, one line each.
+    """
+
+    problem: Problem
+    estimator: Estimator
+    optimizer: Optimizer
+    settings: Mapping[str, ParameterSettings] = field(default_factory=dict)
+    reasons: tuple[str, ...] = ()
+
+    def configured(self) -> Problem:
+        """Return the problem with the settings of this plan. Raises `InputError` for a setting that does not suit."""
+        return self.problem.configured(self.settings)
+
+    def table(self) -> dict[str, Any]:
+        """Return the plan as TOML has it: estimator, optimizer, settings by key.
+
+        A component that no table can describe becomes a text with the reason.
+        """
+        parts: dict[str, Any] = {name: _table(getattr(self, name)) for name in _COMPONENTS}
+        settings = {key: table for key, own in self.settings.items() if (table := _settings_table(own))}
+        return parts | ({"settings": settings} if settings else {})
+
+    @classmethod
+    def from_table(
+        cls,
+        problem: Problem,
+        table: Mapping[str, Any],
+        where: str,
+        estimator: Estimator | None = None,
+        optimizer: Optimizer | None = None,
+    ) -> Plan:
+        """Return the plan that `table` describes.
+
+        Args:
+            problem: What to recover.
+            table: As `Plan.table` returns it.
+            where: What a message begins with.
+            estimator, optimizer: Used in place of the table's.
+
+        Raises:
+            InputError: A component that the table does not describe, is of another kind, or does not suit the problem.
+        """
+        given = {"estimator": estimator, "optimizer": optimizer}
+        made = {name: given[name] or _component(table.get(name), name, where) for name in _COMPONENTS}
+        for name, asked in zip(_COMPONENTS, ("estimate", "update"), strict=True):
+            if not callable(getattr(made[name], asked, None)):
+                raise InputError(f"{where}: {name}: {type(made[name]).__name__} is no {name}")
+        settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in table.get("settings", {}).items()}
+        return cls(problem, made["estimator"], made["optimizer"], settings)
+
+
+def _table(component: Any) -> dict[str, Any] | str:
+    try:
+        return tables.table(component)
+    except tables.NotStorable as error:
+        return f"it cannot be made again from a file ({error})"
+
+
+def _component(table: Any, name: str, where: str) -> Any:
+    if isinstance(table, str):
+        raise InputError(f"{where}: {name}: {table}; hand it in: unrender.resume(..., {name}=...)")
+    return tables.component(table, where=f"{where}: {name}")
+
+
+def _settings_table(own: ParameterSettings) -> dict[str, Any]:
+    """Return the settings that are not None, as tables."""
+    found: dict[str, Any] = {}
+    if own.parameterisation is not None:
+        named = isinstance(own.parameterisation, str)
+        found["parameterisation"] = own.parameterisation if named else _table(own.parameterisation)
+    if own.preconditioner is not None:
+        found["preconditioner"] = _table(own.preconditioner)
+    if own.coarse_to_fine is not None:
+        found["coarse_to_fine"] = tables.fields(own.coarse_to_fine)
+    return found
+
+
+def _settings(table: Any, where: str) -> ParameterSettings:
+    """Return the settings that a table describes. Raises `InputError`."""
+    if not isinstance(table, Mapping) or set(table) - set(vars(ParameterSettings())):
+        raise InputError(f"{where}: expected {', '.join(vars(ParameterSettings()))}, got {repr(table)[:60]}")
+    made: dict[str, Any] = dict(table)
+    if "preconditioner" in made:
+        made["preconditioner"] = tables.component(made["preconditioner"], "preconditioner", where=where)
+    if "coarse_to_fine" in made:
+        made["coarse_to_fine"] = tables.build(CoarseToFine, made["coarse_to_fine"])
+    return ParameterSettings(**made)
