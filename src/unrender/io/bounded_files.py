@@ -374,7 +374,7 @@ def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:
     seen: set[str] = set()
     for member in members:
         name, key = member.filename, member.filename.removesuffix(".npy")
-        if name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name:
+        if files.member_leads_out(name):
             raise InputError(f"{path}: {printable(name)}: a name that leads out of the archive")
         if key in seen:
             raise InputError(f"{path}: {printable(key)}: given twice")

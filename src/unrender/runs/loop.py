@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
-from unrender.core.random import Key
+from unrender.core.random import Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.capabilities import Capabilities, LossFunction
@@ -82,7 +82,8 @@ def prepare(
     seconds: float | None,
     seed: int,
 ) -> tuple[Run, RunState]:
-    """A run before its first step."""
+    """Return a run before its first step. Raises `InputError` for a seed that no file could hold."""
+    seed = check_seed("seed", seed)
     if problem.gatherer is not None:
         problem.gatherer.check(estimator)
         if problem.remeshings:
