@@ -27,6 +27,7 @@ from hostile_inputs import KEY, Hostile, ply, scene, serialized, write_scene
 from hostile_worker import Outcome, take_in
 
 import unrender as ur
+from unrender import report
 from unrender.capture import formats, pictures
 from unrender.capture.formats import lights
 from unrender.core.errors import InputError
@@ -296,7 +297,7 @@ def _use_run(folder: Path, name: str) -> Any:
     del name
     results = [
         _refused(lambda: reader.read(folder)),
-        _refused(lambda: ur.report(folder)),
+        _refused(lambda: report.page(folder)),
         _refused(lambda: ur.resume(folder, steps=6)),
     ]
     if all(results):
