@@ -38,6 +38,8 @@ __all__ = ["INPUTS", "TARGETS", "faults", "names", "warm_up"]
 
 LARGEST = 1 << 30
 """Bytes that no input may take."""
+LONGEST = 120.0
+"""Seconds of the clock after which an input counts as hung, on a machine that others use, too."""
 
 Files = dict[str, bytes]
 Use = Callable[[Path, str], Any]
@@ -386,7 +388,7 @@ def _main() -> int:
     found: list[str] = []
     while time.monotonic() < end:
         with tempfile.TemporaryDirectory(prefix="fuzz") as place:
-            outcomes = take_in(Path(__file__).stem, "INPUTS", names(first, given.batch), Path(place))
+            outcomes = take_in(Path(__file__).stem, "INPUTS", names(first, given.batch), Path(place), LONGEST)
         first += given.batch
         counts.update(f"{o.name.partition(' ')[0]} {o.kind}" for o in outcomes)
         counts["inputs"] += len(outcomes)

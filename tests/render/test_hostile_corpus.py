@@ -95,7 +95,7 @@ def test_what_mitsuba_warns_of_is_printable(tmp_path: Path, capfd: pytest.Captur
 @pytest.mark.skipif(sys.platform != "linux", reason="measures by /proc")
 def test_files_damaged_at_random_take_little(tmp_path: Path):
     """The short edition of `fuzz_inputs.py`, which goes on for as long as it is told."""
-    outcomes = take_in(fuzz_inputs.__name__, "INPUTS", fuzz_inputs.names(0, 40), tmp_path)
+    outcomes = take_in(fuzz_inputs.__name__, "INPUTS", fuzz_inputs.names(0, 40), tmp_path, fuzz_inputs.LONGEST)
     assert fuzz_inputs.faults(outcomes) == []
     assert len(outcomes) == 40 * len(fuzz_inputs.TARGETS)
     kinds = {(o.name.partition(" ")[0], o.kind) for o in outcomes}

@@ -187,13 +187,38 @@ def _word(data: bytes, at: int) -> tuple[bytes, int]:
     return data[at:end], end + 1
 
 
-def _hdr(data: bytes, _: IO[bytes]) -> Sizes:
+def _hdr(data: bytes, file: IO[bytes]) -> Sizes:
     """From the first line with a resolution, in the one form that Mitsuba reads."""
-    line = re.search(rb"^.*(?:-Y|\+X).*$", data.replace(b"\r", b""), re.MULTILINE)
-    match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0])
-    if not match:
+    line = re.search(rb"^[^\n]*(?:-Y|\+X)[^\n]*$", data, re.MULTILINE)
+    match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0].replace(b"\r", b""))
+    if not line or not match:
         raise ValueError("no resolution")
-    return [(int(match[2]), int(match[1]), 3)]
+    width, height = int(match[2]), int(match[1])
+    if 0 < 3 * width * height <= MOST_VALUES:
+        file.seek(line.end() + 1)
+        _check_scanlines(file.read(), width, height)
+    return [(width, height, 3)]
+
+
+def _check_scanlines(data: bytes, width: int, height: int) -> None:
+    """Raise unless the encoded rows of an HDR file end where the picture does: Mitsuba would write on behind it."""
+    if not (8 <= width < 1 << 15 and data[:2] == b"\2\2" and len(data) > 2 and data[2] < 0x80):
+        return  # without runs: read as it is
+    marker, at = b"\2\2" + width.to_bytes(2, "big"), 0
+    for _ in range(height):
+        if data[at : at + 4] != marker:
+            raise ValueError("a row without runs among those with runs")
+        at += 4
+        for _ in range(4):
+            left = width
+            while left > 0:
+                count = data[at]
+                run = count > 128
+                count -= 128 if run else 0
+                at += 2 if run else 1 + count
+                if not 0 < count <= left or at > len(data):
+                    raise ValueError("runs that do not fill a row")
+                left -= count
 
 
 def _pfm(data: bytes, _: IO[bytes]) -> Sizes:
