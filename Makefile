@@ -6,6 +6,7 @@
 # make test-unit   the tests that need no Mitsuba alone, in about a minute
 # make lint        lint and types alone
 # make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
+# make package     wheel and source archive, in dist; the wheel is installed into an empty folder and started from there
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
@@ -16,7 +17,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo asset test test-all test-slow test-unit lint docs clean
+.PHONY: help demo asset test test-all test-slow test-unit lint docs package clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
@@ -77,6 +78,9 @@ lint: .venv/ready
 docs: .venv/docs-ready
 	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs build/site
 	@echo "the site: file://$(CURDIR)/build/site/index.html"
+
+package: .venv/ready
+	$(BIN)/python -I scripts/package.py
 
 clean:
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from unrender.cli.main import main
+from unrender.io import confinement
 
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective">
@@ -54,6 +55,7 @@ def unrender(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: py
     """`unrender(*arguments)`, in an empty folder of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv(confinement.VARIABLE, "0")  # which --allow-outside sets
 
     def call(*arguments: object) -> Answer:
         capsys.readouterr()

@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -118,6 +119,7 @@ def _tell(module: str, table: str, folder: Path) -> None:
         except BaseException as error:
             kind, said = "raised", f"{type(error).__name__}: {str(error)[:300]}"
         found = Outcome(name, said, kind, _seconds() - started, time.monotonic() - clock, _status("VmHWM") - before)
+        shutil.rmtree(place, ignore_errors=True)
         report.write(json.dumps(found.__dict__) + "\n")
         report.flush()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import fuzz_inputs
 import hostile_folders
 import hostile_inputs
 import pytest
@@ -88,3 +89,28 @@ def test_what_mitsuba_warns_of_is_printable(tmp_path: Path, capfd: pytest.Captur
     assert "performance warning" in said.err
     assert "\\x1b]0;owned\\x07.ply" in said.err
     assert "\x1b" not in said.out + said.err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="measures by /proc")
+def test_files_damaged_at_random_take_little(tmp_path: Path):
+    """The short edition of `fuzz_inputs.py`, which goes on for as long as it is told."""
+    outcomes = take_in(fuzz_inputs.__name__, "INPUTS", fuzz_inputs.names(0, 40), tmp_path, fuzz_inputs.LONGEST)
+    assert fuzz_inputs.faults(outcomes) == []
+    assert len(outcomes) == 40 * len(fuzz_inputs.TARGETS)
+    kinds = {(o.name.partition(" ")[0], o.kind) for o in outcomes}
+    assert kinds == {(target, kind) for target in fuzz_inputs.TARGETS for kind in ("refused", "taken")}
+
+
+def test_a_planted_fault_is_found():
+    """Each thing that a sound reader never does."""
+    sound = Outcome("mesh 1", "a.ply: no", "refused"), Outcome("mesh 2", "", "taken")
+    for fault in (
+        Outcome("mesh 3", "", "died"),
+        Outcome("mesh 4", "", "hung"),
+        Outcome("mesh 5", "ValueError: x", "raised"),
+        Outcome("mesh 6", "", "taken", bytes=_BYTES + 1),
+        Outcome("mesh 7", "two\nlines", "refused"),
+    ):
+        assert len(fuzz_inputs.faults([*sound, fault])) == 1
+    assert fuzz_inputs.faults([*sound]) == []

@@ -251,6 +251,14 @@ RECORDS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "an option that is none": (
         lambda f: (f / "problem.toml").write_text('gallery = "quad"\n[options]\nx = 1'), "no option x",
     ),
+    "an origin of a name without end": (
+        lambda f: [
+            _edit_record(f, problem={"origin": {"file": "/" + 5000 * "x"}}),
+            (f / "problem.toml").write_text('scene = "a.xml"'),
+        ],
+        "File name too long",
+    ),
+    "a seed that no file holds": (lambda f: _method(f, "seed = 0", "seed = 99999999999999999999"), "seed"),
     "a lock that is a link": (lambda f: (f / "lock").symlink_to(f.parent / "escape"), "cannot be locked"),
 }  # fmt: skip
 

@@ -81,6 +81,36 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path: Path):
         image_size.check(tmp_path / "a.jpg")
 
 
+def _hdr(rows: bytes, width: int = 8, height: int = 2) -> bytes:
+    return f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode() + rows
+
+
+_ROW = b"\2\2\0\x08" + 4 * b"\x88\x01"  # one run of eight for each channel
+SCANLINES: dict[str, tuple[bytes, bool]] = {
+    "runs": (2 * _ROW, True),
+    "runs and single values": (b"\2\2\0\x08" + 4 * (b"\x85\x01\x03abc") + _ROW, True),
+    "no runs": (bytes(64), True),
+    "a run too long": (_ROW + b"\2\2\0\x08" + 4 * b"\x89\x01", False),
+    "single values too many": (b"\2\2\0\x08" + 4 * b"\x09abcdefghi" + _ROW, False),
+    "a run of none": (b"\2\2\0\x08" + 4 * b"\x80\x01\x88\x01" + _ROW, False),
+    "a row without runs after one with": (_ROW + bytes(32), False),
+    "a row of another width": (_ROW + _ROW.replace(b"\2\2\0\x08", b"\2\2\0\x09"), False),
+    "a row too few": (_ROW, False),
+}
+
+
+@pytest.mark.parametrize("name", SCANLINES)
+def test_runs_of_an_hdr_file_must_fill_its_rows(name: str, tmp_path: Path):
+    """Mitsuba writes on behind the picture: the process died."""
+    rows, sound = SCANLINES[name]
+    (tmp_path / "a.hdr").write_bytes(_hdr(rows))
+    if sound:
+        assert image_size.check(tmp_path / "a.hdr") == 48
+        return
+    with pytest.raises(InputError, match="header is malformed"):
+        image_size.check(tmp_path / "a.hdr")
+
+
 # ---------------------------------------------------------------------- meshes and other files of a scene
 
 

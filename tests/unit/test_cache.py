@@ -85,3 +85,21 @@ def test_dr_jit_keeps_its_kernels_there_unless_told_otherwise(place: Path, monke
     cache.use_for_kernels()
     assert os.environ["DRJIT_CACHE_DIR"] == str(place / "kernels")
     monkeypatch.delenv("DRJIT_CACHE_DIR")
+
+
+@pytest.mark.parametrize("which", ["top", "part"])
+def test_a_folder_that_others_may_write_keeps_nothing(
+    which: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel that somebody else put there would run as whoever loads it."""
+    top = tmp_path / "cache"
+    monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, str(top))
+    assert cache.folder(cache.KERNELS) == top / cache.KERNELS
+    place = top if which == "top" else top / cache.KERNELS
+    place.chmod(0o777)
+    assert cache.folder(cache.KERNELS) is None
+    monkeypatch.delenv("DRJIT_CACHE_DIR", raising=False)
+    cache.use_for_kernels()
+    assert "DRJIT_CACHE_DIR" not in os.environ
+    place.chmod(0o700)
+    assert cache.folder(cache.KERNELS) == top / cache.KERNELS

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,7 +58,8 @@ def folder(part: str) -> Path | None:
     """A part of the cache, `REFERENCES` or `KERNELS`, made where it is missing.
 
     Returns:
-        None where the cache is switched off or bypassed, or the folder cannot be made or written.
+        None where the cache is switched off or bypassed, or the folder cannot be made or written, is another user's, or may be written by
+        everybody.
     """
     top = None if _bypassed else root()
     if top is None:
@@ -67,7 +69,16 @@ def folder(part: str) -> Path | None:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
         return None
+    if not all(_is_private(each) for each in (top, place)):
+        return None
     return place if os.access(place, os.R_OK | os.W_OK | os.X_OK) else None
+
+
+def _is_private(place: Path) -> bool:
+    """Whether nobody else can put files there: a compiled kernel is code that runs as whoever loads it."""
+    found = place.stat()
+    others_may_write = bool(found.st_mode & stat.S_IWOTH)
+    return found.st_uid in (os.geteuid(), 0) and not others_may_write
 
 
 @contextlib.contextmanager

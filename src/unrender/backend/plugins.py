@@ -39,14 +39,17 @@ def own_folder() -> Path:
 
 
 def search_paths() -> list[Path]:
-    """The folders where Mitsuba's file resolver looks for files, first to last."""
-    return [Path(str(place)) for place in _mitsuba().file_resolver()]
+    """Return the folders where Mitsuba's file resolver looks for files, first to last. Raises `InputError` for names that are not UTF-8."""
+    try:
+        return [Path(str(place)) for place in _mitsuba().file_resolver()]
+    except UnicodeDecodeError as error:  # the current folder is one of them
+        raise InputError("current folder: its name is not UTF-8, which Mitsuba cannot read; rename it") from error
 
 
 def prefer_own() -> None:
     """Have Mitsuba look into its own folder first, for the whole process. Again does nothing."""
     resolver = _mitsuba().file_resolver()
-    if len(resolver) == 0 or Path(str(resolver[0])) != own_folder():
+    if search_paths()[:1] != [own_folder()]:
         resolver.prepend(str(own_folder()))
 
 

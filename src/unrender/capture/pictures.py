@@ -10,18 +10,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from unrender.capture import decoding
 from unrender.capture.cameras import Lens, opencv
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
-from unrender.io import bounded_files, image_size, images
+from unrender.io import bounded_files, image_size, images, tiff_header
 
 __all__ = ["Pixels", "read", "read_mask", "upright"]
 
-_BY_PILLOW = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".ppm", ".tga")
-_BY_OPENCV = (".tif", ".tiff")
+_PILLOW_KINDS = {
+    "JPEG": ("JPEG", "MPO"),
+    "PNG": ("PNG",),
+    "WEBP": ("WEBP",),
+    "BMP": ("BMP",),
+    "PPM": ("PPM",),
+    "TGA": ("TGA",),
+}
+"""Kinds of files that Pillow decodes, with Pillow's names of their formats. Pillow opens no file by another plugin."""
+_PILLOW_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr")
+"""Modes of 8 bits or fewer a channel. Pillow clips what has more."""
 _ORIENTATION = 0x0112
 _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
@@ -29,8 +38,6 @@ _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 _MIRRORED = (2, 4, 5, 7)
 _LONGEST_SIDE = 1 << 15
 """In pixels, exclusive: OpenCV's `remap` takes no more."""
-_GUARDED = ("JPEG", "MPO", "PNG", "BMP")
-"""Pillow's names of kinds that a few bytes can make much of."""
 _BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
@@ -57,22 +64,17 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
         raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
     if bounded_files.kind(path) != "file":
         raise InputError(f"{path}: {bounded_files.no_file(path)}")
-    try:
-        with _opened(path) as picture:
+    header = _header(path)
+    if header.kind in _PILLOW_KINDS:
+        with _opened(path, header) as picture:
             if picture.format == "PNG":
                 picture.load()  # EXIF may follow the pixels
             return picture.width, picture.height, _orientation(picture)
-    except InputError:
-        raise
-    except UnidentifiedImageError as error:
-        if path.suffix.lower() in _BY_OPENCV:
-            raise InputError(
-                f"{path}: cannot be read as a picture; save floating-point values as .exr, not as .tif"
-            ) from error
-        height, width = _by_mitsuba(path).values.shape[:2]  # OpenEXR, which Pillow does not know
-        return width, height, 1
-    except _BROKEN as error:
-        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
+    if header.kind == "TIFF":
+        width, height, _ = header.sizes[0]
+        return width, height, header.orientation
+    height, width = _by_mitsuba(path).values.shape[:2]
+    return width, height, 1
 
 
 def _orientation(picture: Image.Image) -> int:
@@ -163,62 +165,76 @@ def _turn(values: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """The pixels as stored; None for kinds that Mitsuba reads."""
-    ending = path.suffix.lower()
-    if ending in _BY_OPENCV or (ending == ".png" and _is_16_bit(path)):
-        return _decode_opencv(path)
-    return _decode_pillow(path) if ending in _BY_PILLOW else None
+    """Return the pixels as stored; None for kinds that Mitsuba reads."""
+    header = _header(path)
+    if header.kind == "TIFF" or _is_16_bit(header):
+        return _decode_opencv(path, header)
+    return _decode_pillow(path, header) if header.kind in _PILLOW_KINDS else None
+
+
+def _header(path: Path) -> image_size.Header:
+    """Return the header of a photograph or mask. Raises `InputError` where it is of no kind that is read, or too large."""
+    try:
+        header = image_size.read_photograph_header(path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    width, height, _ = header.sizes[0]
+    _check_size(path, width, height)
+    return header
+
+
+def _is_16_bit(header: image_size.Header) -> bool:
+    """Whether a PNG file has 16 bits a channel, which Pillow would cut to 8."""
+    return header.kind == "PNG" and header.bits == 16
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """The file as Pillow sees it, whose header says no more than is read here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sizes, where our own limit is as large, and of broken EXIF
-        with Image.open(path) as picture:
-            _check_size(path, picture.width, picture.height)
-            if picture.format in _GUARDED:
-                try:
-                    image_size.check(path)
-                except InputError as error:
-                    raise InputError(f"{path}: {error}") from error
-            yield picture
-
-
-def _is_16_bit(path: Path) -> bool:
-    """Whether a PNG file has 16 bits a channel, which Pillow would cut to 8."""
-    with bounded_files.open_regular(path) as file:
-        header = file.read(26)
-    return header[12:16] == b"IHDR" and header[24] == 16
-
-
-def _decode_pillow(path: Path) -> np.ndarray:
-    """(H, W, 3 or 4) uint8."""
+def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
+    """Open a file by Pillow, by the plugin of the kind that its header has and by no other. Errors of Pillow become `InputError`."""
     try:
-        with _opened(path) as picture:
-            transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
-            return np.array(picture.convert("RGBA" if transparent else "RGB"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of sizes, where our own limit is as large, and of broken EXIF
+            with (
+                bounded_files.open_regular(path) as file,
+                Image.open(file, formats=_PILLOW_KINDS[header.kind]) as picture,
+            ):
+                if (picture.width, picture.height) != header.sizes[0][:2]:
+                    raise InputError(f"{path}: cannot be read as a picture: its header declares two sizes")
+                yield picture
     except InputError:
         raise
     except _BROKEN as error:
         raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
 
 
-def _decode_opencv(path: Path) -> np.ndarray:
-    """(H, W, 3 or 4) uint8, uint16 or float32, RGB."""
+def _decode_pillow(path: Path, header: image_size.Header) -> np.ndarray:
+    """Return (H, W, 3 or 4) uint8."""
+    with _opened(path, header) as picture:
+        if picture.mode not in _PILLOW_MODES:
+            raise InputError(f"{path}: {picture.mode} pixels, expected 8 bits a channel; save it as .png, .tif or .exr")
+        transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+        return np.array(picture.convert("RGBA" if transparent else "RGB"))
+
+
+def _decode_opencv(path: Path, header: image_size.Header) -> np.ndarray:
+    """Return (H, W, 3 or 4) uint8 or uint16, RGB. The file must be TIFF or PNG: OpenCV chooses a decoder by the first bytes."""
     cv2 = opencv()
-    data = np.frombuffer(bounded_files.read_bytes(path, 4 * image_size.MOST_VALUES), np.uint8)
+    data = bounded_files.read_bytes(path, 4 * image_size.MOST_VALUES)
+    if header.kind == "TIFF":
+        data = tiff_header.without_orientation(data)
     flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        array = cv2.imdecode(data, flags) if data.size else None
-    except cv2.error as error:
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError) as error:
         raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
-    if array is None:
-        raise InputError(f"{path}: cannot be read as a picture")
-    if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise InputError(f"{path}: expected 8 or 16 bits or floating-point numbers a channel, got {array.dtype}")
+    if array is None or array.shape[:2] != (header.sizes[0][1], header.sizes[0][0]):
+        raise InputError(f"{path}: cannot be read as a picture: its pixels are not as its header declares")
+    if array.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: expected 8 or 16 bits a channel, got {array.dtype}")
     if array.ndim == 2 or array.shape[2] == 1:
         return np.repeat(array.reshape(*array.shape[:2], 1), 3, 2)
+    if array.shape[2] > 4:
+        raise InputError(f"{path}: {array.shape[2]} channels, expected at most 4")
     return array[..., [2, 1, 0, 3][: array.shape[2]]]
 
 

@@ -15,7 +15,9 @@ import typer
 from unrender.backend import cache, variant
 from unrender.core import phases
 from unrender.core.errors import InputError
+from unrender.core.random import LARGEST_SEED
 from unrender.core.suggestions import did_you_mean
+from unrender.io import confinement
 
 if TYPE_CHECKING:
     from unrender.cluster import Workers
@@ -23,12 +25,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEFAULT_STEPS",
+    "AllowOutside",
     "CheckpointEvery",
     "FinalSpp",
     "NoCache",
     "Overwrite",
     "ProblemName",
     "ProblemSettings",
+    "Seed",
     "Threads",
     "Variant",
     "WorkersOption",
@@ -77,6 +81,21 @@ FinalSpp = Annotated[
         min=1, help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows."
     ),
 ]
+
+
+Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers.")]
+
+
+AllowOutside = Annotated[
+    bool,
+    typer.Option(
+        "--allow-outside",
+        callback=confinement.allow,
+        help="Read files that a capture or a scene names outside of its own folder.",
+        show_default=False,
+    ),
+]
+"""The option has its effect when it is parsed: see `io.confinement`."""
 
 
 NoCache = Annotated[
@@ -216,8 +235,8 @@ def _is_file(name: str) -> bool:
 
 def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
     """Steps and seconds; `DEFAULT_STEPS` where neither is given. Raises `InputError` where one makes no sense."""
-    if steps is not None and steps < 1:
-        raise InputError(f"--steps {steps}: expected at least 1")
+    if steps is not None and not 1 <= steps < 1 << 63:
+        raise InputError(f"--steps {steps!s:.60}: expected at least 1 and less than 2**63")
     if seconds is not None and not 0 < seconds < math.inf:
         raise InputError(f"--seconds {seconds:g}: expected a number above 0")
     return (DEFAULT_STEPS if steps is None and seconds is None else steps), seconds

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant, WorkersOption
+from unrender.cli.arguments import AllowOutside, FinalSpp, NoCache, Overwrite, ProblemSettings, Variant, WorkersOption
 from unrender.cli.exit_status import FAILED
 from unrender.cli.run import exit_status
 from unrender.core import phases
 from unrender.core.errors import InputError
+from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
     from unrender.cli.tasks import Job, RunTask
@@ -38,15 +39,18 @@ _POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
+_Methods = Annotated[
+    str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
+]
+
+
 def compare(
     context: typer.Context,
     what: Annotated[
         list[str],
         typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run here, or run folders made earlier."),
     ],
-    methods: Annotated[
-        str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
-    ] = None,
+    methods: _Methods = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,6 +67,7 @@ def compare(
     final_spp: FinalSpp = None,
     overwrite: Overwrite = False,
     no_cache: NoCache = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Compare methods at equal time on one problem, or runs made earlier.
 
@@ -73,6 +78,7 @@ def compare(
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
+    check_seed("--seed", seed, seeds)
     where = arguments.workers(workers)
     if all(Path(name).is_dir() for name in what):
         run_options = methods or settings or problem_settings or workers or seconds is not None

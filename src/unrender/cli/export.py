@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import Variant
+from unrender.cli.arguments import AllowOutside, Variant
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
 
@@ -37,6 +37,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
     spp: Annotated[int, typer.Option(min=1, help="Samples per pixel that the scene asks for.")] = 256,
     variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write a run's result as a scene folder for Mitsuba or for other programs, and the recovered maps alone."""
     from rich.markup import escape

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import Overwrite, Variant
+from unrender.cli.arguments import AllowOutside, Overwrite, Variant
 from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ def import_(
     field: _Field = None,
     overwrite: Overwrite = False,
     variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write a problem from posed photographs: scene, undistorted references, masks, a first shape, problem.toml, held-out.toml."""
     from unrender.display.terminal import Console

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import Variant
+from unrender.cli.arguments import AllowOutside, Variant
 
 if TYPE_CHECKING:
     from unrender.judging.judge import Judgement
@@ -32,6 +32,7 @@ def judge(
     out: Annotated[Path | None, typer.Option(help="The folder. Default: judge in DIR.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier judgement.")] = False,
     variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Measure a run's result on photographs that it was not made from: PSNR, SSIM, LPIPS, a sheet, the light as a picture."""
     from unrender.display.terminal import Console

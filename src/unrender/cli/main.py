@@ -15,6 +15,7 @@ from importlib import metadata
 from unrender.backend import variant
 from unrender.cli.exit_status import ENVIRONMENT, INPUT, INTERRUPTED, WORDS
 from unrender.cli.signals import Signals
+from unrender.core.checks import encode_text
 from unrender.core.errors import UnrenderError, VariantError
 from unrender.core.text import one_line
 
@@ -53,6 +54,8 @@ def _execute(given: list[str]) -> int:
             from unrender.cli.doctor import doctor
 
             return doctor()
+        for argument in given:
+            encode_text(argument, "command line")
         variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
         from unrender.cli.app import app
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from unrender.cli import arguments, dealing, stages
-from unrender.cli.arguments import Threads, WorkersOption
+from unrender.cli.arguments import AllowOutside, Threads, WorkersOption
 from unrender.cli.dealing import Compress
 from unrender.cli.run import conclude
 from unrender.core import phases
@@ -32,6 +32,7 @@ def resume(
     threads: Threads = None,
     workers: WorkersOption = None,
     compress: Compress = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Go on with a run that was interrupted or killed, or give a finished one more.
 

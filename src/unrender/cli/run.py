@@ -10,12 +10,14 @@ import typer
 
 from unrender.cli import arguments, dealing, stages
 from unrender.cli.arguments import (
+    AllowOutside,
     CheckpointEvery,
     FinalSpp,
     NoCache,
     Overwrite,
     ProblemName,
     ProblemSettings,
+    Seed,
     Threads,
     Variant,
     WorkersOption,
@@ -34,19 +36,20 @@ if TYPE_CHECKING:
 __all__ = ["conclude", "exit_status", "run"]
 
 
+_MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")]
+
+
 def run(
     context: typer.Context,
     problem: ProblemName,
-    method_name: Annotated[
-        str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
-    ] = "auto",
+    method_name: _MethodName = "auto",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")] = None,
     seconds: Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 0,
+    seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")] = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
@@ -57,6 +60,7 @@ def run(
     no_cache: NoCache = False,
     workers: WorkersOption = None,
     compress: Compress = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from unrender.cli import arguments
 from unrender.core import phases
 from unrender.core.errors import InputError
+from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -110,6 +111,7 @@ def begin(
         stages = replace(stages, steps=budget[0], seconds=budget[1])
     steps, seconds = arguments.budget(stages.steps, stages.seconds)
     stages = replace(stages, steps=steps, seconds=seconds, seed=seed or stages.seed)
+    check_seed("seed", stages.seed, len(stages.stages))
     for stage in stages.stages:
         try:
             method(stage.method or stages.method).start(stages.settings_of(stage))

@@ -9,9 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Threads, Variant, WorkersOption
+from unrender.cli.arguments import (
+    AllowOutside,
+    FinalSpp,
+    NoCache,
+    Overwrite,
+    ProblemSettings,
+    Threads,
+    Variant,
+    WorkersOption,
+)
 from unrender.core import phases
 from unrender.core.errors import InputError
+from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
     from unrender.methods import Method
@@ -23,7 +33,7 @@ __all__ = ["MARK", "plan_of", "search_of", "sweep"]
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
-_FREE = ("what", "workers", "trials", "threads")
+_FREE = ("allow_outside", "what", "workers", "trials", "threads")
 """What may be given anew for a sweep that goes on."""
 
 _What = Annotated[
@@ -82,6 +92,7 @@ def sweep(
     overwrite: Overwrite = False,
     threads: Threads = None,
     no_cache: NoCache = False,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Search a method's options for those of the least error, on one problem.
 
@@ -132,6 +143,7 @@ def plan_of(names: dict[str, Any]) -> SweepPlan:
     axes, method = _axes(names["method"], names["over"], names["settings"])
     search = _kind(names["search"], axes)
     changes = {"steps": steps, "seconds": seconds, "method": method.name, "search": search}
+    check_seed("--seed", names["seed"], names["seeds"])
     return schema.validate(
         SweepPlan, {**names, **changes, "problem": arguments.absolute(names["problem"])}, "unrender sweep"
     )

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import Variant
+from unrender.cli.arguments import AllowOutside, Variant
 from unrender.core.errors import InputError
 
 __all__ = ["turntable"]
@@ -33,6 +33,7 @@ def turntable(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Write a video of a run's result that turns once before a camera and a light."""
     from unrender.display.terminal import Console

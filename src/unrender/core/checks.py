@@ -1,4 +1,4 @@
-"""Checks of numbers that a user gives; each failure is one line that names the field and what it should be."""
+"""Checks of numbers and text that a user gives; each failure is one line that names the field and what it should be."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from numbers import Integral, Real
 from typing import Any
 
 from unrender.core.errors import InputError
+from unrender.core.text import printable
 
-__all__ = ["integer", "number"]
+__all__ = ["encode_text", "integer", "number"]
 
 
 def number(
@@ -31,3 +32,15 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return int(value)
     raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")
+
+
+def encode_text(text: str, where: str) -> bytes:
+    """Return the text as UTF-8.
+
+    Raises `InputError` for text that is no Unicode: the name of a file whose bytes are not UTF-8, as Python reads it.
+    """
+    try:
+        return text.encode()
+    except UnicodeEncodeError as error:
+        part = printable(text[max(error.start - 20, 0) : error.start + 20])
+        raise InputError(f"{where}: a name that is not UTF-8 ({part}); rename the file or folder") from error

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Integral
+from typing import Any
 
-__all__ = ["Key"]
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+
+__all__ = ["LARGEST_SEED", "LEAST_SEED", "Key", "check_seed"]
 
 _MASK = 0xFFFFFFFFFFFFFFFF
 
@@ -17,12 +22,25 @@ def _mix(x: int) -> int:
     return x ^ (x >> 31)
 
 
+LEAST_SEED, LARGEST_SEED = -(1 << 63), (1 << 63) - 1
+"""Range of a run's seed: what files of every kind hold."""
+
+
+def check_seed(owner: str, seed: Any, runs: int = 1) -> int:
+    """Return `seed` as an integer in range, so that the seeds of that many runs, each one larger, are too. Raises `InputError`."""
+    whole = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if whole and LEAST_SEED <= (value := int(seed)) <= LARGEST_SEED - (runs - 1):
+        return value
+    got = f"an integer of {int(seed).bit_length()} bits" if whole else printable(seed)
+    raise InputError(f"{owner}: expected a whole number from -2**63 to 2**63 - {max(runs, 1)}, got {got}")
+
+
 @dataclass(frozen=True)
 class Key:
     """Names one draw of a run.
 
     Args:
-        seed: the run's seed, any integer.
+        seed: the run's seed, any integer; that of a run is in range of `check_seed`.
         step: the step of the run, from 0.
         stream: which of the step's independent streams of draws; `fold` derives further ones.
     """

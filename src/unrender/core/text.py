@@ -9,7 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["LONGEST_LINE", "grouped", "listed", "one_line", "printable", "reason_of", "shorten", "visible"]
+__all__ = [
+    "LONGEST_LINE",
+    "grouped",
+    "listed",
+    "one_line",
+    "plain",
+    "printable",
+    "reason_of",
+    "shorten",
+    "visible",
+]
 
 LONGEST_LINE = 1000
 """Characters of the longest message."""
@@ -55,6 +65,11 @@ def one_line(text: str) -> str:
 def reason_of(error: BaseException, longest: int | None = None) -> str:
     """What an error says, on one line of at most so many characters; its kind where it says nothing."""
     return " ".join(str(error).split())[:longest] or type(error).__name__
+
+
+def plain(text: str) -> str:
+    """Return the text with what is no Unicode escaped: such text can be written to a file and read again."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def printable(value: Any) -> str:

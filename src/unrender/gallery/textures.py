@@ -47,7 +47,7 @@ def _read(name: Photograph) -> np.ndarray:
             "gallery: scikit-image is not installed, whose photographs are needed: pip install scikit-image"
         )
     path = Path(found.submodule_search_locations[0]) / "data" / f"{name}.{'jpg' if name == 'rocket' else 'png'}"
-    with Image.open(path) as image:
+    with Image.open(path, formats=["PNG", "JPEG"]) as image:
         return np.asarray(image)
 
 

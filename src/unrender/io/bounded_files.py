@@ -23,7 +23,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.core.text import printable, visible
+from unrender.core.text import printable, shorten, visible
 from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
@@ -97,7 +97,7 @@ def kind(path: Path) -> str:
     except (FileNotFoundError, NotADirectoryError, ValueError):  # the last for a name with a zero byte
         return ""
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise InputError(f"{shorten(str(path), 300)}: cannot be read: {error.strerror or error}") from error
     return "file" if stat.S_ISREG(mode) else "folder" if stat.S_ISDIR(mode) else "other"
 
 
@@ -374,7 +374,7 @@ def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:
     seen: set[str] = set()
     for member in members:
         name, key = member.filename, member.filename.removesuffix(".npy")
-        if name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name:
+        if files.member_leads_out(name):
             raise InputError(f"{path}: {printable(name)}: a name that leads out of the archive")
         if key in seen:
             raise InputError(f"{path}: {printable(key)}: given twice")

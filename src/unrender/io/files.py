@@ -16,19 +16,24 @@ import os
 import re
 import shutil
 import sys
+import zipfile
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
+from unrender.core.text import printable
 
 __all__ = [
     "COMPRESSED_BYTES",
+    "check_member",
     "check_replaceable",
     "flush",
     "make_folder",
+    "member_leads_out",
     "remove",
     "remove_leftovers",
     "replace_folder",
@@ -93,6 +98,18 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
     return path
 
 
+def check_member(name: str, where: str) -> None:
+    """Raise `InputError` for the name of an array that no archive can hold, or that readers refuse: one that leads out of it."""
+    if member_leads_out(name):
+        raise InputError(f"{where} {printable(name)}: a name that leads out of an archive; rename the object")
+    encode_text(name, f"{where} {printable(name)}")
+
+
+def member_leads_out(name: str) -> bool:
+    """Whether the name of an array in an archive could be that of a file elsewhere."""
+    return name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name
+
+
 def write_arrays(
     path: Path, arrays: Mapping[str, np.ndarray], compress: bool = True, durable: bool = True, name_too: bool = True
 ) -> Path:
@@ -103,8 +120,11 @@ def write_arrays(
     buffer = io.BytesIO()
     values = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
     small = sum(value.nbytes for value in values.values()) < COMPRESSED_BYTES - _HEADERS
-    save = np.savez_compressed if compress and small else np.savez
-    save(buffer, allow_pickle=False, **values)
+    # Not by `numpy.savez`, which takes the name "file" for an argument of its own.
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED if compress and small else zipfile.ZIP_STORED) as archive:
+        for key, value in values.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, value, allow_pickle=False)
     return write(path, buffer.getvalue(), durable, name_too)
 
 

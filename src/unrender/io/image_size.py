@@ -1,7 +1,7 @@
-"""How large a picture file says it is, from its header alone: before a decoder takes memory for it.
+"""Kind and size of a picture file, read from its header before a decoder runs.
 
 A file of some hundred bytes can declare a hundred thousand pixels a side. Mitsuba tells the kinds of files apart by their first bytes,
-whatever their names end in, and so does this module.
+whatever their names end in, and so does this module. Each decoder has an allow-list of kinds: a file of another kind never reaches it.
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from PIL import Image, UnidentifiedImageError
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files
+from unrender.io import bounded_files, tiff_header
 
-__all__ = ["LONGEST_SIDE", "MOST_VALUES", "Sizes", "check"]
+__all__ = ["LONGEST_SIDE", "MOST_VALUES", "Header", "Sizes", "check", "read_photograph_header"]
 
 MOST_VALUES = 1 << 28
 """Pixels times channels of the largest picture that is decoded: one gigabyte in single precision."""
@@ -30,35 +31,73 @@ _HEADER = 1 << 20
 _EXR_PARTS = 0x1000
 _MOST_ATTRIBUTES = 4096
 _MOST_SCANS = 100
+_MOST_SCANNED = 1 << 30
+"""Pixels times scans of a JPEG file: each scan goes over the whole picture, and may take a few bytes."""
+_WEBP_ANIMATION = 0x02
 _FARTHEST = 1 << 30
 
 
-def check(path: Path) -> int:
-    """How many values a picture holds, pixels times channels, all parts of a file together.
+@dataclass(frozen=True)
+class Header:
+    """Header of a picture file.
 
-    Raises `InputError`, which does not name the file, where it is no picture, declares more than `MOST_VALUES` or more than so few bytes
-    hold, or where its header cannot be read.
+    Attributes:
+        kind: "PNG", "TIFF" and so on.
+        sizes: width, height and channels of each part.
+        bits: bits per channel of a PNG or TIFF file; 0 for other kinds.
+        orientation: orientation tag of a TIFF file; 1 for other kinds.
     """
+
+    kind: str
+    sizes: Sizes
+    bits: int = 0
+    orientation: int = 1
+
+    @property
+    def values(self) -> int:
+        """Pixels times channels of all parts."""
+        return sum(width * height * max(channels, 1) for width, height, channels in self.sizes)
+
+
+def check(path: Path) -> int:
+    """Return how many values a picture that Mitsuba decodes holds: pixels times channels of all parts.
+
+    Raises `InputError`, which does not name the file. It is raised for a file of an unknown kind and for a malformed header. It is also
+    raised where the file declares more than `MOST_VALUES` values, or more than its bytes can hold.
+    """
+    return _read_header(path, _MITSUBA).values
+
+
+def read_photograph_header(path: Path) -> Header:
+    """Return the header of a photograph: the kinds that Mitsuba decodes, and TIFF, WebP and PNM. Raises `InputError` as `check` does."""
+    return _read_header(path, _PHOTOGRAPHS)
+
+
+def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
     try:
         with bounded_files.open_regular(path) as file:
             data = file.read(_HEADER)
             size = file.seek(0, 2)
+            kind, reader = _reader(data, file, path, readers)
             file.seek(0)
-            sizes = _reader(data, file)(data, file)
+            found = reader(data, file)
     except InputError as error:
         raise InputError(str(error).removeprefix(f"{path}: ")) from error
     except Image.DecompressionBombError as error:
         raise InputError(f"cannot be read as a picture: {error}") from error
     except (struct.error, ValueError, IndexError, OSError, UnidentifiedImageError, SyntaxError) as error:
         raise InputError(f"cannot be read as a picture: its header is malformed ({type(error).__name__})") from error
-    for width, height, channels in sizes:
+    header = (
+        Header(kind, found) if isinstance(found, list) else Header(kind, [found.size], found.bits, found.orientation)
+    )
+    for width, height, channels in header.sizes:
         values, what = width * height * max(channels, 1), f"{width}x{height} pixels of {channels} channels"
         if width < 1 or height < 1 or values > MOST_VALUES or max(width, height) > LONGEST_SIDE:
             limits = f"at most {MOST_VALUES} values in all and {LONGEST_SIDE} pixels a side"
             raise InputError(f"declares {what}, expected at least one and {limits}")
         if values > _plausible(size):
             raise InputError(f"declares {what} in {size} bytes; if that is right, save it without compression")
-    return sum(width * height * max(channels, 1) for width, height, channels in sizes)
+    return header
 
 
 def _plausible(size: int) -> int:
@@ -71,19 +110,29 @@ def _plausible(size: int) -> int:
 
 
 Sizes = list[tuple[int, int, int]]
-_Reader = Callable[[bytes, IO[bytes]], Sizes]
+_Reader = Callable[[bytes, IO[bytes]], Sizes | tiff_header.TiffHeader]
+_Kind = tuple[bytes, str, _Reader]
 
 
-def _reader(data: bytes, file: IO[bytes]) -> _Reader:
-    """By the first bytes (a TGA file's last ones), in Mitsuba's order."""
-    for magic, reader in _READERS:
-        if data.startswith(magic):
-            return reader
-    if file.seek(0, 2) >= 18:
-        file.seek(-18, 2)
-        if file.read() == b"TRUEVISION-XFILE.\0":
-            return _tga
-    raise ValueError("no picture that Mitsuba knows")
+def _reader(data: bytes, file: IO[bytes], path: Path, readers: Sequence[_Kind]) -> tuple[str, _Reader]:
+    """Return kind and reader by the first bytes (a TGA file's last ones), in Mitsuba's order."""
+    for magic, kind, reader in readers:
+        if magic and data.startswith(magic):
+            return kind, reader
+    for magic, kind, reader in readers:
+        if not magic and (_has_tga_footer(file) or (readers is _PHOTOGRAPHS and path.suffix.lower() == ".tga")):
+            return kind, reader
+    kinds = ", ".join(dict.fromkeys(kind for _, kind, _ in readers))
+    raise InputError(
+        f"cannot be read as a picture: its header is malformed or of another kind; expected one of {kinds}"
+    )
+
+
+def _has_tga_footer(file: IO[bytes]) -> bool:
+    if file.seek(0, 2) < 18:
+        return False
+    file.seek(-18, 2)
+    return file.read() == b"TRUEVISION-XFILE.\0"
 
 
 def _exr(data: bytes, _: IO[bytes]) -> Sizes:
@@ -138,13 +187,38 @@ def _word(data: bytes, at: int) -> tuple[bytes, int]:
     return data[at:end], end + 1
 
 
-def _hdr(data: bytes, _: IO[bytes]) -> Sizes:
+def _hdr(data: bytes, file: IO[bytes]) -> Sizes:
     """From the first line with a resolution, in the one form that Mitsuba reads."""
-    line = re.search(rb"^.*(?:-Y|\+X).*$", data.replace(b"\r", b""), re.MULTILINE)
-    match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0])
-    if not match:
+    line = re.search(rb"^[^\n]*(?:-Y|\+X)[^\n]*$", data, re.MULTILINE)
+    match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0].replace(b"\r", b""))
+    if not line or not match:
         raise ValueError("no resolution")
-    return [(int(match[2]), int(match[1]), 3)]
+    width, height = int(match[2]), int(match[1])
+    if 0 < 3 * width * height <= MOST_VALUES:
+        file.seek(line.end() + 1)
+        _check_scanlines(file.read(), width, height)
+    return [(width, height, 3)]
+
+
+def _check_scanlines(data: bytes, width: int, height: int) -> None:
+    """Raise unless the encoded rows of an HDR file end where the picture does: Mitsuba would write on behind it."""
+    if not (8 <= width < 1 << 15 and data[:2] == b"\2\2" and len(data) > 2 and data[2] < 0x80):
+        return  # without runs: read as it is
+    marker, at = b"\2\2" + width.to_bytes(2, "big"), 0
+    for _ in range(height):
+        if data[at : at + 4] != marker:
+            raise ValueError("a row without runs among those with runs")
+        at += 4
+        for _ in range(4):
+            left = width
+            while left > 0:
+                count = data[at]
+                run = count > 128
+                count -= 128 if run else 0
+                at += 2 if run else 1 + count
+                if not 0 < count <= left or at > len(data):
+                    raise ValueError("runs that do not fill a row")
+                left -= count
 
 
 def _pfm(data: bytes, _: IO[bytes]) -> Sizes:
@@ -161,12 +235,46 @@ def _ppm(data: bytes, _: IO[bytes]) -> Sizes:
     return [(int(match[1]), int(match[2]), 3)]
 
 
+def _pnm(data: bytes, _: IO[bytes]) -> Sizes:
+    """Read the header that Pillow accepts: P1 to P6, with comments between the numbers."""
+    match = re.match(rb"P([1-6])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data)
+    if match is None:
+        raise ValueError("no resolution")
+    return [(int(match[2]), int(match[3]), 3 if match[1] in b"36" else 1)]
+
+
+def _webp(data: bytes, _: IO[bytes]) -> Sizes:
+    """Read the canvas of a still image; Pillow allocates it before it tells the size."""
+    if data[8:12] != b"WEBP":
+        raise ValueError("no WebP")
+    chunk = data[12:16]
+    if chunk == b"VP8X":
+        if data[20] & _WEBP_ANIMATION:
+            raise InputError("an animation, expected a still image")
+        sides = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+    elif chunk == b"VP8L" and data[20] == 0x2F:
+        bits = int.from_bytes(data[21:25], "little")
+        sides = ((bits >> shift & 0x3FFF) + 1 for shift in (0, 14))
+    elif chunk == b"VP8 " and data[23:26] == b"\x9d\x01\x2a":
+        sides = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
+    else:
+        raise ValueError("no frame")
+    width, height = sides
+    return [(width, height, 4)]
+
+
 def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
     width, height, *_rest, bits = struct.unpack_from("<iiHH", data, 18)
     return [(width, abs(height), max(bits // 8, 1))]
 
 
-def _tga(data: bytes, file: IO[bytes]) -> Sizes:
+def _tga(data: bytes, _: IO[bytes]) -> Sizes:
+    """Read the header that Pillow accepts."""
+    width, height, bits = struct.unpack_from("<HHB", data, 12)
+    return [(width, height, max(bits // 8, 3))]
+
+
+def _mitsubas_tga(data: bytes, file: IO[bytes]) -> Sizes:
     skipped, _, kind = struct.unpack_from("<3B", data)
     width, height, bits = struct.unpack_from("<hhB", data, 12)  # with a sign, as Mitsuba reads them
     depth = max(bits // 8, 1)
@@ -187,18 +295,18 @@ def _check_runs(packets: bytes, pixels: int, depth: int) -> None:
         raise ValueError("runs that do not fill the picture")
 
 
-def _png(data: bytes, _: IO[bytes]) -> Sizes:
+def _png(data: bytes, _: IO[bytes]) -> tiff_header.TiffHeader:
     """Indexed colours count as four channels, which they become."""
     if data[12:16] != b"IHDR":
         raise ValueError("no IHDR")
-    width, height, *_rest, kind = struct.unpack_from(">IIBB", data, 16)
-    return [(width, height, {0: 1, 2: 3, 4: 2}.get(kind, 4))]
+    width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
+    return tiff_header.TiffHeader((width, height, {0: 1, 2: 3, 4: 2}.get(kind, 4)), bits)
 
 
 def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
     file.seek(0)
-    # Each scan of a progressive file goes over the whole picture, and may take a few bytes.
-    if sum(block.count(b"\xff\xda") for block in iter(lambda: file.read(_HEADER), b"")) > _MOST_SCANS:
+    scans = sum(block.count(b"\xff\xda") for block in iter(lambda: file.read(_HEADER), b""))
+    if scans > _MOST_SCANS:
         raise InputError(f"cannot be read as a picture: more than {_MOST_SCANS} scans")
     file.seek(0)
     with warnings.catch_warnings():
@@ -206,18 +314,33 @@ def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             with Image.open(file, formats=["JPEG"]) as image:
-                return [(*image.size, len(image.getbands()))]
+                size = image.size
+                channels = len(image.getbands())
         finally:
             Image.MAX_IMAGE_PIXELS = limit
+    if scans * size[0] * size[1] > _MOST_SCANNED:
+        raise InputError(f"cannot be read as a picture: {scans} scans of {size[0]}x{size[1]} pixels")
+    return [(*size, channels)]
 
 
-_READERS: list[tuple[bytes, _Reader]] = [
-    (b"BM", _bmp),
-    (b"#?", _hdr),
-    (b"PF", _pfm),
-    (b"Pf", _pfm),
-    (b"P6", _ppm),
-    (b"\xff\xd8", _jpeg),
-    (b"\x89PNG\r\n\x1a\n", _png),
-    (b"\x76\x2f\x31\x01", _exr),
-]
+_MITSUBA: tuple[_Kind, ...] = (
+    (b"BM", "BMP", _bmp),
+    (b"#?", "HDR", _hdr),
+    (b"PF", "PFM", _pfm),
+    (b"Pf", "PFM", _pfm),
+    (b"P6", "PPM", _ppm),
+    (b"\xff\xd8", "JPEG", _jpeg),
+    (b"\x89PNG\r\n\x1a\n", "PNG", _png),
+    (b"\x76\x2f\x31\x01", "EXR", _exr),
+    (b"", "TGA", _mitsubas_tga),
+)
+"""Kinds that Mitsuba's `Bitmap` may decode."""
+
+_PHOTOGRAPHS: tuple[_Kind, ...] = (
+    *(each for each in _MITSUBA if each[1] not in ("PPM", "TGA")),
+    *((magic, "TIFF", tiff_header.read) for magic in tiff_header.MAGICS),
+    (b"RIFF", "WEBP", _webp),
+    *((b"P%d" % number, "PPM", _pnm) for number in range(1, 7)),
+    (b"", "TGA", _tga),
+)
+"""Kinds that photographs and masks may have."""

@@ -7,9 +7,10 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 
-__all__ = ["LARGEST", "Place", "array_table", "check", "dotted", "find", "parse"]
+__all__ = ["LARGEST", "Place", "array_table", "check", "dotted", "encode", "find", "parse"]
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -57,6 +58,13 @@ def parse(text: str, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: not valid TOML: nested too deeply") from error
     except ValueError as error:  # of numbers without end
         raise InputError(f"{where}: not valid TOML: {str(error)[:200]}") from error
+
+
+def encode(text: str, where: str) -> bytes:
+    """Return the bytes of a TOML file that `parse` takes. Raises `InputError` for text that it would refuse or that is no Unicode."""
+    data = encode_text(text, where)
+    parse(text, where)
+    return data
 
 
 def array_table(heading: str, fields: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import tomli_w
 
 from unrender.core import tables
-from unrender.io import files
+from unrender.io import files, toml_lines
 from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 
@@ -39,7 +39,7 @@ def save(problem: Problem, folder: Path) -> None:
         note = "A description of a problem made in Python; resume(..., problem=) needs the problem itself"
     if (folder / ARRAYS).is_dir():
         files.sync_folder(folder / ARRAYS)
-    files.write(folder / FILE, f"# {note}\n{tomli_w.dumps(document)}".encode())
+    files.write(folder / FILE, toml_lines.encode(f"# {note}\n{tomli_w.dumps(document)}", str(folder / FILE)))
 
 
 def origin(problem: Problem) -> dict[str, Any]:

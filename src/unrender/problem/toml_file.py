@@ -33,7 +33,7 @@ from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.io import toml_models
+from unrender.io import confinement, toml_models
 from unrender.io.toml_models import Table
 from unrender.problem import coarse_to_fine
 from unrender.problem.errors import FieldError
@@ -106,7 +106,8 @@ def read(path: str | Path) -> Problem:
     file = Path(path)
     model, text = toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
     try:
-        problem = _build(model, file)
+        with confinement.within(file.parent):
+            problem = _build(model, file)
         problem.origin["file"] = str(file.resolve())
         return problem
     except FieldError as error:

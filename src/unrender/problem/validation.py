@@ -15,7 +15,7 @@ from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
-from unrender.io import bounded_files, parameter_values, scene_files
+from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
 from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
@@ -318,7 +318,7 @@ def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Rende
 
     try:
         if isinstance(scene, (str, Path)) and bounded_files.kind(Path(scene)) == "file":
-            scene_files.of(Path(scene))  # refuses what Mitsuba would include from elsewhere
+            _check_files(Path(scene))
     except InputError as error:
         raise FieldError(("scene",), str(error).removeprefix("scene ")) from error
     ensure()
@@ -328,6 +328,12 @@ def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Rende
         return MitsubaRenderer(scene, max_depth, keys)
     except InputError as error:
         raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
+
+
+def _check_files(scene: Path) -> None:
+    """Raise `InputError` where an XML scene includes or names files outside of its folder."""
+    for path in dict.fromkeys(scene_files.read(scene).named):
+        confinement.check(path, [scene.absolute().parent], f"scene {scene.name}: it names")
 
 
 def renderer_notices(renderer: Renderer) -> Sequence[str]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 __all__ = ["Budget", "check_budget"]
 
 _MOST_SKIPPED = 20
+_MOST_STEPS = 1 << 63
+"""Exclusive: what the files of a run folder hold."""
 
 
 class Budget(Hook):
@@ -46,6 +48,8 @@ def check_budget(steps: int | None, seconds: float | None) -> None:
     """Raise `InputError` unless a run can have this budget."""
     if steps is None and seconds is None:
         raise InputError("optimize: give a budget, steps= or seconds=")
+    if isinstance(steps, int) and steps >= _MOST_STEPS:
+        raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
     if steps is not None and (not isinstance(steps, int) or steps < 1):
         raise InputError(f"optimize: steps must be a whole number of at least 1, got {steps!r}")
     if seconds is not None and not (0 < float(seconds) < float("inf")):

@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
-from unrender.core.random import Key
+from unrender.core.random import Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
@@ -75,7 +75,8 @@ class Descent:
 
 
 def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> tuple[Run, RunState]:
-    """Return a run before its first step."""
+    """Return a run before its first step. Raises `InputError` for a seed that no file could hold."""
+    seed = check_seed("seed", seed)
     problem, estimator, optimizer = plan.configured(), plan.estimator, plan.optimizer
     problem.executor.check(estimator)
     if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it

@@ -96,4 +96,4 @@ def problem_of(directory: str | Path) -> Problem:
             "unrender.export((problem, result.parameters), out)"
         )
     file = origin.get("file")
-    return Problem.from_file(file if isinstance(file, str) and Path(file).is_file() else path)
+    return Problem.from_file(file if isinstance(file, str) and bounded_files.kind(Path(file)) == "file" else path)

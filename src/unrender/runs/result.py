@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ import numpy as np
 
 from unrender.backend.variant import LLVM, cores, current, llvm_version
 from unrender.core.errors import InputError
+from unrender.core.text import plain
 from unrender.io import files
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines, steps_in
@@ -130,6 +130,9 @@ class Result:
         own), comes last. Raises `InputError` where the folder cannot be written.
         """
         folder = Path(directory)
+        record = self.encoded_record(status or self.status, "", folder / schema.RECORD)
+        for key in self.parameters:
+            files.check_member(key, f"run folder {folder}: parameter")
         try:
             files.make_folder(folder)
             archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
@@ -139,11 +142,14 @@ class Result:
                     files.write_arrays(folder / name, values, name_too=False)
             files.write(folder / schema.HISTORY, lines(self.history), name_too=False)
             files.sync_folder(folder)
-            record = json.dumps(self.record(status or self.status), indent=2) + "\n"
-            files.write(folder / schema.RECORD, record.encode())
+            files.write(folder / schema.RECORD, record)
         except OSError as error:
             raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
         return folder
+
+    def encoded_record(self, status: str, error: str, path: Path) -> bytes:
+        """Return the bytes of run.json. Raises `InputError`, which names `path`, where the reader would refuse them."""
+        return schema.encode(schema.RunRecord, self.record(status, error), str(path))
 
     def record(self, status: str, error: str = "") -> dict[str, Any]:
         """run.json, see `schema.RunRecord`.
@@ -160,18 +166,18 @@ class Result:
             "method": self.method,
             "settings": dict(self.settings),
             "choices": list(self.choices),
-            "adapted": list(self.adapted),
+            "adapted": [plain(line) for line in self.adapted],
             "seed": self.seed,
             "command": self.command,
             "versions": versions(),
             "hardware": hardware(),
             "variant": current() or "",
-            "stopped": self.stopped,
+            "stopped": plain(self.stopped),
             "steps": self.steps,
             "seconds": self.seconds,
             "warmup_seconds": self.warmup_seconds,
             "skipped": self.skipped,
-            "warnings": list(self.warnings),
+            "warnings": [plain(line) for line in self.warnings],
             "problem": dict(self.problem),
             "resumed": list(self.resumed),
             "image_errors": {
@@ -180,7 +186,7 @@ class Result:
             "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:
-            fields["error"] = error
+            fields["error"] = plain(error)
         return schema.serialize(schema.RunRecord.model_construct(None, **fields))
 
 

@@ -224,7 +224,7 @@ def write(stages: Stages, folder: Path) -> None:
     """The file of a run in stages, with the problem's path in full. Raises `OSError`."""
     whole = replace(stages, problem=stages.problem.resolve())
     note = "Stages under way: `unrender resume` goes on with those that are left"
-    files.write(folder / FILE, text(whole, note).encode())
+    files.write(folder / FILE, toml_lines.encode(text(whole, note), str(folder / FILE)))
 
 
 def split(stages: Stages) -> list[tuple[int | None, float | None]]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StrictBool, StrictInt, StrictStr
 
@@ -161,8 +160,8 @@ def read_sweep(folder: Path) -> SweepRecord:
 
 def write_sweep(folder: Path, record: SweepRecord) -> None:
     """Write sweep.json beside its place, and rename it. Raises `InputError` where that cannot be."""
-    given: dict[str, Any] = record.model_dump()
+    data = schema.encode(SweepRecord, record.model_dump(), str(folder / SWEEP))
     try:
-        files.write(folder / SWEEP, (json.dumps(given, indent=1) + "\n").encode())
+        files.write(folder / SWEEP, data)
     except OSError as error:
         raise InputError(f"sweep {folder}: cannot be written: {error.strerror or error}") from error

@@ -12,7 +12,7 @@ from unrender.capture.capture import Capture
 from unrender.capture.formats import colmap, lights, llff, transforms
 from unrender.core.errors import InputError
 from unrender.core.text import printable
-from unrender.io import bounded_files
+from unrender.io import bounded_files, confinement
 
 __all__ = ["FORMATS", "LIGHTS", "is_lit", "read"]
 
@@ -67,6 +67,7 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
             capture = each.read(folder, masks)
             if not capture.photographs:
                 raise InputError(f"{folder}: none of its photographs is there")
+            _check_places(capture, masks)
             _check_photographs(capture)
             _check_masks(capture)
             return capture
@@ -75,6 +76,15 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
     raise InputError(
         f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}"
     )
+
+
+def _check_places(capture: Capture, masks: Path | None) -> None:
+    """Raise `InputError` where a photograph or a mask lies outside of the capture's folder; masks may lie in `masks`, too."""
+    for photograph in capture.photographs:
+        confinement.check(photograph.file, [capture.folder], f"{capture.folder}: it names the photograph")
+        if photograph.mask is not None:
+            places = [capture.folder] if masks is None else [capture.folder, masks]
+            confinement.check(photograph.mask, places, f"{capture.folder}: it names the mask")
 
 
 def _check_photographs(capture: Capture) -> None:

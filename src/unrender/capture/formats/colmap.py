@@ -81,14 +81,16 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
     text = ending == ".txt"
     lenses = dict(_text_cameras(cameras_file) if text else _binary_cameras(cameras_file))
     images = sorted(_text_images(images_file) if text else _binary_images(images_file), key=lambda image: image.name)
-    root = next((folder / name for name in _PHOTOGRAPHS if images and (folder / name / images[0].name).is_file()), None)
+    root = next(
+        (folder / name for name in _PHOTOGRAPHS if images and files.is_file(folder / name / images[0].name)), None
+    )
     if root is None:
-        here = next((folder / n for n in _PHOTOGRAPHS if any((folder / n / i.name).is_file() for i in images)), None)
+        here = next((folder / n for n in _PHOTOGRAPHS if any(files.is_file(folder / n / i.name) for i in images)), None)
         root = here or folder / "images"
     photographs, missing = [], []
     for image in images:
         file = root / image.name
-        if not file.is_file():
+        if not files.is_file(file):
             missing.append(image.name)
             continue
         if image.camera not in lenses:

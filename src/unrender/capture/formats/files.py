@@ -6,15 +6,23 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from unrender.core.errors import InputError
-from unrender.core.text import printable
+from unrender.core.text import printable, shorten
 
-__all__ = ["PICTURES", "find_mask", "find_picture", "left_out", "pictures", "without_pose"]
+__all__ = ["PICTURES", "find_mask", "find_picture", "is_file", "left_out", "pictures", "without_pose"]
 
 PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".tga", ".bmp", ".hdr", ".ppm", ".pfm")
 """Endings of photographs."""
 _WITHOUT_ENDING = (*PICTURES, ".PNG", ".JPG", ".JPEG", "_rgb.exr", "_rgba.png")
 """Tried in turn where a format names a photograph without its ending."""
 _MASK_FOLDERS = ("masks", "mask")
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that no file can have is that of none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -28,7 +36,7 @@ def find_picture(folder: Path, name: str) -> Path | None:
     """The file of a photograph that a format calls `name`, relative to `folder`; None where there is none."""
     name = name.replace("\\", "/")
     for candidate in (folder / name, *(folder / f"{name}{ending}" for ending in _WITHOUT_ENDING)):
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
     return None
 
@@ -47,12 +55,14 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
         return None if found == photograph else found
     if named is not None:
         path = folder / named
-        if not path.is_file():
-            raise InputError(f"{path}: no such file, and {printable(photograph.name)} names it as its mask")
+        if not is_file(path):
+            raise InputError(
+                f"{shorten(str(path), 300)}: no such file, and {printable(photograph.name)} names it as its mask"
+            )
         return path
     stem = photograph.stem.removesuffix("_rgb").removesuffix("_rgba")
     for ending in PICTURES:
-        if (beside := photograph.with_name(f"{stem}_mask{ending}")).is_file():
+        if is_file(beside := photograph.with_name(f"{stem}_mask{ending}")):
             return beside
     own = photograph.parent.with_name(f"{photograph.parent.name}_mask") if photograph.parent.name else folder / "mask"
     places = [own, *(place / name for place in (folder, photograph.parent.parent) for name in _MASK_FOLDERS)]
@@ -71,7 +81,7 @@ def _of_name(folder: Path, relative: Iterable[Path]) -> Path | None:
         place = folder / path.parent
         if place.is_dir():
             names = (path.name, *(f"{path.stem}{e}" for e in PICTURES), *(f"{path.name}{e}" for e in PICTURES))
-            if (found := next((place / name for name in names if (place / name).is_file()), None)) is not None:
+            if (found := next((place / name for name in names if is_file(place / name)), None)) is not None:
                 return found
     return None
 

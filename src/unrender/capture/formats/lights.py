@@ -16,7 +16,7 @@ import numpy as np
 from unrender.capture.formats import files
 from unrender.core.errors import InputError
 from unrender.core.text import printable
-from unrender.io import bounded_files
+from unrender.io import bounded_files, confinement
 
 __all__ = ["FILE", "LitCapture", "read", "recognise"]
 
@@ -62,6 +62,10 @@ def read(folder: Path, mask: Path | None = None) -> LitCapture:
     if len(masks) > 1 or (mask is not None and not masks):
         place = folder if mask is None else mask
         raise InputError(f"{place}: expected one mask, got {len(masks)}, the camera stands still")
+    for path in photographs:
+        confinement.check(path, [folder], f"{folder}: it has the photograph")
+    for path in masks:
+        confinement.check(path, [folder if mask is None else mask], f"{folder}: it has the mask")
     return LitCapture(folder, photographs, directions, masks[0] if masks else None)
 
 

@@ -7,13 +7,14 @@ from typing import Annotated, Any
 
 import drjit as dr
 import pydantic
+import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, toml_lines
 from unrender.runs.run import Run
 
-__all__ = ["Method", "read", "serialize"]
+__all__ = ["Method", "encode", "read", "serialize"]
 
 _LONGEST = 1 << 20
 _Positive = Annotated[StrictInt, Field(ge=1)]
@@ -62,8 +63,20 @@ def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int 
 
 
 def read(path: Path) -> Method:
-    """Raises `InputError` that names the field."""
-    found = toml_lines.parse(bounded_files.read_text(path, _LONGEST, path.parent), str(path))
+    """Read the file. Raises `InputError` that names the field."""
+    return _parse(bounded_files.read_text(path, _LONGEST, path.parent), path)
+
+
+def encode(method: Mapping[str, Any], path: Path) -> bytes:
+    """Return the bytes of the file that `serialize` describes. Raises `InputError` where `read` would refuse them."""
+    text = "# The run: its method, budget and seed\n" + tomli_w.dumps(dict(method))
+    data = toml_lines.encode(text, str(path))
+    _parse(text, path)
+    return data
+
+
+def _parse(text: str, path: Path) -> Method:
+    found = toml_lines.parse(text, str(path))
     try:
         return Method.model_validate(found)
     except pydantic.ValidationError as error:

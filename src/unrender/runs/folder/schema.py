@@ -20,14 +20,17 @@ A run writes what these models say, and `reader` checks what it reads against th
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, ValidationError
 
+from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.core.text import printable
+from unrender.core.text import printable, reason_of
+from unrender.io import bounded_files
 
 __all__ = [
     "COMMANDS",
@@ -40,6 +43,7 @@ __all__ = [
     "Model",
     "ProblemRecord",
     "RunRecord",
+    "encode",
     "serialize",
     "validate",
 ]
@@ -225,6 +229,22 @@ def validate(model: type[Model], given: Any, where: str) -> Model:
         message = first["msg"].removeprefix("Input should be ")
         field = f"{name}: " if first["loc"] else ""
         raise InputError(f"{where}: {field}expected {message}, got {printable(repr(first['input']))}") from error
+
+
+def encode(model: type[BaseModel], given: Any, where: str) -> bytes:
+    """Return the bytes of a JSON file that the reader takes as the model.
+
+    Raises:
+        InputError: the reader would refuse them; one line that begins with `where` and names the field.
+    """
+    try:
+        data = encode_text(json.dumps(given, indent=2, ensure_ascii=False) + "\n", where)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{where}: cannot be written as JSON: {reason_of(error, 200)}") from error
+    if len(data) > bounded_files.LARGEST_JSON:
+        raise InputError(f"{where}: larger than {bounded_files.LARGEST_JSON >> 20} MiB, which no reader takes")
+    validate(model, bounded_files.parse_object(data.decode(), where), where)
+    return data
 
 
 def serialize(record: BaseModel) -> dict[str, Any]:

@@ -7,7 +7,6 @@ a kill would have left at the last checkpoint, or later.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import shutil
@@ -17,8 +16,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tomli_w
-
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
@@ -26,7 +23,7 @@ from unrender.problem import serialization
 from unrender.problem.problem import Problem
 from unrender.runs import phase_times
 from unrender.runs.final_images import render_final_images
-from unrender.runs.folder import checkpoint
+from unrender.runs.folder import checkpoint, method_file
 from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
 from unrender.runs.folder.meshes import FOLDER as MESH_FILES
@@ -117,7 +114,11 @@ class RunWriter(Hook):
         self._lock.release()
 
     def start(self, result: Result) -> None:
-        """Write what a new run starts with, in place of what an earlier one left. Raises `InputError` where that cannot be."""
+        """Write what a new run starts with, in place of what an earlier one left.
+
+        Raises `InputError` where that cannot be, and where the files could not be read again: before an earlier run is removed.
+        """
+        self._check(result)
         try:
             if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
                 _clear(self.folder)
@@ -126,7 +127,7 @@ class RunWriter(Hook):
             self._started = True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, InputError):
             with contextlib.suppress(OSError):
                 _clear(self.folder)  # what is whole but for run.json nothing would take for a run
             raise
@@ -136,7 +137,7 @@ class RunWriter(Hook):
         try:
             _sweep(self.folder)
             self._history.rewrite(records)
-            files.write(self.folder / METHOD, _method_text(self.method))
+            files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD))
             self._write_record(result, "running")
             self._written_step, self._started = result.steps, True
         except OSError as error:
@@ -227,9 +228,16 @@ class RunWriter(Hook):
             raise InputError(f"run folder {self.folder}: another run has taken its place; the result is not saved")
         result.save(self.folder, status)
 
+    def _check(self, result: Result) -> None:
+        """Raise `InputError` where the reader would refuse what this run writes."""
+        result.encoded_record("running", "", self.folder / RECORD)
+        method_file.encode(self.method, self.folder / METHOD)
+        for key in result.parameters:
+            files.check_member(key, f"run folder {self.folder}: parameter")
+
     def _write_start(self, result: Result) -> None:
         serialization.save(self.problem, self.folder)
-        files.write(self.folder / METHOD, _method_text(self.method), name_too=False)
+        files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD), name_too=False)
         files.write_arrays(self.folder / INITIAL, result.initial, name_too=False)
         for name, values in ((TRUTH, result.truth), (MESHES, result.meshes)):
             if values:
@@ -240,8 +248,7 @@ class RunWriter(Hook):
         self._write_record(result, "running")
 
     def _write_record(self, result: Result, status: str, error: str = "") -> None:
-        text = json.dumps(result.record(status, error), indent=2) + "\n"
-        files.write(self.folder / RECORD, text.encode())
+        files.write(self.folder / RECORD, result.encoded_record(status, error, self.folder / RECORD))
 
     def _write_checkpoint(self, result: Result, seed: int, state: Any) -> None:
         self._restore_folder(result)
@@ -296,10 +303,6 @@ class RunWriter(Hook):
             self._warned.add(topic or line)
             self.warn(line)
             _log.warning(line)
-
-
-def _method_text(method: Mapping[str, Any]) -> bytes:
-    return ("# The run: its method, budget and seed\n" + tomli_w.dumps(dict(method))).encode()
 
 
 def _clear(folder: Path) -> None:
