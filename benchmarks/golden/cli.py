@@ -44,9 +44,7 @@ def main(arguments: Sequence[str]) -> int:
         for name, run in wanted.items():
             found[name] = summary(run)
             print(f"{name}: {found[name].get('refused', 'recorded')}", flush=True)
-        header = {**records.provenance(), "variant": variant, "processor": _processor()}
-        lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
-        given.file.write_text(f'{{"header": {json.dumps(header)},\n"cases": {{\n{lines}\n}}}}\n')
+            _write(given.file, found, variant)
         return 0
     known = json.loads(given.file.read_text())["cases"]
     counts: dict[str, int] = {}
@@ -92,6 +90,12 @@ def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> str:
         worst = max(worst, distance / allowed if distance else 0.0)
     word = "within seed scatter" if worst <= 1.0 else "differs"
     return f"{word}: from step {step} on; at the end {worst:.2g} of the scatter"
+
+
+def _write(file: Path, cases: Mapping[str, Any], variant: str) -> None:
+    header = {**records.provenance(), "variant": variant, "processor": _processor()}
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in cases.items())
+    file.write_text(f'{{"header": {json.dumps(header)},\n"cases": {{\n{lines}\n}}}}\n')
 
 
 def _size(x: np.ndarray) -> float:

@@ -342,7 +342,10 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "other proportions": (_shrink, "view_2.png: 40 x 30 pixels, but its camera has 40 x 40"),
     "a cut photograph": (lambda c: _cut(_photograph(c)), "view_2.png: cannot be read as a picture"),
     "an empty photograph": (lambda c: _photograph(c).write_bytes(b""), "view_2.png: cannot be read as a picture"),
-    "400 megapixels": (_huge, "view_2.png: declares 20000x20000 pixels of 3 channels, expected at least one and at most 268435456 values"),
+    "400 megapixels": (
+        _huge,
+        "view_2.png: declares 20000x20000 pixels of 3 channels, expected at least one and at most 268435456 values",
+    ),
     "a text": (lambda c: _photograph(c).write_text("no picture"), "view_2.png: cannot be read as a picture"),
     "inverted masks": (_invert, "of the picture's edge: inverted? expected white on the object; 9 of 9 masks are so"),
     "an empty mask": (lambda c: _save(_mask(c), np.zeros((40, 40), np.uint8)), "mask of images/view_2.png: empty"),

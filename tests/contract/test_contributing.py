@@ -27,6 +27,7 @@ REGISTERED = {
     "image estimator": "Clamped",
     "estimator": "AveragedGradient",
     "optimizer": "SignDescent",
+    "step transform": "ScaleByLargest",
     "method": "momentum",
     "gallery problem": "painted-wall",
 }
@@ -74,8 +75,15 @@ found["image estimator"] = error(problem(), ur.PathGradient(make("Clamped", inne
 averaged = make("AveragedGradient", inner={"type": "PathGradient", "spp": 2}, decay=0.5)
 found["estimator"] = error(problem(), averaged, adam)
 found["optimizer"] = error(problem(), ur.PathGradient(spp=2), make("SignDescent", learning_rate=0.05, schedule="inversetime(10)"))
+parts = [{"type": "GradientMean", "decay": 0.5}, {"type": "ScaleByLargest"}]
+chain = make("Chain", transforms=parts, learning_rate=0.05)
+found["step transform"] = error(problem(), ur.PathGradient(spp=2), chain)
+whole = ur.optimize(problem(), ur.PathGradient(spp=2), chain, 9).parameters
+ur.optimize(problem(), ur.PathGradient(spp=2), chain, 4, run_directory=sys.argv[3])
+again = ur.resume(sys.argv[3], problem(), steps=9).parameters
+found["resumed"] = all(np.array_equal(whole[key], again[key]) for key in whole)
 found["method"] = error(problem(), *method("momentum").start({"learning_rate": "0.05"}))
-for each in (loss, grey, sampler, averaged):
+for each in (loss, grey, sampler, averaged, chain):
     assert tables.component(json.loads(json.dumps(tables.table(each)))) == each
 
 from additions.exposure import ExposureRenderer, problem as exposure
@@ -119,7 +127,7 @@ def found(tmp_path_factory: pytest.TempPathFactory, mitsuba_variant: str) -> dic
     package(folder, FILES)
     source = Path(unrender.__file__).parents[1]
     process = subprocess.run(
-        [sys.executable, "-W", "error", "-c", DRIVER, str(Path(__file__).parent), mitsuba_variant],
+        [sys.executable, "-W", "error", "-c", DRIVER, str(Path(__file__).parent), mitsuba_variant, str(folder / "run")],
         env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{folder}"}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
@@ -143,13 +151,17 @@ def test_each_is_found_by_its_kind(found: dict[str, Any], kind: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        *("loss", "preconditioner", "pixel sampler", "image estimator", "estimator", "optimizer"),
+        *("loss", "preconditioner", "pixel sampler", "image estimator", "estimator", "optimizer", "step transform"),
         *("method", "gallery problem", "renderer", "BSDF"),
     ],
 )
 def test_each_recovers_a_known_truth(found: dict[str, Any], name: str) -> None:
     before, after = found[name]
     assert after < 0.4 * before
+
+
+def test_a_run_with_a_foreign_transform_resumes_to_the_bit(found: dict[str, Any]) -> None:
+    assert found["resumed"]
 
 
 def test_each_computes_what_it_says(found: dict[str, Any]) -> None:

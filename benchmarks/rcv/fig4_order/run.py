@@ -1,7 +1,7 @@
 """Statistics updated before or after use (RCV Fig. 4): the bias of a weight that depends on the samples it weighs.
 
 On `indirect-room`, once with parameters that do not change and once on a fixed path from the initial values to the
-truth. Statistics are updated after use (`RecursiveControlVariate()`) or before (`update_before_use=True`). Their
+truth. Statistics are updated after use (`RecursiveControlVariate()`) or before (`UpdatedBeforeUse`). Their
 bias, relative to the mean of the image, is measured twice: as the mean over runs less a converged image at the same
 parameters, and, far more precisely, less the same recursion on the same samples with weights fixed beforehand (those
 of other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp of one step times
@@ -14,6 +14,7 @@ variance is 0, so is its weight, and those samples are forgotten once another co
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,25 @@ from benchmarks.moments import Moments, bias, paired_bias
 from benchmarks.paths import converged, follow, geometric
 
 METHODS = ("plain", "before", "after")
+
+
+@dataclass(frozen=True)
+class UpdatedBeforeUse(ur.images.RecursiveControlVariate):
+    """The biased order of Fig. 4, left: the weight depends on the samples that it weighs."""
+
+    def _combine_view(self, memory: Any, rendering: Any, asked: Any, frame: Any) -> Any:
+        number = 1.0 if frame.counts is None else frame.counts.divisors
+        mean = arrays.mean_over_first if frame.counts is None else frame.counts.means
+        seen = super()._observe(memory, mean(rendering.images), mean(rendering.previous), number)
+        return super()._combine_view(seen, rendering, asked, frame)
+
+    def _observe(self, memory: Any, F: Any, H: Any, number: Any) -> Any:
+        del F, H, number
+        return memory
+
+
 ORDERS = {
-    "before": ur.images.RecursiveControlVariate(update_before_use=True),
+    "before": UpdatedBeforeUse(),
     "after": ur.images.RecursiveControlVariate(),
 }
 PILOT_SEEDS = (1_000_001, 1_000_002)

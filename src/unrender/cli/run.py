@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 __all__ = ["conclude", "exit_status", "run"]
 
 
-_MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")]
+_MethodName = Annotated[
+    str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
+]
 
 
 def run(

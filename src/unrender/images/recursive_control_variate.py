@@ -105,7 +105,6 @@ class RecursiveControlVariate:
         beta: decay of the running (co)variances, in [0, 1).
         whole_views: with pixel mini-batches, every so many of them are followed by a step that renders whole views, >= 1.
         learn_from_draws: remember what mini-batches render, too, not whole views alone.
-        update_before_use: the biased order of Fig. 4, left: the weight sees the samples that it weighs. For comparison only.
         max_weight: upper bound of the weights, in (0, 1]; 1 in the paper. Below, an error of the image is forgotten after some
             1 / (1 - max_weight) steps. With 1, it lasts as long as the run has lasted, an optimizer takes it for signal, and
             follows: where rare bright paths make most of the noise, the parameters get worse again.
@@ -132,7 +131,6 @@ class RecursiveControlVariate:
     space: Space = "path"
     alpha: float = 0.9
     beta: float = 0.999
-    update_before_use: bool = False
     whole_views: int = 20
     learn_from_draws: bool = True
     max_weight: float = 1.0
@@ -285,11 +283,10 @@ class RecursiveControlVariate:
         number: Array | float = 1.0 if counts is None else counts.divisors
         mean = arrays.mean_over_first if counts is None else counts.means
         F, H = mean(rendering.images), mean(rendering.previous)
-        used = self._observe(memory, F, H, number) if self.update_before_use else memory
-        past, weight = memory.relative_variance, self._weight(used, number)
+        past, weight = memory.relative_variance, self._weight(memory, number)
         image, of_each = frame.laid(memory.image), frame.laid(weight)
         current = advance(image, rendering.images, rendering.previous, of_each)
-        observed = used if self.update_before_use else self._observe(memory, F, H, number)
+        observed = self._observe(memory, F, H, number)
         var_current, var_previous = welford.covariance(observed.current), welford.covariance(observed.previous)
         cov = welford.covariance(observed.joint)
         variance = statistics.control_variate_variance(

@@ -34,14 +34,14 @@ class ScheduleFree(Recipe):
         z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
     The parameters of a run are its y, near x. An average has less noise than an iterate, and parameters that move slowly suit estimators
-    that reuse earlier samples. The chain, each transform with its formula in its own docstring:
+    that reuse earlier samples. The chain has six transforms, each with its formula in its own docstring:
 
-        FittedSobolev        gradients of `preconditioned` are smoothed by S; its strength is fitted to them
-        AgreementRate        η_t: the rate needs no horizon; it decays with the gradient's noise
-        ScaleByRms           √v̂ + ε, with all gradients of equal weight from step 1 / (1 − β₂) on
-        ApplyPreconditioner  S again, on the direction
-        WienerShrinkage      w: elements of little signal take short steps
-        ScheduleFreeAverage  z, x and y
+    - `FittedSobolev` smooths the gradients of `preconditioned` by S, whose strength it fits to them.
+    - `AgreementRate` sets η_t. The rate needs no horizon; it decays with the gradient's noise.
+    - `ScaleByRms` divides by √v̂ + ε. All gradients have equal weight in v̂ from step 1 / (1 − β₂) on.
+    - `ApplyPreconditioner` applies S again, to the direction.
+    - `WienerShrinkage` multiplies by w: elements of little signal take short steps.
+    - `ScheduleFreeAverage` moves z, x and y.
 
     Adam normalises every element's step, so weakly observed elements follow a random walk: w stops that. Parameters outside
     `preconditioned` have no neighbours to estimate w from, and unscaled steps. Pass `wiener=False` for pixel mini-batches. Two successive

@@ -1,0 +1,192 @@
+"""Transforms of steps: every registered one by one contract, and chains against the recipes and formulas that they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from unrender.core import registry, tables
+from unrender.core.errors import InputError
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import PastWeight, Variance
+from unrender.optimizers import Adam, Chain, ScheduleFree
+from unrender.optimizers.transforms import (
+    AgreementRate,
+    ApplyPreconditioner,
+    ClipDirection,
+    DecayingSum,
+    FittedSobolev,
+    GradientMean,
+    PerParameter,
+    ScaleByDeviation,
+    ScaleByRms,
+    ScheduleFreeAverage,
+    WienerShrinkage,
+)
+from unrender.preconditioners import Sobolev
+from unrender.problem.upsampling import restarted
+from unrender.runs.folder.state import Packed, check_alike, pack, unpack
+from unrender.schedules import Cosine
+
+SMOOTH = FittedSobolev(Sobolev(2.0), ("map",))
+CHAINS: dict[str, Callable[[], tuple[Any, ...]]] = {
+    "AgreementRate": lambda: (FittedSobolev(), AgreementRate()),
+    "ApplyPreconditioner": lambda: (SMOOTH, ApplyPreconditioner()),
+    "ClipDirection": lambda: (ClipDirection(0.5),),
+    "DecayingSum": lambda: (DecayingSum(0.5),),
+    "FittedSobolev": lambda: (SMOOTH,),
+    "GradientMean": lambda: (GradientMean(),),
+    "PerParameter": lambda: (
+        PerParameter(("map",), (GradientMean(), ScaleByRms()), (ScaleByRms(), ScheduleFreeAverage())),
+    ),
+    "ScaleByDeviation": lambda: (ScaleByDeviation(rule="walk"),),
+    "ScaleByRms": lambda: (ScaleByRms(long_memory=True),),
+    "ScheduleFreeAverage": lambda: (ScaleByRms(), ScheduleFreeAverage()),
+    "WienerShrinkage": lambda: (SMOOTH, WienerShrinkage(("map",))),
+}
+"""{a registered transform: a chain that it is part of}."""
+
+START = {"map": np.full((5, 4, 2), 0.5, np.float32), "number": np.full(1, 0.2, np.float32)}
+
+
+def estimates(steps: int, seed: int = 0) -> list[Estimate]:
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(steps):
+        gradient = {key: rng.normal(0.3, 1.0, x.shape).astype(np.float32) for key, x in START.items()}
+        variance = Variance({key: np.full_like(x, 0.5) for key, x in START.items()})
+        past = PastWeight({key: np.full_like(x, 0.6) for key, x in START.items()})
+        found.append(Estimate(0.0, gradient, (variance, past)))
+    return found
+
+
+def take(optimizer: Any, given: list[Estimate], state: Any = None, x: Any = None) -> tuple[list[Any], Any, Any]:
+    """Steps, state and parameters after the estimates."""
+    x = dict(START) if x is None else x
+    state = optimizer.init(x) if state is None else state
+    made = []
+    for estimate in given:
+        steps, state = optimizer.update(estimate, state, x)
+        x = {key: x[key] + steps[key] for key in x}
+        made.append(steps)
+    return made, state, x
+
+
+def same(one: Any, other: Any) -> None:
+    for key in one:
+        np.testing.assert_array_equal(one[key], other[key])
+
+
+def test_every_registered_transform_is_here() -> None:
+    own = {name for name, kind in registry.components("step transform").items() if "unrender" in kind.__module__}
+    assert own == set(CHAINS)
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_an_update_is_pure_and_finite_and_of_the_parameters_shapes(name: str) -> None:
+    chain = Chain(CHAINS[name](), 0.1)
+    _, state, x = take(chain, estimates(5))
+    (estimate,) = estimates(1, seed=9)
+    steps, after = chain.update(estimate, state, x)
+    again, repeated = chain.update(estimate, state, x)
+    same(steps, again)
+    assert repr(after) == repr(repeated)
+    assert after.step == 6
+    for key, step in steps.items():
+        assert step.shape == START[key].shape
+        assert np.isfinite(step).all()
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_a_chain_goes_on_from_its_table_and_its_checkpoint(name: str) -> None:
+    chain = Chain(CHAINS[name](), {"*": 0.1, "number": 0.02}, Cosine(20))
+    made = tables.component(json.loads(json.dumps(tables.table(chain))))
+    assert made == chain
+    whole, _, _ = take(chain, estimates(9))
+    _, state, x = take(chain, estimates(9)[:4])
+    packed = pack(state)
+    stored = unpack(Packed(json.loads(json.dumps(packed.skeleton)), packed.tensors))
+    check_alike(stored, [state])
+    same(take(made, estimates(9)[4:], stored, x)[0][-1], whole[-1])
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_a_chain_that_starts_anew_makes_a_first_step(name: str) -> None:
+    """The schedule goes on, everything else is as before the first step."""
+    chain = Chain(CHAINS[name](), 0.1)
+    _, state, x = take(chain, estimates(5))
+    fresh = restarted(state, chain.init(x))
+    assert (fresh.step, fresh.begun) == (5, 5)
+    (estimate,) = estimates(1, seed=3)
+    same(chain.update(estimate, fresh, x)[0], chain.update(estimate, chain.init(x), x)[0])
+
+
+def test_adam_is_a_mean_over_a_root_mean_square() -> None:
+    chain = Chain((GradientMean(0.9), ScaleByRms(0.999)), 0.01)
+    same(take(chain, estimates(6))[2], take(Adam(0.01), estimates(6))[2])
+    swapped = Chain((ScaleByRms(0.999), GradientMean(0.9)), 0.01)
+    assert np.abs(take(swapped, estimates(6))[2]["map"] - take(chain, estimates(6))[2]["map"]).max() > 1e-4
+
+
+def test_schedule_free_is_its_chain() -> None:
+    smooth = Sobolev(2.0)
+    recipe = ScheduleFree(0.1, preconditioner=smooth, preconditioned=("map",))
+    parts = (
+        FittedSobolev(smooth, ("map",)),
+        AgreementRate(),
+        ScaleByRms(0.95, 1e-12, long_memory=True),
+        ApplyPreconditioner(),
+        WienerShrinkage(("map",)),
+        ScheduleFreeAverage(),
+    )
+    same(take(Chain(parts, 0.1), estimates(8))[2], take(recipe, estimates(8))[2])
+
+
+def test_groups_of_parameters_move_as_if_alone() -> None:
+    """Also where one group has a mean to debias, or iterates of its own, and the other has not."""
+    own, others = (GradientMean(0.8), ScaleByRms(), ClipDirection(0.7)), (DecayingSum(0.3), ScheduleFreeAverage())
+    mixed = take(Chain((PerParameter(("map",), own, others),), 0.1, Cosine(30)), estimates(7))[2]
+    for key, parts in (("map", own), ("number", others)):
+        alone = take(Chain(parts, 0.1, Cosine(30)), estimates(7))[2]
+        np.testing.assert_allclose(mixed[key], alone[key], rtol=1e-6)
+
+
+def test_a_clipped_mean_is_clipped_after_debiasing() -> None:
+    """The first mean is 0.1 g before debiasing: clipping that at 0.5 would let a direction of 5 pass."""
+    gradient = {"x": np.array([3.0, -0.2, 9.0])}
+    chain = Chain((GradientMean(0.9), ClipDirection(0.5)), 1.0)
+    steps, _ = chain.update(Estimate(0.0, gradient), chain.init(gradient), gradient)
+    np.testing.assert_allclose(steps["x"], [-0.5, 0.2, -0.5], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Chain((AgreementRate(),)), "AgreementRate: no transform before it remembers .* FittedSobolev"),
+        (lambda: Chain((FittedSobolev(), WienerShrinkage(("map",)))), "FittedSobolev must precondition map"),
+        (lambda: Chain((WienerShrinkage(("mop",)),)), 'unknown parameter "mop"'),
+        (lambda: Chain((PerParameter(("mop",)),)), 'unknown parameter "mop"'),
+        (lambda: Chain((FittedSobolev(Sobolev(), ("mop",)),)), 'unknown parameter "mop"'),
+        (lambda: Chain((FittedSobolev(Sobolev(), ("number",)),)), "needs a texture"),
+        (lambda: Chain((Adam(),)), r"Chain: transforms: expected transforms such as ScaleByRms\(\), got Adam"),  # type: ignore
+        (lambda: Chain(GradientMean()), "Chain: transforms: expected a list of transforms"),  # type: ignore
+        (lambda: PerParameter(("a",), others=(Adam(),)), "PerParameter: others: expected transforms"),  # type: ignore
+        (lambda: tables.component({"type": "Chain", "transforms": [{"type": "Adam"}]}), r"transforms\[0\]: .*Adam"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        take(make(), estimates(1))
+
+
+def test_what_a_transform_requires_the_chain_requires() -> None:
+    assert set(Chain((PerParameter(("a",), (ScaleByDeviation(rule="walk"),)),)).requires) == {
+        *("gradient", "variance", "past_weight"),
+    }
+    with pytest.raises(InputError, match="variance"):
+        take(Chain((ScaleByDeviation(),)), [replace(estimates(1)[0], capabilities=())])
