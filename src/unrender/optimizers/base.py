@@ -56,10 +56,17 @@ class Refining(Protocol):
 
 @runtime_checkable
 class OnMeshes(Protocol):
-    """An optimizer that has preconditioners which suit values at the vertices of meshes, once they know these."""
+    """An optimizer that has preconditioners which need to know the neighbours of a parameter's elements."""
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Optimizer:
-        """The same, given the mesh of a parameter's key; None for what has none."""
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> Optimizer:
+        """Return the same for a problem's parameters.
+
+        Args:
+            topology: returns the mesh of a parameter; None for what has none.
+            repeated: returns the number of outer columns that repeat those of the opposite end; None where no parameter has any.
+        """
         ...
 
 

@@ -20,7 +20,7 @@ from unrender.optimizers.agreement import measured, root_mean_square
 from unrender.optimizers.signal_share import signal_share
 from unrender.optimizers.strength import StrengthFit
 from unrender.preconditioners import Sobolev
-from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem.coarse_to_fine import checked_steps
 from unrender.problem.upsampling import SQUARES, Upsampler
@@ -170,7 +170,7 @@ class ScheduleFree:
     wiener: bool = True
     parameterisations: Mapping[str, str] = field(default_factory=dict)
     coarse_to_fine: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
+    _bound: Mapping[str, tuple[int, Preconditioner]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -199,14 +199,18 @@ class ScheduleFree:
         """A gradient."""
         return Capabilities(Gradient)
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> ScheduleFree:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> ScheduleFree:
         """See `OnMeshes.on_meshes`."""
         smooth, bound = self.preconditioner, {}
-        if isinstance(smooth, MeshPreconditioner):
-            found = {key: topology(key) for key in self.preconditioned}
-            bound = {key: (mesh, smooth.on_mesh(mesh)) for key, mesh in found.items() if mesh is not None}
+        for key in self.preconditioned:
+            if isinstance(smooth, MeshPreconditioner) and (mesh := topology(key)) is not None:
+                bound[key] = len(mesh.places), smooth.on_mesh(mesh)
+            elif isinstance(smooth, PeriodicPreconditioner) and repeated and (columns := repeated(key)):
+                bound[key] = 0, smooth.on_repeated(columns)
         optimizer = replace(self)
-        object.__setattr__(optimizer, "_on_meshes", bound)
+        object.__setattr__(optimizer, "_bound", bound)
         return optimizer
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ScheduleFreeState:
@@ -268,7 +272,7 @@ class ScheduleFree:
             if key in maps:
                 direction = maps[key].apply(direction)
             if key in product:
-                cells = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
+                cells = self._bound[key][0] if key in self._bound else 0
                 share = signal_share(maps[key], product[key], square[key], _MEMORY**made, fit.confirmed, cells)
                 direction = direction * share
             rate = -state.learning_rates[key] * factor * math.exp(log_rate[key])
@@ -352,7 +356,7 @@ class ScheduleFree:
 
     def _smooth(self, key: str) -> Preconditioner:
         """The preconditioner of a parameter in `preconditioned`, all of it."""
-        found = self._on_meshes[key][1] if key in self._on_meshes else self.preconditioner
+        found = self._bound[key][1] if key in self._bound else self.preconditioner
         assert found is not None
         return found
 

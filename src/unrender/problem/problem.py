@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, periodic
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
@@ -97,6 +97,7 @@ class Problem(ViewLosses):
         self_intersections: {key: "warn", "prevent" or "ignore"} of the parameters that are vertex positions.
         regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
+        repeated: {key: number of columns at each end that repeat those of the opposite end} of environment maps.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
         surfaces: as given.
@@ -152,7 +153,8 @@ class Problem(ViewLosses):
         self.parameterisations = {k: p for k, found in checked.items() if (p := found.parameterisation) is not None}
         self.regularizers = {k: r for k, found in checked.items() if (r := found.regularizer) is not None}
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
-        self.coordinates = Coordinates(transforms, self.preconditioners)
+        self.repeated = {key: n for key in checked if (n := known[key].conversion.repeated)}
+        self.coordinates = Coordinates(transforms, self.preconditioners, self.repeated)
         self.first_values = {key: found.initial for key, found in checked.items()}
         meshes = {key: mesh() for key in checked if (mesh := known[key].moving_mesh) is not None}
         self.faces = {key: np.asarray(faces).astype(np.int64).reshape(-1, 3) for key, (_, faces) in meshes.items()}
@@ -175,8 +177,10 @@ class Problem(ViewLosses):
     def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """True values as arrays; adds to the notices."""
         found: dict[str, np.ndarray] = {}
+        known = self.renderer.parameters()
+        infos = {key: known[key] for key in self.first_values}
         for key, value in given.items():
-            found[key], notice = check_truth(key, value, self.shapes())
+            found[key], notice = check_truth(key, value, infos)
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
         return found
 
@@ -365,10 +369,10 @@ class Problem(ViewLosses):
         """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root
         mean square distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
         found = self.full({key: parameters[key] for key in (*self.truth, *self.surfaces)})
-        errors = {
-            key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))
-            for key, truth in self.truth.items()
-        }
+        errors = {}
+        for key, truth in self.truth.items():
+            difference = periodic.interior(found[key] - truth, self.repeated.get(key, 0))
+            errors[key] = float(np.sqrt(np.mean(np.square(difference, dtype=np.float64))))
         for key, surface in self.surfaces.items():
             if found[key].size == self.first_values[key].size:
                 errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)

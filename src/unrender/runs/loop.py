@@ -102,7 +102,7 @@ def prepare(
         ways = {key: CoarseToFine(tuple(steps), states="carry") for key, steps in optimizer.coarse_to_fine.items()}
         problem = problem.refining(ways)
     if isinstance(optimizer, OnMeshes):
-        optimizer = optimizer.on_meshes(problem.topology)
+        optimizer = optimizer.on_meshes(problem.topology, lambda key: problem.repeated.get(key, 0))
     run = Run(problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import emissive, film
+from unrender.rendering.mitsuba import emissive, file_conversions, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.emitter_tables import emitter_tables
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
@@ -320,13 +320,15 @@ class ScenePair:
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
             low, high = physical_range(self.current_parameters, key)
-            return ParameterInfo(shape, False, False, why, low, high, perturbable=able)
+            conversion = file_conversions.conversion(self.current_parameters, key, self.description)
+            return ParameterInfo(shape, False, False, why, low, high, perturbable=able, conversion=conversion)
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
         low, high = physical_range(self.current_parameters, key)
+        conversion = file_conversions.conversion(self.current_parameters, key, self.description)
         if not traits.replayable:
-            return ParameterInfo(shape, False, False, traits.reason, low, high)
+            return ParameterInfo(shape, False, False, traits.reason, low, high, conversion=conversion)
         return ParameterInfo(
             shape,
             True,
@@ -337,6 +339,7 @@ class ScenePair:
             resizable=self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
             welded=key.endswith(".vertex_positions"),
+            conversion=conversion,
         )
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
