@@ -252,8 +252,8 @@ def test_repeated_columns_follow_in_a_descent(folder: Path, method: str):
         "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
     }
     problem = ur.Problem(scene, [ur.Parameter("sky.data", initial=1.0)], [VIEW], max_depth=2)
-    chosen = () if method == "auto" else methods.method(method).start({})
-    result = ur.optimize(problem, *chosen, steps=3)
+    estimator, optimizer = ("auto", None) if method == "auto" else methods.method(method).start({})
+    result = ur.optimize(problem, estimator, optimizer, steps=3)
     found = result.parameters["sky.data"]
     assert np.ptp(found) > 0
     np.testing.assert_array_equal(found, periodic.repeat(found, 1))

@@ -59,10 +59,10 @@ def test_its_strength_is_that_of_the_unknown_columns_and_scales():
     assert bound.strength_of((HEIGHT, WIDTH + 2, 3)) == plain.strength_of(X.shape)
     shares = np.array([1.0, 0.25])
     other = np.random.default_rng(1).normal(size=X.shape).astype(np.float32)
-    pairs = [periodic.pad(x, 1) for x in (X, other)]
-    np.testing.assert_allclose(bound.descents(*pairs, shares), plain.descents(X, other, shares), rtol=1e-6)
+    first, second = periodic.pad(X, 1), periodic.pad(other, 1)
+    np.testing.assert_allclose(bound.descents(first, second, shares), plain.descents(X, other, shares), rtol=1e-6)
     np.testing.assert_allclose(
-        periodic.interior(bound.scaled(0.5).apply(pairs[0]), 1), plain.scaled(0.5).apply(X), atol=1e-6
+        periodic.interior(bound.scaled(0.5).apply(first), 1), plain.scaled(0.5).apply(X), atol=1e-6
     )
 
 

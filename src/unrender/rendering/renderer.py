@@ -16,6 +16,7 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.evaluation.parameter_errors import Role
 from unrender.io.file_conversion import PLAIN, FileConversion
 
 __all__ = [
@@ -68,6 +69,7 @@ class ParameterInfo:
         welded: whether they are its positions, which vertices at the same place share.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
         conversion: what the renderer does to a file's values when it loads such a parameter.
+        role: what the values stand for: numbers, normals or directions. Of the last two, errors are angles.
     """
 
     shape: tuple[int, ...]
@@ -85,6 +87,7 @@ class ParameterInfo:
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
     welded: bool = False
     conversion: FileConversion = PLAIN
+    role: Role = "value"
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

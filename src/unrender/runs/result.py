@@ -42,8 +42,8 @@ class Result:
         history: one dictionary per step (of a run of millions of steps in a run folder, per second, fourth, ... of the earlier
             ones): "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
             "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
-            "parameter_error" ({key: root mean square error}) now and then and at the last step; of parameters that are coarse at
-            first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
+            "parameter_error" ({key: error}, see `Problem.parameter_error`) now and then and at the last step; of parameters that are
+            coarse at first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
         seconds: of optimization.
         warmup_seconds: of tracing and compiling kernels before the first step.
         stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated"

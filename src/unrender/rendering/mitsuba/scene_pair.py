@@ -26,7 +26,13 @@ from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
+from unrender.rendering.mitsuba.parameters import (
+    ParameterTraits,
+    is_of_vertices,
+    parameter_traits,
+    physical_range,
+    role,
+)
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
@@ -298,7 +304,13 @@ class ScenePair:
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
-        return {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
+        found = {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
+        return {key: self._with_meaning(key, info) if info.perturbable else info for key, info in found.items()}
+
+    def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
+        """`info` with what the values of the parameter stand for, and what a file becomes."""
+        conversion = file_conversions.conversion(self.current_parameters, key, self.description)
+        return replace(info, conversion=conversion, role=role(self.current_parameters, key, info.shape))
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)
@@ -320,15 +332,13 @@ class ScenePair:
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
             low, high = physical_range(self.current_parameters, key)
-            conversion = file_conversions.conversion(self.current_parameters, key, self.description)
-            return ParameterInfo(shape, False, False, why, low, high, perturbable=able, conversion=conversion)
+            return ParameterInfo(shape, False, False, why, low, high, perturbable=able)
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
         low, high = physical_range(self.current_parameters, key)
-        conversion = file_conversions.conversion(self.current_parameters, key, self.description)
         if not traits.replayable:
-            return ParameterInfo(shape, False, False, traits.reason, low, high, conversion=conversion)
+            return ParameterInfo(shape, False, False, traits.reason, low, high)
         return ParameterInfo(
             shape,
             True,
@@ -339,7 +349,6 @@ class ScenePair:
             resizable=self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
             welded=key.endswith(".vertex_positions"),
-            conversion=conversion,
         )
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
