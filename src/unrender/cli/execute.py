@@ -151,6 +151,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)
+    for line in result.undetermined:
+        console.print(f"[yellow]not determined[/] {escape(line)}", soft_wrap=True)
     for warning in result.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
     if result.status == "interrupted":

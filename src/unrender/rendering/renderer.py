@@ -70,6 +70,7 @@ class ParameterInfo:
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
         conversion: what the renderer does to a file's values when it loads such a parameter.
         role: what the values stand for: numbers, normals or directions. Of the last two, errors are angles.
+        brightness: what the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
     """
 
     shape: tuple[int, ...]
@@ -88,6 +89,7 @@ class ParameterInfo:
     welded: bool = False
     conversion: FileConversion = PLAIN
     role: Role = "value"
+    brightness: Literal["", "light", "reflectance"] = ""
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

@@ -64,6 +64,8 @@ class Result:
             of squares over all pixels and channels, see `unrender.sensitivity`; {} of runs without a run folder, and where path
             gradients do not reach the parameters. Where it is small, the images tell nothing.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
+        undetermined: one line for each unknown that the pictures do not determine, see `runs.determination`; empty for runs without a run
+            folder.
         meshes: {"KEY/faces": (F, 3), ...} of the parameters that are vertex positions, and the true surfaces, "KEY/true_vertices" and
             "KEY/true_faces", where they are known.
     """
@@ -92,6 +94,7 @@ class Result:
     sensitivity: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
     meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    undetermined: Sequence[str] = ()
 
     def __repr__(self) -> str:
         from unrender.runs import notebook
@@ -177,6 +180,7 @@ class Result:
             "image_errors": {
                 name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
             },
+            "undetermined": list(self.undetermined),
             "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mitsuba as mi
 
@@ -12,7 +12,15 @@ from unrender.evaluation.parameter_errors import Role
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
-__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range", "role"]
+__all__ = [
+    "ParameterTraits",
+    "brightness",
+    "is_of_vertices",
+    "normals_key",
+    "parameter_traits",
+    "physical_range",
+    "role",
+]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
 # depend on the parameter.
@@ -20,6 +28,8 @@ _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "Smoot
 _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
+_LIGHT = ("radiance", "intensity", "irradiance")
+_REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
 _DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
 
 
@@ -166,6 +176,17 @@ def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Ro
             return "normal" if node.class_name() == "NormalMap" and "normalmap" in names else "value"
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
     return "value"
+
+
+def brightness(parameters: mi.SceneParameters, key: str) -> Literal["", "light", "reflectance"]:
+    """Return what the picture is proportional to: an emitter's light, a surface's reflectance, or neither."""
+    names, node = key.split("."), parameters.properties[key][2]
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    if isinstance(node, mi.Emitter):
+        emits = names[-1] in ("scale", "data") or any(name in _LIGHT for name in names)
+        return "light" if emits else ""
+    return "reflectance" if isinstance(node, mi.BSDF) and any(name in _REFLECTANCE for name in names) else ""
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:

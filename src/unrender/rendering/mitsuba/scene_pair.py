@@ -28,6 +28,7 @@ from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import (
     ParameterTraits,
+    brightness,
     is_of_vertices,
     parameter_traits,
     physical_range,
@@ -310,7 +311,8 @@ class ScenePair:
     def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
         """`info` with what the values of the parameter stand for, and what a file becomes."""
         conversion = file_conversions.conversion(self.current_parameters, key, self.description)
-        return replace(info, conversion=conversion, role=role(self.current_parameters, key, info.shape))
+        kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
+        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1])
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)

@@ -115,7 +115,7 @@ class RunRecord(BaseModel):
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
-        image_errors, phases: see `Result`.
+        image_errors, undetermined, phases: see `Result`.
         error: the exception by which the run failed; "" for none.
     """
 
@@ -141,6 +141,7 @@ class RunRecord(BaseModel):
     problem: ProblemRecord = ProblemRecord()
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
+    undetermined: list[StrictStr] = []
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
 
