@@ -45,7 +45,7 @@ def test_a_parameter_without_influence_is_named_and_others_are_not():
     made = problem(scene(material), *keys)
     lines = undetermined(made, made.initial_values(), 16)
     assert [line.partition(":")[0] for line in lines] == keys[2:]
-    assert undetermined(made, made.initial_values(), 16, seconds=0.0) == []
+    assert undetermined(made, made.initial_values(), 16, seconds=0.0) == []  # the first alone, which is determined
 
 
 def test_light_and_colour_of_all_that_is_seen_share_a_factor():
@@ -77,7 +77,7 @@ def test_cells_that_hardly_change_the_pictures_are_told():
 
 def test_a_run_tells_in_its_folder(tmp_path: Any):
     material = {"type": "principled", "sheen": 0.0, "sheen_tint": 0.5}
-    made = problem(scene(material), "wall.bsdf.base_color.value", "wall.bsdf.sheen_tint.value")
+    made = problem(scene(material), "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value")
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
     page = ur.report.page(tmp_path / "run").read_text()

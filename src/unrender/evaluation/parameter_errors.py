@@ -15,6 +15,8 @@ __all__ = ["PLAIN", "ErrorMeasure", "Role", "from_record", "title"]
 Role = Literal["value", "normal", "direction"]
 """What the values of a parameter stand for: numbers; a normal map, n = 2 x - 1; vectors of which the direction counts."""
 
+_MOST_COLUMNS = 8
+"""Repeated columns that a record may name."""
 _SHORTEST = 1e-12
 """Length below which a vector has no direction; its angle counts as 90°."""
 
@@ -108,7 +110,7 @@ def from_record(given: Any) -> ErrorMeasure:
     if not isinstance(given, Mapping):
         return PLAIN
     role, repeated = given.get("role", "value"), given.get("repeated", 0)
-    if role not in get_args(Role) or type(repeated) is not int or repeated < 0:
+    if role not in get_args(Role) or type(repeated) is not int or not 0 <= repeated <= _MOST_COLUMNS:
         return PLAIN
     return ErrorMeasure(role, repeated)
 

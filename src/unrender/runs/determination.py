@@ -28,6 +28,8 @@ _ERRORS = 2.0
 _UNSEEN = 0.05
 """Share of the cells of a texture or grid that are worth a line where no picture sees them."""
 _MOST_VIEWS = 4
+_SEEDS, _RENDERINGS = (3, 4), 8
+"""Of the two independent halves, and renderings per view of two changes."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,16 @@ def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, s
         problem: its views and scene.
         values: {key: array}, where the other parameters stay.
         spp: samples per pixel of each of four renderings per view.
-        seconds: after which no further parameter is looked at.
+        seconds: after which no further parameter is looked at; the first one always is.
     """
-    known, lines, until = problem.renderer.parameters(), [], time.perf_counter() + seconds
+    known, lines = problem.renderer.parameters(), []
+    until, longest = time.perf_counter() + seconds, 0.0
     for key, (low, high) in problem.bounds.items():
         info = known[key]
         if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role != "value":
             continue
-        if time.perf_counter() >= until:
+        started = time.perf_counter()
+        if longest > 0.0 and started + longest > until:
             break
         first, last = (
             {**values, key: project(np.full(values[key].shape, end, np.float32), low, high)} for end in (low, high)
@@ -75,6 +79,7 @@ def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, s
             change = _change(problem, first, last, spp)
         except InputError:  # the renderer refuses an end of the range
             continue
+        longest = max(longest, time.perf_counter() - started)
         if change.is_below(_LEAST):
             lines.append(
                 f"{key}: over its whole range the pictures change by less than {_LEAST:.1%}; its value is the start's, or noise"
@@ -98,7 +103,7 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
     return lines
 
 
-def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int) -> list[str]:
+def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf) -> list[str]:
     """Return one line where the pictures determine lights and reflectances up to a common factor only; none elsewhere.
 
     Lights become brighter by a factor and reflectances darker by the same; the pictures tell the two apart if they change.
@@ -106,11 +111,16 @@ def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int) 
     Args:
         problem: its views and scene.
         values: {key: array}, the parameters at which it is looked.
-        spp: samples per pixel of each of six renderings per view.
+        spp: samples per pixel of each of eight renderings per view.
+        seconds: what it may take; nothing is looked at where one rendering shows that it would take longer.
     """
     known = problem.renderer.parameters()
     lights, colours = ([k for k in values if known[k].brightness == kind] for kind in ("light", "reflectance"))
     if not lights or not colours:
+        return []
+    started = time.perf_counter()
+    render(problem, values, 0, spp, _SEEDS[0])
+    if _RENDERINGS * len(_views(problem)) * (time.perf_counter() - started) > seconds:
         return []
     brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
     darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
@@ -141,13 +151,18 @@ def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
     return float(np.mean(values) / np.mean(truth))
 
 
+def _views(problem: Problem) -> list[int]:
+    """The views that are rendered: all, or evenly some of many."""
+    count = len(problem.views)
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
+
+
 def _change(problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int) -> Change:
     """Between two states. The product of two independent differences has no bias by noise; each is of equal random numbers."""
-    views = sorted({round(v) for v in np.linspace(0, len(problem.views) - 1, min(len(problem.views), _MOST_VIEWS))})
     products, squares = [], []
-    for view in views:
+    for view in _views(problem):
         differences = []
-        for seed in (3, 4):
+        for seed in _SEEDS:
             first, second = (render(problem, state, view, spp, seed) for state in (before, after))
             differences.append((second - first).astype(np.float64))
             squares.append(np.mean(np.square(first, dtype=np.float64)))

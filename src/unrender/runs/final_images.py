@@ -25,8 +25,8 @@ _SHARE, _LEAST_SECONDS = 0.05, 1.0
 """Of the time of the steps, what final pictures may take, but a second at least."""
 _SENSITIVITY_SHARE = 0.5
 """Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
-_LOOK_SHARE, _LOOK_SECONDS = 0.02, 0.5
-"""Of the time of the steps, what it may take to see which parameters the pictures do not determine, but half a second at least."""
+_LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
+"""Of the time of the steps, what each of two looks at what the pictures do not determine may take, but a quarter of a second at least."""
 _TRIAL_PATHS = 1 << 18
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
@@ -106,9 +106,9 @@ def _undetermined(problem: Problem, result: Result, found: Mapping[str, np.ndarr
     if not result.steps:
         return []
     lines = undetermined_cells(found)
-    spp = _trial_spp(problem)
-    lines += common_factor(problem, result.parameters, spp)
-    return lines + undetermined(problem, result.parameters, spp, max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS))
+    spp, seconds = _trial_spp(problem), max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS)
+    lines += common_factor(problem, result.parameters, spp, seconds)
+    return lines + undetermined(problem, result.parameters, spp, seconds)
 
 
 def _chosen(problem: Problem) -> list[int]:

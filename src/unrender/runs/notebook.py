@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unrender.core import periodic
 from unrender.display import formatting, maps, notebook
 from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
@@ -49,6 +50,7 @@ def html(result: Result) -> str:
 def shown_pictures(result: Result) -> dict[str, np.ndarray]:
     """{caption: (H, W, 3) in [0, 1]}: views, where there are pictures, then parameters that are maps."""
     shown: dict[str, np.ndarray] = {}
+    found = measures(result)
     for view in range(_VIEWS):
         reference = result.pictures.get(f"view{view}/reference")
         for what in ("reference", "initial", "result"):
@@ -56,10 +58,10 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
             if picture is not None:
                 shown[f"view {view}: {'start' if what == 'initial' else what}"] = shown_image(picture, reference)
     for key in [key for key, values in result.parameters.items() if maps.is_map(values)][:_MAPS]:
-        truth = result.truth.get(key)
+        truth, columns = result.truth.get(key), found[key].repeated
         like = result.parameters[key] if truth is None else truth
         for what, values in (("truth", truth), ("start", result.initial[key]), ("recovered", result.parameters[key])):
-            colours = None if values is None else shown_map(values, like)
+            colours = None if values is None else shown_map(periodic.interior(values, columns), like)
             if colours is not None:
                 shown[f"{what}: {key}"] = colours
     return shown
