@@ -214,6 +214,24 @@ def test_an_array_file_fills_an_environment_map(renderer: MitsubaRenderer, tmp_p
     )
 
 
+def test_an_exported_environment_map_is_read_back_exactly(renderer: MitsubaRenderer, folder: Path, tmp_path: Path):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"""<scene version="3.0.0">
+          <sensor type="perspective">
+            <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
+          </sensor>
+          <emitter type="envmap" id="sky"><string name="filename" value="{folder / "single.exr"}"/></emitter>
+        </scene>"""
+    )
+    problem = ur.Problem(scene, [ur.Parameter("sky.data", initial=0.5)], [VIEW], max_depth=2)
+    sky = periodic.pad(2 * PICTURE, 1)
+    ur.export((problem, {"sky.data": sky}), tmp_path / "out", formats=["mitsuba"])
+    for written in ("maps/sky.exr", "textures/sky.exr"):
+        found = of_file(renderer, "sky.data", tmp_path / "out" / written)
+        np.testing.assert_array_equal(found, sky)
+
+
 # ------------------------------------------------------------------ meshes
 
 
