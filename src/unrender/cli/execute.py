@@ -27,6 +27,7 @@ from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
+from unrender.runs.sensitivity import seen_cells
 
 __all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise"]
 
@@ -106,6 +107,19 @@ def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarra
     return f"{formatting.number(float(np.mean(errors)))} with noise"
 
 
+def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:
+    """The error of a parameter at the start and at the end; and where the pictures tell of it."""
+    measure, told = problem.measures[key], result.sensitivity.get(key)
+    line = f"error {measure.text(before)} before, {measure.text(after)} after"
+    if measure.unit and key in problem.truth:
+        line += f" ({measure.name_with_median(result.parameters[key], problem.truth[key])})"
+    where = None if told is None else seen_cells(told)
+    if where is None or key not in problem.truth or where.all():
+        return line
+    seen = measure.error(result.parameters[key], problem.truth[key], where)
+    return line if seen is None else f"{line}, {measure.text(seen)} where seen ({where.mean():.0%} of it)"
+
+
 def introduce(console: Console, problem: Problem, variant: str) -> None:
     """What is about to be recovered, and what was done to the input."""
     views = describe_views(problem)
@@ -134,10 +148,12 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     start = problem.parameter_error(result.initial)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():
-        table.add_row(escape(key), f"error {start[key]:.4g} before, {error:.4g} after")
+        table.add_row(escape(key), _error_line(problem, result, key, start[key], error))
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)
+    for line in result.undetermined:
+        console.print(f"[yellow]not determined[/] {escape(line)}", soft_wrap=True)
     for warning in result.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
     if result.status == "interrupted":

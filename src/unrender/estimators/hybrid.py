@@ -222,6 +222,7 @@ def _of(problem: Problem, keys: Sequence[str]) -> Problem:
         coordinates,
         transforms={k: φ for k, φ in coordinates.transforms.items() if k in keys},
         preconditioners={k: S for k, S in coordinates.preconditioners.items() if k in keys},
+        repeated={k: n for k, n in coordinates.repeated.items() if k in keys},
     )
     return found
 

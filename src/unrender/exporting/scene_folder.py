@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.backend import variant
-from unrender.core import arrays
+from unrender.core import arrays, periodic
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.exporting import asset, maps, ready_made
@@ -140,7 +140,8 @@ def _write(
     spp: int,
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
-    notices = maps.write(values, folder)
+    repeated = {key: measure.repeated for key, measure in problem.measures.items()}
+    notices = maps.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
     others = [name for name in asked if name != MITSUBA]
     if renderer.pair.emissive:
         if others:

@@ -65,10 +65,19 @@ def read(source: Any, linearise: bool = True) -> Picture:
     return picture
 
 
-def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(H, W, C) to (height, width, C): smoothed before it shrinks, linear between pixels where it grows."""
+def resize(values: np.ndarray, height: int, width: int, around: bool = False) -> np.ndarray:
+    """Return a picture (H, W, C) as (height, width, C): smoothed before it shrinks, linear between pixels where it grows.
+
+    Args:
+        values: the picture.
+        height: of the result.
+        width: of the result.
+        around: whether its left and right borders are neighbours, as in an environment map.
+    """
     if values.shape[:2] == (height, width):
         return values
+    if around:
+        return np.ascontiguousarray(resize(np.tile(values, (1, 3, 1)), height, 3 * width)[:, width : 2 * width])
     from skimage import transform
 
     scaled = transform.resize(values, (height, width, values.shape[2]), order=1, anti_aliasing=True, mode="edge")

@@ -7,24 +7,33 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import periodic
 from unrender.core.errors import InputError
 from unrender.io import images, resampling, volumes
+from unrender.io.file_conversion import MESH_FILES, PLAIN, FileConversion
 
 __all__ = ["fill"]
 
 
-def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
-    """`initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
+def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> tuple[np.ndarray, str]:
+    """Return `initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
 
-    A number fills any shape; a colour fills the last axis; a picture file is scaled to (H, W, C), a .vol file to (Z, Y, X, C); an
-    array, also of a .npy file or the only one of an .npz archive, must have the shape, but for the last axis where that is of length 1.
-    Where the shape has one axis, as of a mesh's vertices (n V,), it may be (V, n), too.
+    A number fills any shape; a colour fills the last axis. A picture file fills (H, W, C) and a .vol file (Z, Y, X, C); files of other
+    resolutions are resized. A mesh file fills values at vertices. An array, also of a .npy file or the only one of an .npz archive, must
+    have the shape; the last axis may be missing where its length is 1. Where the shape has one axis, as of a mesh's vertices (n V,), it may
+    be (V, n), too. Where outer columns repeat others, pictures and arrays may leave them out.
+
+    Args:
+        initial: the value as given.
+        shape: of the parameter.
+        conversion: what the renderer does to such a file when it loads a scene.
 
     Raises:
         InputError: it does not fit, cannot be read, or is not finite.
     """
     if isinstance(initial, (str, Path)):
-        return _from_file(initial, shape)
+        found, notice = _from_file(Path(initial), shape, conversion)
+        return periodic.repeat(conversion.stored(found), conversion.repeated), notice
     try:
         array = np.asarray(initial)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
@@ -38,27 +47,31 @@ def fill(initial: Any, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     if not np.isfinite(array).all():
         raise InputError("must be finite, got NaN or infinite values")
     if array.shape == shape:
-        return array, ""
+        return periodic.repeat(array, conversion.repeated), ""
+    if array.shape == conversion.picture_shape(shape):
+        return periodic.pad(array, conversion.repeated), ""
     if len(shape) == 1 and array.size == shape[0] and array.ndim == 2:
         return array.reshape(shape), ""
     scalar = array.shape in ((), (1,))
     colour = array.ndim == 1 and len(shape) > 1 and array.shape[0] == shape[-1]
     if scalar or colour:
         return np.array(np.broadcast_to(array.reshape(-1) if colour else array.reshape(()), shape)), ""
-    raise InputError(f"expected {_expected(shape)}, got an array of shape {array.shape}")
+    raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {array.shape}")
 
 
-def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
-    ending = Path(path).suffix.lower()
+def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -> tuple[np.ndarray, str]:
+    ending = path.suffix.lower()
     if ending == ".vol":
-        return _from_grid(Path(path), shape)
+        return _from_grid(path, shape)
+    if ending in MESH_FILES:
+        return _from_mesh(path, shape, conversion), ""
     if ending in (".npy", ".npz"):
-        array = volumes.read_numpy(Path(path), lambda found: _check_shape(found, shape))
-        return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape)
-    picture = images.read(path)
+        array = volumes.read_numpy(path, lambda found: _check_shape(found, shape, conversion))
+        return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape, conversion)
+    picture = images.read(path, not conversion.raw)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
-    height, width, channels = shape
+    height, width, channels = conversion.picture_shape(shape)
     values, remarks = picture.values, [picture.notice.partition(": ")[2]] if picture.notice else []
     if channels == 1 and values.shape[2] == 3:
         values = images.luminance(values)
@@ -71,8 +84,19 @@ def _from_file(path: str | Path, shape: tuple[int, ...]) -> tuple[np.ndarray, st
         raise InputError(f"{path}: a picture cannot fill a parameter of {channels} channels")
     if values.shape[:2] != (height, width):
         remarks.append(f"scaled from {values.shape[1]}x{values.shape[0]} to {width}x{height}")
-        values = images.resize(values, height, width)
-    return np.ascontiguousarray(values, np.float32), f"{Path(path).name}: {', '.join(remarks)}" if remarks else ""
+        values = images.resize(values, height, width, around=conversion.repeated > 0)
+    values = periodic.pad(np.ascontiguousarray(values, np.float32), conversion.repeated)
+    return values, f"{path.name}: {', '.join(remarks)}" if remarks else ""
+
+
+def _from_mesh(path: Path, shape: tuple[int, ...], conversion: FileConversion) -> np.ndarray:
+    if conversion.vertices is None:
+        raise InputError(f"{path}: a mesh file cannot fill this parameter, expected {_expected(shape)}")
+    values = conversion.vertices(path)
+    if values.shape != shape:
+        numbers = f"{values.size} numbers at its vertices, and the scene's mesh has {shape[0]}"
+        raise InputError(f"{path}: has {numbers}; give a mesh of as many vertices, in the same order")
+    return values
 
 
 def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
@@ -89,21 +113,21 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     return resampling.resize(grid, shape[:-1]), f"{path.name}: scaled from {sizes[0]} to {sizes[1]} voxels"
 
 
-def _check_shape(found: tuple[int, ...], shape: tuple[int, ...]) -> None:
+def _check_shape(found: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
     """Raise `InputError` where no array of this shape fills the parameter's, before it is read."""
     number, colour = found in ((), (1,)), len(found) == 1 and len(shape) > 1 and found[0] == shape[-1]
     bare = len(shape) > 1 and shape[-1] == 1 and found == shape[:-1]
-    if not (number or colour or bare or found == shape):
-        raise InputError(f"expected {_expected(shape)}, got an array of shape {found}")
+    if not (number or colour or bare or found in (shape, conversion.picture_shape(shape))):
+        raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {found}")
 
 
-def _expected(shape: tuple[int, ...]) -> str:
+def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str:
     if not shape:
         return "a number"
     if shape == (3,):
         return "a number or a colour (3 numbers)"
     colour = "a colour (3 numbers), " if len(shape) > 1 and shape[-1] == 3 else ""
-    return f"a number, {colour}or an array of shape {shape}"
+    return f"a number, {colour}or an array of shape {conversion.picture_shape(shape)}"
 
 
 def _short(value: Any) -> str:

@@ -35,10 +35,17 @@ class Optimizer(Protocol):
 
 @runtime_checkable
 class OnMeshes(Protocol):
-    """An optimizer whose own preconditioners act along the edges of meshes, so it has to know these."""
+    """An optimizer that has preconditioners which need to know the neighbours of a parameter's elements."""
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Optimizer:
-        """Return the same optimizer for meshes that `topology` returns by the parameter's key; None for what has no mesh."""
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> Optimizer:
+        """Return the same for a problem's parameters.
+
+        Args:
+            topology: returns the mesh of a parameter; None for what has none.
+            repeated: returns the number of outer columns that repeat those of the opposite end; None where no parameter has any.
+        """
         ...
 
 

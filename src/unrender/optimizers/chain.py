@@ -131,7 +131,9 @@ class Chain(Recipe):
         """See `Recipe.compose`."""
         return self.transforms
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Chain:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> Chain:
         """See `OnMeshes.on_meshes`."""
-        bound = (part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in self.transforms)
+        bound = (part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in self.transforms)
         return replace(self, transforms=tuple(bound))  # pyright: ignore[reportArgumentType]

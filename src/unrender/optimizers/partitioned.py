@@ -68,10 +68,14 @@ class Partitioned:
         """A gradient."""
         return Capabilities(Gradient)
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> Partitioned:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> Partitioned:
         """See `OnMeshes.on_meshes`."""
-        parts = (self.optimizer, self.others)
-        own, others = (part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in parts)
+        own, others = (
+            part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part
+            for part in (self.optimizer, self.others)
+        )
         return replace(self, optimizer=own, others=others)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> PartitionedState:

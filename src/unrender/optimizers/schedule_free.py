@@ -96,10 +96,12 @@ class ScheduleFree(Recipe):
         moved = checked_keys("ScheduleFree: reparameterised", self.reparameterised)
         object.__setattr__(self, "reparameterised", moved)
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> ScheduleFree:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> ScheduleFree:
         """See `OnMeshes.on_meshes`."""
         optimizer = replace(self)
-        object.__setattr__(optimizer, "_smoothing", self._smoothing.on_meshes(topology))
+        object.__setattr__(optimizer, "_smoothing", self._smoothing.on_meshes(topology, repeated))
         return optimizer
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from unrender.core.arrays import Array
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["MeshPreconditioner", "Preconditioner"]
+__all__ = ["MeshPreconditioner", "PeriodicPreconditioner", "Preconditioner"]
 
 
 class Preconditioner(Protocol):
@@ -31,4 +31,13 @@ class MeshPreconditioner(Protocol):
 
     def on_mesh(self, topology: MeshTopology) -> Preconditioner:
         """The same for values at the V vertices of a mesh, (n V,)."""
+        ...
+
+
+@runtime_checkable
+class PeriodicPreconditioner(Protocol):
+    """A preconditioner that suits an array whose outer columns repeat those of the opposite end, such as an environment map."""
+
+    def on_repeated(self, columns: int) -> Preconditioner:
+        """Return the same for (H, W + 2 `columns`, C): neighbours go on across the left and right borders."""
         ...

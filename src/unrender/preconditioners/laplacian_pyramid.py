@@ -8,7 +8,7 @@ Xu 1990, "Parallel Multilevel Preconditioners".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.preconditioners import grid
+from unrender.preconditioners.around import Around, around_axis
 
 __all__ = ["LaplacianPyramid"]
 
@@ -68,6 +69,10 @@ class LaplacianPyramid:
         if not _LEAST_FALLOFF <= checks.number("LaplacianPyramid", "falloff", self.falloff, above=0.0) <= 1:
             raise InputError(f"LaplacianPyramid: falloff must be from {_LEAST_FALLOFF} to 1, got {self.falloff!r}")
         object.__setattr__(self, "wrap", grid.wraps("LaplacianPyramid", self.wrap))
+
+    def on_repeated(self, columns: int) -> Around:
+        """Return the preconditioner of an environment map."""
+        return Around(replace(self, wrap=around_axis(self.wrap)), columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""

@@ -5,12 +5,13 @@ After Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid
+from unrender.preconditioners.around import Around, around_axis
 from unrender.preconditioners.mesh import MeshTopology
 
 __all__ = ["LargeSteps"]
@@ -49,6 +50,10 @@ class LargeSteps:
         bound = LargeSteps(self.strength, self.wrap)
         object.__setattr__(bound, "_mesh", topology)
         return bound
+
+    def on_repeated(self, columns: int) -> Around:
+        """Return the preconditioner of an environment map."""
+        return Around(replace(self, wrap=around_axis(self.wrap)), columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""

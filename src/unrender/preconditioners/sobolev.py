@@ -10,10 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from unrender.core import arrays, checks
+from unrender.core import arrays, checks, periodic
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid, grid_pyramid
+from unrender.preconditioners.around import Around, around_axis
 from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
 __all__ = ["Sobolev"]
@@ -50,6 +51,7 @@ class Sobolev:
     wrap: bool | tuple[bool, ...] = False
     correlation: float = 1 / 8
     _spectrum: MeshSpectrum | None = field(default=None, init=False, repr=False, compare=False)
+    _columns: int = field(default=0, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if self.strength is not None:
@@ -61,10 +63,16 @@ class Sobolev:
         """See `MeshPreconditioner.on_mesh`."""
         return replace(self)._bound(MeshSpectrum(topology, self._strength_on(topology)))
 
+    def on_repeated(self, columns: int) -> Sobolev:
+        """Return the preconditioner of an environment map. A large one, see above, keeps borders on all sides."""
+        return replace(self)._bound(None, columns)
+
     def check(self, key: str, shape: tuple[int, ...]) -> None:
         """See `Preconditioner.check`."""
         if self._spectrum is not None:
             return
+        if (around := self._around(shape)) is not None:
+            return around.check(key, shape)
         grid.check("Sobolev", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
@@ -74,6 +82,8 @@ class Sobolev:
             return arrays.like(spectrum.root(self._strength_on(spectrum.topology), values).reshape(-1), x)
         shape = arrays.shape(x)
         self.check("parameter", shape)
+        if (around := self._around(shape)) is not None:
+            return around.apply(x)
         if (pyramid := self._pyramid(shape)) is not None:
             return pyramid.apply(x, self.strength_of(shape), 0.5)
         solver = grid.square_root_solver(self.strength_of(shape), shape[:-1], self._wraps(shape))
@@ -90,7 +100,7 @@ class Sobolev:
         """λ for a texture or grid of this shape; of its mesh, where it has one."""
         if self._spectrum is not None:
             return self._strength_on(self._spectrum.topology)
-        cells = shape[:-1]
+        cells = periodic.interior_shape(shape, self._columns)[:-1]
         if self.strength is not None:
             return float(self.strength)
         return (self.correlation * math.prod(cells) ** (1 / len(cells))) ** 2
@@ -101,7 +111,7 @@ class Sobolev:
             found = replace(self, correlation=self.correlation * math.sqrt(share))
         else:
             found = replace(self, strength=self.strength * share)
-        return found._bound(self._spectrum)
+        return found._bound(self._spectrum, self._columns)
 
     def descents(self, smooth: Array, gradient: Array, shares: np.ndarray) -> np.ndarray:
         """With `shares` s of λ and S_s = (I + s λ L)^(-1/2), of two estimates g and g' of a gradient: S_s g · S_s g' and |S_s g|².
@@ -118,6 +128,9 @@ class Sobolev:
             first, second = (spectrum.topology.split("Sobolev", arrays.numpy(x)) for x in (smooth, gradient))
             return spectrum.descents(self._strength_on(spectrum.topology), first, second, shares)
         shape = arrays.shape(gradient)
+        if (around := self._around(shape)) is not None:
+            first, second = (periodic.interior(arrays.numpy(x), self._columns) for x in (smooth, gradient))
+            return around.inner.descents(first, second, shares)
         transform = grid.transform(shape[:-1], self._wraps(shape))
         strength, eigenvalues = self.strength_of(shape), transform.eigenvalues
         first = transform.forward(arrays.numpy(smooth)) * np.sqrt(1.0 + strength * eigenvalues)
@@ -146,14 +159,21 @@ class Sobolev:
 
     def _pyramid(self, shape: tuple[int, ...]) -> grid_pyramid.GridPyramid | None:
         """That stands in for transforms of a large grid; None where it does not, as on meshes."""
-        if self._spectrum is not None:
+        if self._spectrum is not None or self._around(shape) is not None:
             return None
         if math.prod(shape[:-1]) <= grid_pyramid.LARGEST_EXACT or any(self._wraps(shape)):
             return None
         return grid_pyramid.pyramid(shape[:-1])
 
-    def _bound(self, spectrum: MeshSpectrum | None) -> Sobolev:
+    def _around(self, shape: tuple[int, ...]) -> Around[Sobolev] | None:
+        """The map of an environment map that is not too large for transforms; None for all else."""
+        if not self._columns or math.prod(shape[:2]) > grid_pyramid.LARGEST_EXACT:
+            return None
+        return Around(replace(self, wrap=around_axis(self.wrap)), self._columns)
+
+    def _bound(self, spectrum: MeshSpectrum | None, columns: int = 0) -> Sobolev:
         object.__setattr__(self, "_spectrum", spectrum)
+        object.__setattr__(self, "_columns", columns)
         return self
 
     def _strength_on(self, mesh: MeshTopology) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, periodic, trees
 from unrender.core.trees import Tree
 from unrender.parameterisations.base import Transform
 from unrender.preconditioners.base import Preconditioner
@@ -18,15 +18,17 @@ class Coordinates:
     """x = φ(u), u = S v: φ of a parameter's parameterisation, S its preconditioner, each the identity where there is none.
 
     An optimizer is given u, and the gradient by v; its steps are of v. φ is known by its slope at the present parameters: {key: φ'} of the
-    parameters that have one.
+    parameters that have one. Outer columns that repeat others are no unknowns: gradients and steps there are copies.
 
     Attributes:
         transforms: {key: φ}.
         preconditioners: {key: S}.
+        repeated: {key: number of columns at each end that repeat those of the opposite end}, see `core.periodic`.
     """
 
     transforms: Mapping[str, Transform]
     preconditioners: Mapping[str, Preconditioner]
+    repeated: Mapping[str, int] = field(default_factory=dict)
 
     def of(self, parameters: Tree) -> Tree:
         """u."""
@@ -67,7 +69,8 @@ class Coordinates:
 
     def _smoothed(self, tree: Tree) -> Tree:
         maps = self.preconditioners
-        return {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
+        found = {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
+        return {key: periodic.repeat(x, self.repeated.get(key, 0)) for key, x in found.items()}
 
 
 def _times(tree: Tree, factors: Tree) -> Tree:

@@ -24,10 +24,11 @@ class Parameter:
 
     Args:
         key: as `mitsuba.traverse` names it, e.g. ``"back.bsdf.reflectance.data"``.
-        initial: where the descent starts: a number, a colour, an image or grid file, an array of the parameter's shape (a number
-            or a colour fills it), or None for the scene's own value. An image file is scaled to the resolution of a texture (H, W, C),
-            a `.vol` file to that of a grid (Z, Y, X, C); 8-bit images are taken as sRGB and linearised. A `.npy` file, or an `.npz`
-            archive of one array, must have the parameter's shape; a last axis of length 1 may be missing.
+        initial: where the descent starts: a number, a colour, an array, a file, or None for the scene's own value. A number or a
+            colour fills the parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated
+            columns of an environment map, the transform of a mesh. Pictures and `.vol` grids of another resolution are resized. A `.npy`
+            file, or an `.npz` archive of one array, must have the parameter's shape; a last axis of length 1 may be missing, and so may
+            the repeated columns of an environment map.
         bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
         learning_rate: this parameter's own; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.

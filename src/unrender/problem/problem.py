@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
+from unrender.evaluation.parameter_errors import ErrorMeasure
 from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
@@ -95,6 +97,8 @@ class Problem(ViewLosses):
         self_intersections: {key: "warn", "prevent" or "ignore"} of the parameters that are vertex positions.
         regularizers: {key: `MeshRegularizer`} of the parameters that have one.
         coordinates: what an optimizer moves, by parameterisations and preconditioners.
+        measures: {key: `evaluation.parameter_errors.ErrorMeasure`}, how errors against the truth are measured: the root mean square
+            difference, of normals and directions the mean angle in degrees.
         references: values and weights of single pixels of the references.
         truth: {key: array} of the parameters' shapes.
         surfaces: as given.
@@ -150,7 +154,8 @@ class Problem(ViewLosses):
         self.parameterisations = {k: p for k, found in checked.items() if (p := found.parameterisation) is not None}
         self.regularizers = {k: r for k, found in checked.items() if (r := found.regularizer) is not None}
         transforms = {k: t for k, found in checked.items() if (t := found.transform) is not None}
-        self.coordinates = Coordinates(transforms, self.preconditioners)
+        self.measures = {key: ErrorMeasure(known[key].role, known[key].conversion.repeated) for key in checked}
+        self.coordinates = Coordinates(transforms, self.preconditioners, self.repeated)
         self.first_values = {key: found.initial for key, found in checked.items()}
         meshes = {key: mesh() for key in checked if (mesh := known[key].moving_mesh) is not None}
         self.faces = {key: np.asarray(faces).astype(np.int64).reshape(-1, 3) for key, (_, faces) in meshes.items()}
@@ -172,8 +177,10 @@ class Problem(ViewLosses):
     def _checked_truth(self, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """True values as arrays; adds to the notices."""
         found: dict[str, np.ndarray] = {}
+        known = self.renderer.parameters()
+        infos = {key: known[key] for key in self.first_values}
         for key, value in given.items():
-            found[key], notice = check_truth(key, value, self.shapes())
+            found[key], notice = check_truth(key, value, infos)
             self.notices += [f"parameter {key}: truth {notice}"] if notice else []
         return found
 
@@ -237,7 +244,8 @@ class Problem(ViewLosses):
             if "coarse_to_fine" in new:
                 check_resolutions(key, new["coarse_to_fine"], known[key])
                 made.coarse_to_fine[key] = new["coarse_to_fine"]
-        made.parameters, made.coordinates = tuple(parameters), Coordinates(transforms, made.preconditioners)
+        made.parameters = tuple(parameters)
+        made.coordinates = replace(self.coordinates, transforms=transforms, preconditioners=made.preconditioners)
         return made
 
     def topology(self, key: str) -> MeshTopology | None:
@@ -331,18 +339,26 @@ class Problem(ViewLosses):
         return found if len(found) == self.first_values[key].size // 3 else None
 
     @property
+    def repeated(self) -> dict[str, int]:
+        """{key: number of columns at each end that repeat those of the opposite end} of environment maps."""
+        return {key: measure.repeated for key, measure in self.measures.items() if measure.repeated}
+
+    @property
     def has_truth(self) -> bool:
         """Whether any parameter's true value, or surface, is known."""
         return bool(self.truth or self.surfaces)
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
-        """Root mean square error against the truth, for each key whose truth is known; of meshes whose true surface is, the root
-        mean square distance between the surfaces (`evaluation.surfaces.surface_error`). Waits for the device."""
+        """Return the error of each parameter whose truth is known, see `measures`. Waits for the device.
+
+        The error of a mesh whose true surface is known is the root mean square distance between the surfaces
+        (`evaluation.surfaces.surface_error`).
+        """
         found = self.full({key: parameters[key] for key in (*self.truth, *self.surfaces)})
-        errors = {
-            key: float(np.sqrt(np.mean(np.square(found[key] - truth, dtype=np.float64))))
-            for key, truth in self.truth.items()
-        }
+        errors = {}
+        for key, truth in self.truth.items():
+            error = self.measures[key].error(found[key], truth)
+            errors[key] = math.nan if error is None else error
         for key, surface in self.surfaces.items():
             if found[key].size == self.first_values[key].size:
                 errors[key] = surface_error(Surface(found[key].reshape(-1, 3), self.faces[key]), surface)

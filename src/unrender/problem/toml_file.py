@@ -7,7 +7,7 @@
 
     [[parameters]]
     key = "wall.bsdf.reflectance.data"
-    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), an array (.npy, .npz)
+    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), a mesh, an array (.npy)
     bounds = [0.0, 1.0]                        # inf and -inf are open
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
@@ -49,7 +49,7 @@ _Number = StrictFloat | StrictInt
 class _Parameter(Table):
     key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
     initial: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
     )
     bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is open)")
     learning_rate: _Number | None = Field(None, description="a number above 0")
@@ -75,7 +75,7 @@ class _Parameter(Table):
         "warn", description='of vertex positions, "warn", "prevent" or "ignore"'
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
-        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, .npy or .npz file"
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
     )
 
 

@@ -18,7 +18,7 @@ from unrender.core.text import shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Parameterisation, Transform
-from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import coarse_to_fine
 from unrender.problem.bounds import project
@@ -239,6 +239,8 @@ def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> 
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     if isinstance(preconditioner, MeshPreconditioner) and (topology := mesh_topology(info)) is not None:
         preconditioner = preconditioner.on_mesh(topology)
+    elif isinstance(preconditioner, PeriodicPreconditioner) and info.conversion.repeated:
+        preconditioner = preconditioner.on_repeated(info.conversion.repeated)
     try:
         preconditioner.check(key, info.shape)
     except InputError as error:
@@ -273,7 +275,7 @@ def _check_resolutions(schedule: CoarseToFine, info: ParameterInfo) -> None:
 def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> tuple[np.ndarray, str]:
     """The initial value, float32, and what was changed to make it fit, "" for nothing."""
     if parameter.initial is not None:
-        return parameter_values.fill(parameter.initial, info.shape)
+        return parameter_values.fill(parameter.initial, info.shape, info.conversion)
     # On a CPU the scene's own memory, which nobody writes to: grids and textures can be as large as all else.
     start = np.asarray(arrays.view(renderer.values([parameter.key])[parameter.key]), np.float32)
     if not np.isfinite(start).all():
@@ -295,12 +297,21 @@ def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]
     return np.asarray(np.clip(start, low, high), np.float32), notice  # of a number, clip returns no array
 
 
-def check_truth(key: str, value: Any, shapes: Mapping[str, tuple[int, ...]]) -> tuple[np.ndarray, str]:
-    """The true value of a parameter, float32, and what was changed to make it fit, "" for nothing. Raises `FieldError`."""
-    if key not in shapes:
-        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, shapes)}")
+def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:
+    """Return the true value of a parameter, float32, and what was changed to make it fit, "" for nothing.
+
+    Args:
+        key: of the parameter.
+        value: as given.
+        known: the problem's parameters.
+
+    Raises:
+        FieldError: it does not suit.
+    """
+    if key not in known:
+        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, known)}")
     try:
-        return parameter_values.fill(value, shapes[key])
+        return parameter_values.fill(value, known[key].shape, known[key].conversion)
     except InputError as error:
         raise FieldError(("truth", key), str(error)) from error
 

@@ -16,6 +16,8 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.evaluation.parameter_errors import Role
+from unrender.io.file_conversion import PLAIN, FileConversion
 
 __all__ = [
     "CountingSession",
@@ -66,6 +68,9 @@ class ParameterInfo:
         mesh: of values at the V vertices of a mesh, (n V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
         welded: whether they are its positions, which vertices at the same place share.
         resizable: whether it may be rendered at other resolutions than its own, (H, W, C) or (Z, Y, X, C).
+        conversion: what the renderer does to a file's values when it loads such a parameter.
+        role: what the values stand for: numbers, normals or directions. Of the last two, errors are angles.
+        brightness: what the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
     """
 
     shape: tuple[int, ...]
@@ -82,6 +87,9 @@ class ParameterInfo:
     sensor: int | None = None
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
     welded: bool = False
+    conversion: FileConversion = PLAIN
+    role: Role = "value"
+    brightness: Literal["", "light", "reflectance"] = ""
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

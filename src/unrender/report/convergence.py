@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from unrender.display import plots
 from unrender.display.plots import Chart, Line
+from unrender.evaluation import parameter_errors
 from unrender.report import curves
 from unrender.report.curves import Series
 from unrender.runs.folder.reader import RunFolder
@@ -22,7 +23,7 @@ def charts(run: RunFolder, axis: str) -> list[Chart]:
     errors = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     lines = [Line(key, getattr(s, axis), s.values, colour=i) for i, (key, s) in enumerate(errors)]
     found = [
-        plots.chart("Parameter error (RMSE)", lines, axis, end),
+        plots.chart(parameter_errors.title(run.measure(key) for key, _ in errors), lines, axis, end),
         plots.chart("Loss", [Line("loss", loss.x, loss.median, loss.low, loss.high)], axis, end),
         plots.chart("Gradient noise (share)", [Line("noise", noise.x, noise.median, noise.low, noise.high)], axis, end),
     ]
@@ -36,7 +37,8 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
         return []
     keys = [key for run in runs.values() for key in run.known]
     single = len(set(keys)) == 1
-    title = "Parameter error (RMSE)" if single else "Parameter error, relative to the start"
+    measures = [run.measure(key) for run in runs.values() for key in run.known]
+    title = parameter_errors.title(measures) if single else "Parameter error, relative to the start"
     errors = {label: _error(run, single) for label, run in runs.items()}
     lines = {
         title: [Line(k, getattr(s, axis), s.values, colour=colours[k]) for k, s in errors.items() if s is not None],

@@ -54,7 +54,7 @@ class Band:
 
 
 def parameter_error(run: RunFolder, key: str) -> Series | None:
-    """A parameter's root mean square error from start to end of the run; None where its truth is unknown."""
+    """A parameter's error from start to end of the run; None where its truth is unknown."""
     if key not in run.known:
         return None
     history = run.history

@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.display.plots import AXES
+from unrender.evaluation import parameter_errors
 from unrender.report import curves, image_metrics
 from unrender.report.curves import Band, Series
 from unrender.report.groups import Group
@@ -174,7 +175,7 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
             )
         )
     for key in keys:
-        title = f"Parameter error (RMSE): {key}"
+        title = f"{parameter_errors.title([first_run.measure(key)])}: {key}"
         found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, ends))
     found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, ends))
     # With several parameters the mean over them comes first, then the loss, then each on its own.

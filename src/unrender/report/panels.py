@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unrender.core import periodic
 from unrender.display import formatting, maps
 from unrender.display.maps import is_map
 from unrender.report import tone_mapping
@@ -147,8 +148,12 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
 
 def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Panel:
     """A recovered texture or volume against its truth, or against its start where the truth is unknown; and how much the images tell."""
-    result, initial = run.parameters[key], run.initial[key]
-    truth, sensitivity = run.truth.get(key), run.sensitivity.get(key)
+    known = (of.get(key) for of in (run.parameters, run.initial, run.truth, run.sensitivity))
+    columns = run.measure(key).repeated
+    result, initial, truth, sensitivity = (
+        x if x is None or not is_map(x) else periodic.interior(x, columns) for x in known
+    )
+    assert result is not None
     scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
     planes = maps.planes(result)

@@ -10,6 +10,7 @@ from unrender.display import formatting
 from unrender.evaluation import debiased
 from unrender.report import curves, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
+from unrender.runs.sensitivity import seen_cells
 
 __all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "parameter_row", "tiles", "view_rows"]
 
@@ -37,7 +38,13 @@ class Tile:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One line of the table of parameters. Values as text, errors as numbers, None where not known."""
+    """One line of the table of parameters. Values as text, errors as numbers, None where not known.
+
+    Attributes:
+        unit: of the errors, "" for that of the values.
+        error_seen: at the end, over the cells that the pictures tell of.
+        seen: the share of these cells.
+    """
 
     key: str
     shape: str
@@ -47,6 +54,9 @@ class ParameterRow:
     swatch: str
     error_before: float | None
     error_after: float | None
+    unit: str = ""
+    error_seen: float | None = None
+    seen: float | None = None
 
 
 @dataclass(frozen=True)
@@ -70,7 +80,10 @@ def tiles(run: RunFolder) -> list[Tile]:
     found = []
     series = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     if len(series) == 1:
-        found.append(_tile("Parameter error", float(series[0][1].values[0]), float(series[0][1].values[-1]), "RMSE"))
+        key, errors = series[0]
+        first, last = float(errors.values[0]), float(errors.values[-1])
+        measure = run.measure(key)
+        found.append(_tile("Parameter error", first, last, measure.name, measure.unit))
     elif (relative := curves.relative_error(run, run.known)) is not None:
         found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
     after = curves.image_error(run)
@@ -109,14 +122,14 @@ def _image_error(run: RunFolder) -> Tile | None:
     return Tile("Image error", after, f"RMSE without the pictures' noise, from {before}")
 
 
-def _tile(label: str, before: float | None, after: float, unit: str) -> Tile:
-    return Tile(
-        label, formatting.number(after), f"{unit}, from {formatting.number(before)}" if before is not None else unit
-    )
+def _tile(label: str, before: float | None, after: float, what: str, unit: str = "") -> Tile:
+    note = f"{what}, from {formatting.number(before)}{unit}" if before is not None else what
+    return Tile(label, f"{formatting.number(after)}{unit}", note)
 
 
 def parameter_row(run: RunFolder, key: str) -> ParameterRow:
     """One parameter."""
+    measure, told = run.measure(key), run.sensitivity.get(key)
     result, initial, truth = run.parameters[key], run.initial[key], run.truth.get(key)
     return ParameterRow(
         key,
@@ -127,6 +140,9 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
         _swatch(result),
         run.error_before.get(key),
         run.error_after.get(key),
+        measure.unit,
+        None if told is None or truth is None else measure.error(result, truth, seen_cells(told)),
+        None if told is None or (where := seen_cells(told)) is None else float(where.mean()),
     )
 
 

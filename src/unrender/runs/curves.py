@@ -26,7 +26,7 @@ def loss(history: Sequence[Mapping[str, Any]]) -> Curve:
 
 
 def parameter_errors(history: Sequence[Mapping[str, Any]], initial: Mapping[str, float]) -> dict[str, Curve]:
-    """{key: root mean square error} where it was measured, from the start's `initial` on."""
+    """{key: error} where it was measured, from the start's `initial` on."""
     found: dict[str, Curve] = {}
     for key, first in initial.items():
         known = [

@@ -52,7 +52,7 @@ def plot(result: Result) -> ResultFigure:
             axes.set_axis_off()
     below = grid[rows].subgridspec(1, 2)
     errors = curves.parameter_errors(result.history, notebook.start_errors(result))
-    _draw(figure.add_subplot(below[0]), "parameter error (RMSE)", errors)
+    _draw(figure.add_subplot(below[0]), notebook.error_title(result).lower().replace("rmse", "RMSE"), errors)
     _draw(figure.add_subplot(below[1]), "loss, of the steps' samples", {"loss": curves.loss(result.history)})
     return figure
 

@@ -13,6 +13,7 @@ from unrender.evaluation import debiased
 from unrender.io.thumbnails import resize_nearest
 from unrender.problem.problem import Problem
 from unrender.problem.render import render
+from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
 
@@ -24,6 +25,8 @@ _SHARE, _LEAST_SECONDS = 0.05, 1.0
 """Of the time of the steps, what final pictures may take, but a second at least."""
 _SENSITIVITY_SHARE = 0.5
 """Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
+_LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
+"""Of the time of the steps, what each of two looks at what the pictures do not determine may take, but a quarter of a second at least."""
 _TRIAL_PATHS = 1 << 18
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
@@ -42,12 +45,14 @@ class FinalImages:
         errors: see `Result.image_errors`.
         spp: samples per pixel of each.
         sensitivity: see `Result.sensitivity`.
+        undetermined: see `Result.undetermined`.
     """
 
     pictures: dict[str, np.ndarray]
     errors: dict[str, tuple[float, float]]
     spp: int
     sensitivity: dict[str, np.ndarray]
+    undetermined: tuple[str, ...] = ()
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -92,7 +97,18 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
         seconds = _SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS)
         everything = len(chosen) == len(problem.views)
         found = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
-    return FinalImages(pictures, errors, samples, found)
+        lines = _undetermined(problem, result, found) if everything else []
+    return FinalImages(pictures, errors, samples, found, tuple(lines))
+
+
+def _undetermined(problem: Problem, result: Result, found: Mapping[str, np.ndarray]) -> list[str]:
+    """What the pictures do not determine, in lines; of a run without steps nothing."""
+    if not result.steps:
+        return []
+    lines = undetermined_cells(found)
+    spp, seconds = _trial_spp(problem), max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS)
+    lines += common_factor(problem, result.parameters, spp, seconds)
+    return lines + undetermined(problem, result.parameters, spp, seconds)
 
 
 def _chosen(problem: Problem) -> list[int]:
@@ -126,8 +142,7 @@ def _picture(
 def _affordable(problem: Problem, result: Result) -> int:
     """Samples per pixel that final pictures may have: what they take is measured on a few samples of the first view."""
     sizes = [height * width for height, width in problem.sizes]
-    most = min(min(max(_PICTURE_PATHS // size, _FEWEST), _MOST) for size in sizes)
-    trial = _power_of_two(min(max(_TRIAL_PATHS // sizes[0], 1), most // 2))
+    most, trial = _most_spp(problem), _trial_spp(problem)
     seconds = 0.0
     for seed in (0, 1):  # the first time, kernels are compiled
         started = time.perf_counter()
@@ -136,6 +151,16 @@ def _affordable(problem: Problem, result: Result) -> int:
     allowed = max(_SHARE * result.seconds, _LEAST_SECONDS)
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
     return max(2, _power_of_two(int(min(most, paths / (2 * sum(sizes))))))
+
+
+def _most_spp(problem: Problem) -> int:
+    return min(min(max(_PICTURE_PATHS // (height * width), _FEWEST), _MOST) for height, width in problem.sizes)
+
+
+def _trial_spp(problem: Problem) -> int:
+    """Samples per pixel of renderings that tell something in little time."""
+    height, width = problem.sizes[0]
+    return _power_of_two(min(max(_TRIAL_PATHS // (height * width), 1), _most_spp(problem) // 2))
 
 
 def _power_of_two(number: int) -> int:

@@ -24,6 +24,7 @@ from unrender.runs.callbacks import Callback
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines
 from unrender.runs.folder.schema import COMMANDS, CONTROL, LIVE, LIVE_START, LIVE_STATUS, LIVE_VIEWS
+from unrender.runs.metadata import recorded_measures
 from unrender.runs.result import hardware, versions
 
 if TYPE_CHECKING:
@@ -202,7 +203,12 @@ class Live(Callback):
             versions=versions(),
             hardware=hardware(),
             variant=current() or "",
-            problem={"parameters": list(initial), "views": len(run.problem.views), "loss": repr(run.problem.loss)},
+            problem={
+                "parameters": list(initial),
+                "views": len(run.problem.views),
+                "loss": repr(run.problem.loss),
+                "measures": recorded_measures(run.problem),
+            },
         )
         _write_json(self._live / schema.RECORD, record)
         self._start = None

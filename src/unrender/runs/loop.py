@@ -85,7 +85,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
             )
     if isinstance(optimizer, OnMeshes):
-        optimizer = optimizer.on_meshes(problem.topology)
+        optimizer = optimizer.on_meshes(problem.topology, lambda key: problem.repeated.get(key, 0))
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)

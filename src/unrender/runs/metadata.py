@@ -11,12 +11,23 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.estimators.base import Estimator
+from unrender.evaluation.parameter_errors import PLAIN
 from unrender.problem.fingerprint import fingerprint
+from unrender.problem.problem import Problem
 from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 
-__all__ = ["RunAnnotations", "RunMetadata", "describe", "describe_run", "fingerprint_of", "first_values", "to_numpy"]
+__all__ = [
+    "RunAnnotations",
+    "RunMetadata",
+    "describe",
+    "describe_run",
+    "fingerprint_of",
+    "first_values",
+    "recorded_measures",
+    "to_numpy",
+]
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -114,11 +125,17 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
             "views": len(problem.views),
             "loss": loss,
             "max_depth": problem.max_depth,
+            "measures": recorded_measures(problem),
             **({} if problem.executor.variant is None else {"workers": problem.executor.variant}),
         },
         "truth": problem.truth,
         "meshes": arrays_of(problem),
     }
+
+
+def recorded_measures(problem: Problem) -> dict[str, Any]:
+    """Return how errors are measured as a run folder records it: without the plain measures."""
+    return {key: measure.record() for key, measure in problem.measures.items() if measure != PLAIN}
 
 
 def fingerprint_of(run: Run) -> dict[str, str]:

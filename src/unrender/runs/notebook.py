@@ -6,15 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unrender.core import periodic
 from unrender.display import formatting, maps, notebook
 from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
+from unrender.evaluation import parameter_errors
+from unrender.evaluation.parameter_errors import ErrorMeasure
 from unrender.runs import curves
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result
 
-__all__ = ["html", "line", "shown_pictures", "start_errors"]
+__all__ = ["error_title", "html", "line", "measures", "shown_pictures", "start_errors"]
 
 _VIEWS, _MAPS = 2, 3
 
@@ -31,7 +34,7 @@ def html(result: Result) -> str:
     errors = curves.parameter_errors(result.history, start_errors(result))
     lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
     drawn = [
-        chart("Parameter error (RMSE)", lines, "seconds", end),
+        chart(error_title(result), lines, "seconds", end),
         chart("Loss, of the steps' samples", [Line("loss", seconds, loss)], "seconds", end) if len(loss) else None,
     ]
     rows = {"image error": _image_error(result), "time": formatting.phases(result.phases)}
@@ -47,6 +50,7 @@ def html(result: Result) -> str:
 def shown_pictures(result: Result) -> dict[str, np.ndarray]:
     """{caption: (H, W, 3) in [0, 1]}: views, where there are pictures, then parameters that are maps."""
     shown: dict[str, np.ndarray] = {}
+    found = measures(result)
     for view in range(_VIEWS):
         reference = result.pictures.get(f"view{view}/reference")
         for what in ("reference", "initial", "result"):
@@ -54,22 +58,36 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
             if picture is not None:
                 shown[f"view {view}: {'start' if what == 'initial' else what}"] = shown_image(picture, reference)
     for key in [key for key, values in result.parameters.items() if maps.is_map(values)][:_MAPS]:
-        truth = result.truth.get(key)
+        truth, columns = result.truth.get(key), found[key].repeated
         like = result.parameters[key] if truth is None else truth
         for what, values in (("truth", truth), ("start", result.initial[key]), ("recovered", result.parameters[key])):
-            colours = None if values is None else shown_map(values, like)
+            colours = None if values is None else shown_map(periodic.interior(values, columns), like)
             if colours is not None:
                 shown[f"{what}: {key}"] = colours
     return shown
 
 
+def measures(result: Result) -> dict[str, ErrorMeasure]:
+    """Return {key: how its error is measured}."""
+    recorded = result.problem.get("measures", {})
+    return {key: parameter_errors.from_record(recorded.get(key)) for key in result.parameters}
+
+
 def start_errors(result: Result) -> dict[str, float]:
-    """{key: root mean square error of the start} where the truth is known."""
-    return {
-        key: float(np.sqrt(np.mean(np.square(result.initial[key] - truth, dtype=np.float64))))
+    """{key: error of the start} where the truth is known, see `Problem.parameter_error`."""
+    found = measures(result)
+    errors = {
+        key: found[key].error(result.initial[key], truth)
         for key, truth in result.truth.items()
         if key in result.initial
     }
+    return {key: error for key, error in errors.items() if error is not None}
+
+
+def error_title(result: Result) -> str:
+    """Return what a chart of the errors of the result shows."""
+    found = measures(result)
+    return parameter_errors.title(found[key] for key in result.truth if key in found)
 
 
 def _told(result: Result) -> str:
@@ -77,8 +95,12 @@ def _told(result: Result) -> str:
     before = start_errors(result)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     if before and last:
+        units = {measure.unit for key, measure in measures(result).items() if key in last}
+        if len(units) > 1:  # errors of different units have no mean
+            return f"{words}, {result.status}"
         first, now = np.mean(list(before.values())), np.mean(list(last.values()))
-        words += f", parameter error {formatting.number(float(first))} → {formatting.number(float(now))}"
+        unit = "".join(units)
+        words += f", parameter error {formatting.number(float(first))}{unit} → {formatting.number(float(now))}{unit}"
     return f"{words}, {result.status}"
 
 

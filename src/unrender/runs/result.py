@@ -42,8 +42,8 @@ class Result:
         history: one dictionary per step (of a run of millions of steps in a run folder, per second, fourth, ... of the earlier
             ones): "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
             "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
-            "parameter_error" ({key: root mean square error}) now and then and at the last step; of parameters that are coarse at
-            first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
+            "parameter_error" ({key: error}, see `Problem.parameter_error`) now and then and at the last step; of parameters that are
+            coarse at first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
         seconds: of optimization.
         warmup_seconds: of tracing and compiling kernels before the first step.
         stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated"
@@ -64,6 +64,8 @@ class Result:
             of squares over all pixels and channels, see `unrender.sensitivity`; {} of runs without a run folder, and where path
             gradients do not reach the parameters. Where it is small, the images tell nothing.
         pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
+        undetermined: one line for each unknown that the pictures do not determine, see `runs.determination`; empty for runs without a run
+            folder.
         meshes: {"KEY/faces": (F, 3), ...} of the parameters that are vertex positions, and the true surfaces, "KEY/true_vertices" and
             "KEY/true_faces", where they are known.
     """
@@ -92,6 +94,7 @@ class Result:
     sensitivity: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
     meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    undetermined: Sequence[str] = ()
 
     def __repr__(self) -> str:
         from unrender.runs import notebook
@@ -183,6 +186,7 @@ class Result:
             "image_errors": {
                 name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
             },
+            "undetermined": list(self.undetermined),
             "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unrender.core import arrays, checks
+from unrender.core import arrays, checks, periodic
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
@@ -16,9 +16,10 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import as_tree, view_request
 from unrender.rendering.renderer import RenderSession
 
-__all__ = ["around", "hardly_seen", "sensitivity"]
+__all__ = ["around", "hardly_seen", "seen_cells", "sensitivity"]
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
+_MAP_AXES = 3
 _HARDLY = 0.05
 """Of the median: elements that change the images less are hardly seen."""
 
@@ -72,7 +73,8 @@ def sensitivity(
         for key, square in squares.items():
             square += one[key] * other[key]
         made += 1
-    return {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
+    roots = {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
+    return {key: periodic.repeat(root, problem.repeated.get(key, 0)) for key, root in roots.items()}
 
 
 def around(found: np.ndarray) -> np.ndarray:
@@ -97,6 +99,15 @@ def hardly_seen(found: np.ndarray) -> np.ndarray:
     """
     whole = around(found)
     return whole <= _HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
+
+
+def seen_cells(found: np.ndarray) -> np.ndarray | None:
+    """Return the cells of a texture or grid that change the images, (...) truth values; None for what is neither.
+
+    Args:
+        found: of `sensitivity`, (..., channels).
+    """
+    return ~hardly_seen(found) if found.ndim >= _MAP_AXES and found.size else None
 
 
 def _projections(

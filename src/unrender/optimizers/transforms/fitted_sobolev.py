@@ -25,7 +25,7 @@ from unrender.optimizers.transforms.base import (
     checked_keys,
 )
 from unrender.preconditioners import Sobolev
-from unrender.preconditioners.base import MeshPreconditioner, Preconditioner
+from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem.upsampling import Upsampler
 
@@ -293,7 +293,7 @@ class FittedSobolev(StepTransform):
 
     preconditioner: Preconditioner | None = None
     preconditioned: tuple[str, ...] = ()
-    _on_meshes: Mapping[str, tuple[MeshTopology, Preconditioner]] = field(
+    _bound: Mapping[str, tuple[int, Preconditioner]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -301,14 +301,18 @@ class FittedSobolev(StepTransform):
         keys = checked_keys("FittedSobolev: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> FittedSobolev:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> FittedSobolev:
         """See `OnMeshes.on_meshes`."""
         smooth, bound = self.preconditioner, {}
-        if isinstance(smooth, MeshPreconditioner):
-            found = {key: topology(key) for key in self.preconditioned}
-            bound = {key: (mesh, smooth.on_mesh(mesh)) for key, mesh in found.items() if mesh is not None}
+        for key in self.preconditioned:
+            if isinstance(smooth, MeshPreconditioner) and (mesh := topology(key)) is not None:
+                bound[key] = len(mesh.places), smooth.on_mesh(mesh)
+            elif isinstance(smooth, PeriodicPreconditioner) and repeated and (columns := repeated(key)):
+                bound[key] = 0, smooth.on_repeated(columns)
         transform = replace(self)
-        object.__setattr__(transform, "_on_meshes", bound)
+        object.__setattr__(transform, "_bound", bound)
         return transform
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> FittedSobolevState:
@@ -354,7 +358,7 @@ class FittedSobolev(StepTransform):
 
     def _smoothing(self, key: str, strengths: Mapping[str, StrengthFit]) -> SmoothingChange:
         smooth, fit = self._smooth(key), strengths.get(key)
-        vertices = len(self._on_meshes[key][0].places) if key in self._on_meshes else 0
+        vertices = self._bound[key][0] if key in self._bound else 0
         if fit is None:
             return SmoothingChange(smooth, vertices=vertices)
         scaled = smooth.scaled(fit.share) if isinstance(smooth, Sobolev) else smooth
@@ -362,7 +366,7 @@ class FittedSobolev(StepTransform):
 
     def _smooth(self, key: str) -> Preconditioner:
         """Return the preconditioner of a parameter in `preconditioned`, at full strength."""
-        found = self._on_meshes[key][1] if key in self._on_meshes else self.preconditioner
+        found = self._bound[key][1] if key in self._bound else self.preconditioner
         assert found is not None
         return found
 

@@ -68,10 +68,12 @@ class PerParameter(StepTransform):
         """What the transforms require."""
         return tuple(kind for part in (*self.transforms, *self.others) for kind in part.requires)
 
-    def on_meshes(self, topology: Callable[[str], MeshTopology | None]) -> PerParameter:
+    def on_meshes(
+        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
+    ) -> PerParameter:
         """See `OnMeshes.on_meshes`."""
         own, others = (
-            tuple(part.on_meshes(topology) if isinstance(part, OnMeshes) else part for part in parts)
+            tuple(part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in parts)
             for parts in (self.transforms, self.others)
         )
         return replace(self, transforms=own, others=others)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mitsuba as mi
 
+from unrender.evaluation.parameter_errors import Role
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
-__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range"]
+__all__ = [
+    "ParameterTraits",
+    "brightness",
+    "is_of_vertices",
+    "normals_key",
+    "parameter_traits",
+    "physical_range",
+    "role",
+]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
 # depend on the parameter.
@@ -18,6 +28,9 @@ _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "Smoot
 _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
+_LIGHT = ("radiance", "intensity", "irradiance")
+_REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
+_DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
 
 
 @dataclass(frozen=True)
@@ -142,6 +155,38 @@ def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | No
     ):  # fmt: skip
         return 0.0, 1.0
     return None, None
+
+
+def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Role:
+    """Return what the values of a parameter stand for.
+
+    Args:
+        parameters: of the scene.
+        key: of the parameter.
+        shape: of its array.
+    """
+    vectors = math.prod(shape) % 3 == 0 if len(shape) == 1 else bool(shape) and shape[-1] == 3
+    if not vectors:
+        return "value"
+    names, node = key.split("."), parameters.properties[key][2]
+    if names[-1] in _DIRECTIONS:
+        return "direction"
+    while node is not None:  # the texture of a normal map, however it is wrapped
+        if isinstance(node, mi.BSDF):
+            return "normal" if node.class_name() == "NormalMap" and "normalmap" in names else "value"
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    return "value"
+
+
+def brightness(parameters: mi.SceneParameters, key: str) -> Literal["", "light", "reflectance"]:
+    """Return what the picture is proportional to: an emitter's light, a surface's reflectance, or neither."""
+    names, node = key.split("."), parameters.properties[key][2]
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    if isinstance(node, mi.Emitter):
+        emits = names[-1] in ("scale", "data") or any(name in _LIGHT for name in names)
+        return "light" if emits else ""
+    return "reflectance" if isinstance(node, mi.BSDF) and any(name in _REFLECTANCE for name in names) else ""
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import emissive, film
+from unrender.rendering.mitsuba import emissive, file_conversions, film
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.emitter_tables import emitter_tables
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
@@ -26,7 +26,14 @@ from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
+from unrender.rendering.mitsuba.parameters import (
+    ParameterTraits,
+    brightness,
+    is_of_vertices,
+    parameter_traits,
+    physical_range,
+    role,
+)
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
@@ -298,7 +305,14 @@ class ScenePair:
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
-        return {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
+        found = {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
+        return {key: self._with_meaning(key, info) if info.perturbable else info for key, info in found.items()}
+
+    def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
+        """`info` with what the values of the parameter stand for, and what a file becomes."""
+        conversion = file_conversions.conversion(self.current_parameters, key, self.description)
+        kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
+        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1])
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)

@@ -14,6 +14,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import printable
+from unrender.evaluation.parameter_errors import ErrorMeasure
 from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.io import bounded_files
 from unrender.runs.folder import schema
@@ -56,7 +57,7 @@ class RunFolder:
         history: history.jsonl.
         parameters, initial, truth: {key: array}; `truth` holds the keys whose truth is known.
         views: {view index: pictures}, ascending; empty where the run saved none.
-        error_before, error_after: {key: root mean square error} at the start and at the end, where they are known.
+        error_before, error_after: {key: error} at the start and at the end, where they are known, see `measure`.
         sensitivity: see `Result.sensitivity`; {} where the run saved none.
         meshes: {key: `meshes.RunMesh`} of the parameters that are vertex positions.
         shapes: {key: shape} of parameters whose arrays here are smaller than those of the run.
@@ -79,6 +80,10 @@ class RunFolder:
     def known(self) -> tuple[str, ...]:
         """Keys of parameters whose error is known: those with a truth, and meshes with a true surface."""
         return (*self.truth, *(key for key in self.error_before if key not in self.truth))
+
+    def measure(self, key: str) -> ErrorMeasure:
+        """Return how the error of a parameter is measured."""
+        return self.record.problem.measure(key)
 
     def shape(self, key: str) -> tuple[int, ...]:
         """Of a parameter, as it is in the run."""
@@ -103,7 +108,7 @@ def read(directory: str | Path) -> RunFolder:
     truth = _optional(path / schema.TRUTH, path)
     known = {key: value for key, value in truth.items() if key in parameters}
     before, after = (
-        {k: e for k, wanted in known.items() if (e := root_mean_square(of[k], wanted)) is not None}
+        {k: e for k, wanted in known.items() if (e := record.problem.measure(k).error(of[k], wanted)) is not None}
         for of in (initial, parameters)
     )
     meshes = meshes_in(_optional(path / schema.MESHES, path), parameters, initial, path / schema.MESHES)

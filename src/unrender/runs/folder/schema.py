@@ -30,6 +30,8 @@ from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import printable, reason_of
+from unrender.evaluation import parameter_errors
+from unrender.evaluation.parameter_errors import ErrorMeasure
 from unrender.io import bounded_files
 
 __all__ = [
@@ -67,7 +69,7 @@ HISTORY_AXES = ("seconds", "samples")
 """Columns of the history that every record has, finite and never falling: seconds of optimization and paths traced so far."""
 HISTORY_COLUMNS = (*HISTORY_AXES, "loss", "gradient_noise")
 """Columns that are numbers; the last two are null where a step was not finite or nothing is known yet. A record also has "step", from 0,
-and may have "parameter_error", {key: root mean square error}, and "resolution", {key: texels along each axis}."""
+and may have "parameter_error", {key: see `Problem.parameter_error`}, and "resolution", {key: texels along each axis}."""
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
@@ -83,12 +85,18 @@ class ProblemRecord(BaseModel):
     Attributes:
         fingerprint: see `problem.fingerprint`; None where it was not taken.
         origin: where the problem came from, see `Problem.origin`.
+        measures: {key: how its error is measured}, see `ErrorMeasure.record`; without the plain ones.
     """
 
     model_config = ConfigDict(extra="allow")
 
     fingerprint: dict[StrictStr, StrictStr] | None = None
     origin: dict[StrictStr, Any] = {}
+    measures: dict[StrictStr, Any] = {}
+
+    def measure(self, key: str) -> ErrorMeasure:
+        """Return how the error of a parameter is measured."""
+        return parameter_errors.from_record(self.measures.get(key))
 
     @property
     def description(self) -> dict[str, Any]:
@@ -111,7 +119,7 @@ class RunRecord(BaseModel):
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
-        image_errors, phases: see `Result`.
+        image_errors, undetermined, phases: see `Result`.
         error: the exception by which the run failed; "" for none.
     """
 
@@ -137,6 +145,7 @@ class RunRecord(BaseModel):
     problem: ProblemRecord = ProblemRecord()
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
+    undetermined: list[StrictStr] = []
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
 

@@ -164,7 +164,11 @@ class RunWriter(Hook):
             started = time.perf_counter()
             images = render_final_images(descent.run.problem, result, self.final_spp)
             result = replace(
-                result, pictures=images.pictures, image_errors=images.errors, sensitivity=images.sensitivity
+                result,
+                pictures=images.pictures,
+                image_errors=images.errors,
+                sensitivity=images.sensitivity,
+                undetermined=images.undetermined,
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)

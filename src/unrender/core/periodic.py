@@ -1,0 +1,65 @@
+"""Arrays whose outer columns repeat the columns of the opposite end, such as the data of Mitsuba's environment maps.
+
+An array (H, W + 2 k, C) with k repeated columns stands for W columns that continue around: column j repeats column (j - k) mod W of
+those. The repeated columns are no unknowns of their own.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.arrays import Array
+
+__all__ = ["interior", "interior_shape", "pad", "repeat"]
+
+
+def interior_shape(shape: tuple[int, ...], columns: int) -> tuple[int, ...]:
+    """Return the shape of the array without its repeated columns.
+
+    Args:
+        shape: (H, W + 2 `columns`, ...).
+        columns: number of repeated columns at each end.
+    """
+    return shape if not columns else (shape[0], shape[1] - 2 * columns, *shape[2:])
+
+
+def interior(x: np.ndarray, columns: int) -> np.ndarray:
+    """Return (H, W, ...) of an array (H, W + 2 `columns`, ...)."""
+    return x[:, columns : x.shape[1] - columns] if columns else x
+
+
+def pad(x: np.ndarray, columns: int) -> np.ndarray:
+    """Return (H, W + 2 `columns`, ...) of an array (H, W, ...), the inverse of `interior`."""
+    return np.ascontiguousarray(x[:, _sources(x.shape[1], columns) - columns]) if columns else x
+
+
+def repeat(x: Array, columns: int) -> Array:
+    """Return the array with its outer columns replaced by copies of those that they repeat.
+
+    Args:
+        x: (H, W + 2 `columns`, C), NumPy or Dr.Jit.
+        columns: number of repeated columns at each end; 0 returns `x` itself.
+    """
+    if not columns:
+        return x
+    shape = arrays.shape(x)
+    if not arrays.is_drjit(x):
+        return pad(interior(np.asarray(x), columns), columns)
+    flat = arrays.flat(x)
+    index = arrays.like_integers(_elements(shape, columns), flat)
+    return arrays.shaped(arrays.gather(flat, index), shape, x)
+
+
+def _sources(width: int, columns: int) -> np.ndarray:
+    """The column that each of `width` + 2 `columns` columns repeats, numbered in the whole array."""
+    return np.arange(-columns, width + columns) % width + columns
+
+
+@lru_cache(maxsize=16)
+def _elements(shape: tuple[int, ...], columns: int) -> np.ndarray:
+    """The element that each element of an array of this shape repeats."""
+    numbers = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
+    return numbers[:, _sources(shape[1] - 2 * columns, columns)].reshape(-1)

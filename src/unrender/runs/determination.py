@@ -1,0 +1,171 @@
+"""What the pictures of a problem do not determine, in words."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.text import listed
+from unrender.problem.bounds import project
+from unrender.problem.problem import Problem
+from unrender.problem.render import render
+from unrender.runs.sensitivity import seen_cells
+
+__all__ = ["Change", "common_factor", "undetermined", "undetermined_cells"]
+
+_LEAST = 0.005
+"""Change of the pictures, relative to themselves, below which a parameter counts as undetermined over its whole range."""
+_FACTOR = 1.25
+"""The factor by which lights become brighter and reflectances darker."""
+_LEAST_OF_FACTOR = 0.1
+"""Share of the change by brighter lights that darker reflectances must leave, where the pictures tell the two apart."""
+_ERRORS = 2.0
+"""Standard errors by which a change must be below its limit."""
+_UNSEEN = 0.05
+"""Share of the cells of a texture or grid that are worth a line where no picture sees them."""
+_MOST_VIEWS = 4
+_SEEDS, _RENDERINGS = (3, 4), 8
+"""Of the two independent halves, and renderings per view of two changes."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """By how much pictures change, as mean squares over pixels and channels.
+
+    Attributes:
+        square: of the change, without the noise of rendering; may be below 0.
+        error: standard error of that.
+        scale: mean square of the pictures.
+    """
+
+    square: float
+    error: float
+    scale: float
+
+    def is_below(self, share: float, scale: float | None = None) -> bool:
+        """Return whether the change is surely less than `share` of the root mean square of the pictures, or of √`scale`."""
+        return self.square + _ERRORS * self.error < share**2 * (self.scale if scale is None else scale)
+
+
+def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf) -> list[str]:
+    """Return a line for each parameter that hardly changes the pictures over its whole range.
+
+    Parameters of materials and media are looked at, one after the other, as long as there is time. All elements of a parameter move
+    together.
+
+    Args:
+        problem: its views and scene.
+        values: {key: array}, where the other parameters stay.
+        spp: samples per pixel of each of four renderings per view.
+        seconds: after which no further parameter is looked at; the first one always is.
+    """
+    known, lines = problem.renderer.parameters(), []
+    until, longest = time.perf_counter() + seconds, 0.0
+    for key, (low, high) in problem.bounds.items():
+        info = known[key]
+        if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role != "value":
+            continue
+        started = time.perf_counter()
+        if longest > 0.0 and started + longest > until:
+            break
+        first, last = (
+            {**values, key: project(np.full(values[key].shape, end, np.float32), low, high)} for end in (low, high)
+        )
+        try:
+            change = _change(problem, first, last, spp)
+        except InputError:  # the renderer refuses an end of the range
+            continue
+        longest = max(longest, time.perf_counter() - started)
+        if change.is_below(_LEAST):
+            lines.append(
+                f"{key}: over its whole range the pictures change by less than {_LEAST:.1%}; its value is the start's, or noise"
+            )
+    return lines
+
+
+def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
+    """Return a line for each texture or grid of which a notable part hardly changes the pictures.
+
+    Args:
+        sensitivities: {key: array}, see `unrender.sensitivity`.
+    """
+    lines = []
+    for key, found in sensitivities.items():
+        where = seen_cells(found)
+        if where is not None and (share := 1.0 - float(where.mean())) >= _UNSEEN:
+            lines.append(
+                f"{key}: {share:.0%} of it hardly changes the pictures; values there are the start's, or smoothed"
+            )
+    return lines
+
+
+def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf) -> list[str]:
+    """Return one line where the pictures determine lights and reflectances up to a common factor only; none elsewhere.
+
+    Lights become brighter by a factor and reflectances darker by the same; the pictures tell the two apart if they change.
+
+    Args:
+        problem: its views and scene.
+        values: {key: array}, the parameters at which it is looked.
+        spp: samples per pixel of each of eight renderings per view.
+        seconds: what it may take; nothing is looked at where one rendering shows that it would take longer.
+    """
+    known = problem.renderer.parameters()
+    lights, colours = ([k for k in values if known[k].brightness == kind] for kind in ("light", "reflectance"))
+    if not lights or not colours:
+        return []
+    started = time.perf_counter()
+    render(problem, values, 0, spp, _SEEDS[0])
+    if _RENDERINGS * len(_views(problem)) * (time.perf_counter() - started) > seconds:
+        return []
+    brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
+    darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
+    alone = _change(problem, values, brighter, spp)
+    together = _change(problem, values, darker, spp)
+    if alone.square <= 0.0 or not together.is_below(_LEAST_OF_FACTOR, alone.square):
+        return []
+    line = f"{listed(lights)} and {listed(colours)}: determined up to a common factor only"
+    ratios = [np.log(factor) for key in lights if (factor := _factor(problem, key, values[key])) is not None]
+    if not ratios:
+        return [line]
+    factor = float(np.exp(np.mean(ratios)))
+    after = {key: values[key] / factor if key in lights else values[key] * factor for key in (*lights, *colours)}
+    errors = {
+        key: problem.measures[key].error(np.asarray(x), problem.truth[key])
+        for key, x in after.items()
+        if key in problem.truth
+    }
+    told = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
+    return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {told}"]
+
+
+def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
+    """The factor by which values are too large, in the mean; None where the truth is unknown or 0."""
+    truth = problem.truth.get(key)
+    if truth is None or truth.shape != values.shape or not np.mean(truth) > 0 or not np.mean(values) > 0:
+        return None
+    return float(np.mean(values) / np.mean(truth))
+
+
+def _views(problem: Problem) -> list[int]:
+    """The views that are rendered: all, or evenly some of many."""
+    count = len(problem.views)
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
+
+
+def _change(problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int) -> Change:
+    """Between two states. The product of two independent differences has no bias by noise; each is of equal random numbers."""
+    products, squares = [], []
+    for view in _views(problem):
+        differences = []
+        for seed in _SEEDS:
+            first, second = (render(problem, state, view, spp, seed) for state in (before, after))
+            differences.append((second - first).astype(np.float64))
+            squares.append(np.mean(np.square(first, dtype=np.float64)))
+        products.append(np.mean(differences[0] * differences[1], axis=-1).reshape(-1))
+    flat = np.concatenate(products)
+    return Change(float(flat.mean()), float(flat.std() / np.sqrt(flat.size)), float(np.mean(squares)))

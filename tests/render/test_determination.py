@@ -1,0 +1,85 @@
+"""What the pictures do not determine is named: parameters without influence, a factor between light and colour, unseen cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+
+SIZE = 8
+LIGHT, COLOUR = "lamp.intensity.value", "wall.bsdf.reflectance.value"
+
+
+def scene(material: dict[str, Any], **others: Any) -> dict[str, Any]:
+    """A wall before a lamp."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "lamp": {"type": "point", "position": [1, 1, 2], "intensity": {"type": "rgb", "value": [6, 5, 4]}},
+        "wall": {"type": "rectangle", "bsdf": material},
+        **others,
+    }
+
+
+def problem(described: dict[str, Any], *keys: str, truth: dict[str, Any] | None = None) -> ur.Problem:
+    """These parameters of a scene, which start at its own values."""
+    view = ur.View(np.full((SIZE, SIZE, 3), 0.3, np.float32))
+    return ur.Problem(described, [ur.Parameter(key) for key in keys], [view], max_depth=2, truth=truth)
+
+
+DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.3, 0.2]}}
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+
+
+def test_a_parameter_without_influence_is_named_and_others_are_not():
+    """A sheen's tint where there is no sheen, and the gloss of a clear coat that is not there."""
+    keys = [f"wall.bsdf.{name}.value" for name in ("base_color", "roughness", "sheen_tint", "clearcoat_gloss")]
+    material = {"type": "principled", "sheen": 0.0, "clearcoat": 0.0, "sheen_tint": 0.5, "clearcoat_gloss": 0.5}
+    made = problem(scene(material), *keys)
+    lines = undetermined(made, made.initial_values(), 16)
+    assert [line.partition(":")[0] for line in lines] == keys[2:]
+    assert undetermined(made, made.initial_values(), 16, seconds=0.0) == []  # the first alone, which is determined
+
+
+def test_light_and_colour_of_all_that_is_seen_share_a_factor():
+    made = problem(scene(DIFFUSE), LIGHT, COLOUR, truth={LIGHT: [6, 5, 4], COLOUR: [0.4, 0.3, 0.2]})
+    values = {LIGHT: np.array([12, 10, 8], np.float32), COLOUR: np.array([0.2, 0.15, 0.1], np.float32)}
+    (line,) = common_factor(made, values, 16)
+    assert line.startswith(f"{LIGHT} and {COLOUR}: determined up to a common factor only")
+    assert "with lights divided by 2 and reflectances multiplied by it, errors are" in line
+    errors = [float(word.rstrip(",")) for word in line.rpartition("errors are ")[2].split() if word[0].isdigit()]
+    assert errors == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("keys", [(LIGHT, COLOUR), (LIGHT,), (COLOUR,)])
+def test_a_surface_of_known_colour_determines_the_factor(keys: tuple[str, ...]):
+    """As does a light that is known, since only one of the two is an unknown then."""
+    turned = mi.ScalarTransform4f().translate([0, -0.6, 0.2]).scale(0.5)
+    made = problem(scene(DIFFUSE, card={"type": "rectangle", "to_world": turned, "bsdf": GREY}), *keys)
+    assert common_factor(made, made.initial_values(), 16) == []
+
+
+def test_cells_that_hardly_change_the_pictures_are_told():
+    seen = np.ones((8, 8, 3), np.float32)
+    assert undetermined_cells({"wall": seen, "number": np.zeros((), np.float32)}) == []
+    hidden = seen.copy()
+    hidden[:, :4] = 0
+    (line,) = undetermined_cells({"wall": hidden})
+    assert line.startswith("wall: 38% of it hardly changes the pictures")  # next to seen ones, they count as seen
+
+
+def test_a_run_tells_in_its_folder(tmp_path: Any):
+    material = {"type": "principled", "sheen": 0.0, "sheen_tint": 0.5}
+    made = problem(scene(material), "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value")
+    result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
+    assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
+    page = ur.report.page(tmp_path / "run").read_text()
+    assert "Not determined by the pictures" in page
+    assert "wall.bsdf.sheen_tint.value: over its whole range" in page
