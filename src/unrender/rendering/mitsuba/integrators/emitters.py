@@ -20,9 +20,13 @@ __all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
 
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
-    """The power heuristic with exponent 2, detached."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.detach(dr.select(a > 0, a / (a + b), 0))
+    """Return the weight of strategy a by the power heuristic with exponent 2, detached and finite.
+
+    A point on a flat lamp seen at a grazing angle has a density above 1e19, whose square overflows. The ratio of the densities does not.
+    """
+    largest: Any = dr.largest(mi.Float)
+    a, b = dr.minimum(dr.detach(pdf_a), largest), dr.minimum(dr.detach(pdf_b), largest)
+    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
@@ -87,7 +91,7 @@ class EmitterConnection:
     def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
         self._context, self._vertex = context, vertex
         self.ds = _sample_direction(context, vertex, sample, active)
-        self.active = active & (self.ds.pdf != 0)
+        self.active = active & (self.ds.pdf > 0)  # false also where the density is not a number
 
     @property
     def emitter(self) -> UInt32:
