@@ -18,15 +18,18 @@ from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 __all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
 
+_LARGEST = 1e18
+"""Solid angle density whose square, and twice that, is a finite single-precision number."""
+
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
     """Return the weight of strategy a by the power heuristic with exponent 2, detached and finite.
 
-    A point on a flat lamp seen at a grazing angle has a density above 1e19, whose square overflows. The ratio of the densities does not.
+    Densities count up to `_LARGEST` for both strategies, so the two weights still sum to one. A flat lamp seen edge-on has a density
+    above 1e19, whose square is no single-precision number.
     """
-    largest: Any = dr.largest(mi.Float)
-    a, b = dr.minimum(dr.detach(pdf_a), largest), dr.minimum(dr.detach(pdf_b), largest)
-    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
+    a, b = dr.square(dr.minimum(pdf_a, _LARGEST)), dr.square(dr.minimum(pdf_b, _LARGEST))
+    return dr.detach(dr.select(a > 0, a / (a + b), 0))
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
