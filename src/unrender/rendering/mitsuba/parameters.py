@@ -65,7 +65,11 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: SceneGraph
         readers = graph.attribute_readers(node, leaf)
         chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
         return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in chains], ParameterTraits(False, ""))
-    return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in graph.chains(node)])
+    chains = list(graph.chains(node))
+    used = [
+        chain for chain in chains if len(chain) > 2
+    ] or chains  # a texture that the scene holds, too, has no effect there
+    return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in used])
 
 
 def _is_attribute(leaf: str) -> bool:

@@ -1,7 +1,7 @@
 """The objects of a loaded scene and every place where each is used, children of shape groups and nested BSDFs included.
 
-`mitsuba.traverse` names an object by the first place that holds it. A shared object has several, and each decides how its parameters
-reach the picture.
+`mitsuba.traverse` names an object by the first place that holds it. A shared object has several. Each of them decides how the object's
+parameters reach the picture, and each keeps values of its own that depend on them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from unrender.core.errors import InputError
 
 __all__ = ["SceneGraph", "all_shapes", "object_ids"]
 
+_NAMELESS = re.compile(r"object_\d{9,}")
+"""Mitsuba's name for an object without an id, made of its address."""
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
 
 
@@ -29,14 +31,36 @@ class SceneGraph:
         scene: a loaded scene.
 
     Attributes:
-        nodes: every object once, in the order in which Mitsuba names them. Two loads of a description have equal orders.
+        nodes: every object once. Two loads of a description have equal orders.
+        owners: {object: what holds it}, in the order of visits; nothing holds the scene.
+        properties, hierarchy: of `mitsuba.SceneParameters`.
+        names: of the objects.
     """
 
     def __init__(self, scene: Any):
         self._scene = scene
-        self._owners: dict[Any, list[Any]] = {scene: []}
-        scene.traverse(_visitor(mi.variant())(scene, self._owners))
-        self.nodes = list(self._owners)
+        self.owners: dict[Any, list[Any]] = {scene: []}
+        self.hierarchy: dict[Any, tuple[Any, int]] = {scene: (None, 0)}
+        self.properties: dict[str, tuple[Any, Any, Any, int]] = {}
+        self.names: set[str] = set()
+        _visitor(mi.variant())(self, scene).visit()
+        self.nodes = list(self.owners)
+
+    def parameters(self) -> mi.SceneParameters:
+        """Return what `mitsuba.traverse` returns. A texture of the scene itself has the name of its first use in a material or light."""
+        return mi.SceneParameters(self.properties, self.hierarchy)
+
+    def notify_other_owners(self, node: Any) -> None:
+        """Have every owner of a shared object that changed update itself. Mitsuba updates those of its first place alone."""
+        told, owner = set(), node
+        while owner is not None:
+            told.add(owner)
+            owner = self.hierarchy[owner][0]
+        for chain in self.chains(node):
+            for owner in chain[1:]:
+                if owner not in told and not isinstance(owner, (mi.Shape, mi.Scene, mi.Sensor)):
+                    owner.parameters_changed([])
+                    told.add(owner)
 
     def of(self, kind: str) -> list[Any]:
         """Return the objects of a kind: "bsdf", "emitter", "medium" or "shape"."""
@@ -54,7 +78,7 @@ class SceneGraph:
 
     def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
         """Yield every chain of objects from `node` up to the scene; `above` is what the caller passed on its way to `node`."""
-        owners = [owner for owner in self._owners.get(node, ()) if owner not in above]
+        owners = [owner for owner in self.owners.get(node, ()) if owner not in above]
         if not owners:
             yield [node]
         for owner in owners:
@@ -68,7 +92,9 @@ class SceneGraph:
             InputError: the two loads differ, or a path can meet an object that the traversal does not show.
         """
         if [type(node) for node in self.nodes] != [type(node) for node in other.nodes]:
-            raise InputError("scene: two loads of the description have different objects; expected equal ones, or use --method plain")
+            raise InputError(
+                "scene: two loads of the description have different objects; expected equal ones, or use --method plain"
+            )
         found = {}
         for kind in _KINDS:
             source, target = object_ids(kind, self.of(kind)), object_ids(kind, other.of(kind))
@@ -81,7 +107,9 @@ class SceneGraph:
     def _check_complete(self) -> None:
         """Raise `InputError` for an object that a path can meet and that its owner's `traverse` does not show."""
         shown = {kind: set(self.of(kind)) for kind in _KINDS}
-        shapes = [shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"]  # its children are hit, not it
+        shapes = [
+            shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"
+        ]  # its children are hit, not it
         for owner in (*shapes, *self._scene.emitters(), *self._scene.sensors()):
             for kind, item in _held(owner):
                 if item is not None and item not in shown[kind]:
@@ -126,28 +154,60 @@ def _visitor(variant: str) -> type:
     del variant  # the base class exists only under a variant
 
     class Visitor(mi.TraversalCallback):
-        """Notes the owners of everything below a node. Visits each object once."""
+        """Fills a graph with everything below a node, each object once, by the names that `mitsuba.traverse` gives."""
 
-        def __init__(self, node: Any, owners: dict[Any, list[Any]]):
+        def __init__(self, graph: SceneGraph, node: Any, depth: int = 0, name: str | None = None, flags: int = 0):
             super().__init__()
-            self.node, self.owners = node, owners
+            if name is not None:
+                count, plain = 1, name
+                while name in graph.names:
+                    name = f"{plain}_{count}"
+                    count += 1
+                graph.names.add(name)
+            self.graph, self.node, self.depth, self.name = graph, node, depth, name
+            self.flags = flags | +mi.ParamFlags.Differentiable
+            self.deferred: list[tuple[str, Any, int]] = []
+
+        def visit(self) -> None:
+            """Visit what the node holds. Objects of the scene without a name come last: by then, their users may have named them."""
+            self.node.traverse(self)
+            waiting, self.deferred = self.deferred, []
+            for name, value, flags in waiting:
+                self._enter(name, value, flags)
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
             """Take a value or an object."""
             if isinstance(value, mi.Object):
                 self.put_object(name, value, flags)
+            else:
+                self.put_value(name, value, flags, cpptype)
 
         def put_value(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            """Ignore a value."""
+            """Take a value."""
+            flags = self.flags | flags
+            if flags & mi.ParamFlags.NonDifferentiable:
+                flags &= ~mi.ParamFlags.Discontinuous
+            self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
-            """Note an object and go on below it."""
+            """Take an object, now or at the end."""
             if value is None:
                 return
-            if value not in self.owners:
-                self.owners[value] = [self.node]
-                value.traverse(Visitor(value, self.owners))
-            elif self.node not in self.owners[value]:
-                self.owners[value].append(self.node)
+            if self.depth == 0 and _NAMELESS.fullmatch(name):
+                self.deferred.append((name, value, flags))
+            else:
+                self._enter(name, value, flags)
+
+        def _enter(self, name: str, value: Any, flags: int) -> None:
+            owners = self.graph.owners
+            if value not in owners:
+                owners[value] = [self.node]
+                self.graph.hierarchy[value] = self.node, self.depth + 1
+                type(self)(self.graph, value, self.depth + 1, self._full(name), self.flags | flags).visit()
+            elif self.node not in owners[value]:
+                owners[value].append(self.node)
+
+        def _full(self, name: str) -> str:
+            return name if self.name is None else f"{self.name}.{name}"
 
     return Visitor

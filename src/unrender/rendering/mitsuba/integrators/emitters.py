@@ -23,13 +23,14 @@ _LARGEST = 1e18
 
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
-    """Return the weight of strategy a by the power heuristic with exponent 2, detached and finite.
+    """Return the weight of strategy a by the power heuristic with exponent 2, detached. Finite for all densities that are numbers.
 
     Densities count up to `_LARGEST` for both strategies, so the two weights still sum to one. A flat lamp seen edge-on has a density
     above 1e19, whose square is no single-precision number.
     """
-    a, b = dr.square(dr.minimum(pdf_a, _LARGEST)), dr.square(dr.minimum(pdf_b, _LARGEST))
-    return dr.detach(dr.select(a > 0, a / (a + b), 0))
+    # Unlike a minimum, the selection passes on a density that is no number, so that its sample is dropped and counted.
+    a, b = (dr.square(dr.select(pdf > _LARGEST, _LARGEST, pdf)) for pdf in (pdf_a, pdf_b))
+    return dr.detach(dr.select(a == 0, 0, a / (a + b)))
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
