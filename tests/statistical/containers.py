@@ -181,3 +181,11 @@ CONTAINERS: dict[str, tuple[Callable[[], dict[str, Any]], dict[str, float]]] = {
         {"ball_0.interior_medium.albedo": 0.7, "ball_1.interior_medium.albedo": 0.8},
     ),
 }
+
+SHARED = (
+    "one BSDF under two shapes",
+    "one BSDF in a group and outside",
+    "one texture under two BSDFs",
+    "merged shapes",
+)
+"""Those in which one object has several owners, with one parameter that changes."""

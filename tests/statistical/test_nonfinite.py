@@ -65,12 +65,13 @@ def test_samples_that_are_not_finite_are_dropped_counted_and_reported(caplog: py
     np.testing.assert_allclose(images[untouched], expected[untouched], rtol=1e-5)
     for current, previous in ((good, bad), (bad, good)):
         pair = session.image_pair(current, previous, request, "path")
-        assert np.isfinite(np.array(pair.images)).all() and np.isfinite(np.array(pair.previous)).all()
+        assert np.isfinite([np.array(pair.images), np.array(pair.previous)]).all()
         for tree in session.adjoint_pair(current, previous, pair.paths, weight, weight):
             assert np.isfinite(np.array(tree[KEY])).all()
             assert np.abs(np.array(tree[KEY])).max() > 0
     gradient = np.array(session.adjoint(bad, found.paths, weight)[KEY])
-    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).max() > 0
     tangents = {KEY: renderer.array(np.ones(np.shape(np.array(good[KEY]))))}
     assert np.isfinite(np.array(session.tangent_moment(bad, session.image(bad, request).paths, tangents))).all()
 
@@ -94,7 +95,7 @@ def test_media_drop_what_is_not_finite() -> None:
     session, request = renderer.prepare([key], "path"), SampleRequest(0, SPP, 5)
     pair = session.image_pair({key: renderer.array(values)}, good, request, "path")
     assert session.dropped.count > 0
-    assert np.isfinite(np.array(pair.images)).all() and np.isfinite(np.array(pair.previous)).all()
+    assert np.isfinite([np.array(pair.images), np.array(pair.previous)]).all()
     weight = renderer.array(np.ones((1, fog.SIZE, fog.SIZE, 3)))
     for tree in session.adjoint_pair({key: renderer.array(values)}, good, pair.paths, weight, weight):
         assert np.abs(np.array(tree[key])).max() > 0
