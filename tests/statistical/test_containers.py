@@ -153,7 +153,9 @@ def test_the_colour_of_a_shape_group_s_child_is_recovered(name: str) -> None:
         "sky": {"type": "constant", "radiance": 1.0},
     }
     key = "group.part_0.bsdf.reflectance.value"
-    reference = np.array(mi.render(mi.load_dict(description), integrator=mi.load_dict({"type": "path", "max_depth": 4}), spp=1024))
+    reference = np.array(
+        mi.render(mi.load_dict(description), integrator=mi.load_dict({"type": "path", "max_depth": 4}), spp=1024)
+    )
     parameter = ur.Parameter(key, initial=[0.4, 0.4, 0.4])
     problem = ur.Problem(description, [parameter], [ur.View(reference)], max_depth=4)
     components = () if name == "auto" else method(name).start()
@@ -184,3 +186,14 @@ def test_an_object_that_its_owner_hides_is_refused_by_name() -> None:
         graph.nodes = [node for node in graph.nodes if node is not hidden]
     with pytest.raises(InputError, match=r"scene: the bsdf of part_0 \(SmoothDiffuse\) is hidden"):
         renderer.pair.tables()
+
+
+def test_moving_shapes_and_cameras_beside_instances_are_refused_and_colours_are_not() -> None:
+    description = scene(**instances(ball(bsdf=diffuse())), ball=ball(bsdf=diffuse()))
+    renderer = MitsubaRenderer(description, DEPTH, keys=["ball.translation"])
+    for key in ("ball.translation", "sensor.translation"):
+        with pytest.raises(InputError, match="silhouettes of the scene's instances"):
+            renderer.prepare([key], None)
+    renderer.prepare(["sensor.rotation"], None)
+    renderer.prepare(["group.part_0.bsdf.reflectance.value"], "path")
+    assert renderer.pair.tables()["bsdf"].numpy().any()

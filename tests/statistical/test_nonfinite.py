@@ -12,6 +12,7 @@ import fog
 import mitsuba as mi
 import numpy as np
 import pytest
+from nonfinite_hunt import hunt, subjects
 from zoo import DEPTH, MATERIALS, SIZE, scene
 
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
@@ -99,3 +100,27 @@ def test_media_drop_what_is_not_finite() -> None:
     weight = renderer.array(np.ones((1, fog.SIZE, fog.SIZE, 3)))
     for tree in session.adjoint_pair({key: renderer.array(values)}, good, pair.paths, weight, weight):
         assert np.abs(np.array(tree[key])).max() > 0
+
+
+SEARCHED = ("material: diffuse", "material: principled", "emitter: rectangle and environment", "medium: cloud")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEARCHED)
+def test_no_path_of_the_zoo_is_lost(name: str) -> None:
+    """A small edition of `nonfinite_hunt.py`, which takes any number of paths."""
+    assert list(hunt(name, subjects()[name], 1 << 20)) == []
+    assert list(hunt(name, subjects()[name], 1 << 16, replays=True)) == []
+
+
+def test_the_search_finds_a_planted_path() -> None:
+    def broken() -> dict[str, Any]:
+        found = scene(MATERIALS["diffuse"][0]())
+        values = np.full((8, 8, 3), 0.5, np.float32)
+        values[3, 4] = np.nan
+        found["floor"]["bsdf"]["reflectance"]["bitmap"] = mi.Bitmap(values)
+        return found
+
+    lines = list(hunt("planted", broken, 1 << 14))
+    assert lines
+    assert all(line.startswith("planted: image, seed 0") for line in lines)

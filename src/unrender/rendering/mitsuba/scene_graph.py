@@ -17,7 +17,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["SceneGraph", "all_shapes", "object_ids"]
+__all__ = ["SceneGraph", "all_shapes", "has_instances", "object_ids"]
 
 _NAMELESS = re.compile(r"object_\d{9,}")
 """Mitsuba's name for an object without an id, made of its address."""
@@ -132,11 +132,16 @@ def _held(owner: Any) -> list[tuple[str, Any]]:
 def all_shapes(scene: Any) -> list[Any]:
     """Return all shapes that have surfaces or media of their own: those of the scene, and the children of its shape groups behind them."""
     shapes = scene.shapes()
-    if not any(shape.class_name() == "Instance" for shape in shapes):
+    if not has_instances(scene):
         return shapes
     known = {*shapes}
     others = [shape for shape in SceneGraph(scene).of("shape") if shape not in known]
     return shapes + [shape for shape in others if not shape.class_name().startswith("ShapeGroup")]
+
+
+def has_instances(scene: Any) -> bool:
+    """Whether the scene has instances of shape groups."""
+    return any(shape.class_name() == "Instance" for shape in scene.shapes())
 
 
 def object_ids(kind: str, items: Iterable[Any]) -> np.ndarray:
