@@ -89,7 +89,7 @@ def with_sensor(sensor: dict[str, Any]) -> Callable[[], dict[str, Any]]:
 
     def made() -> dict[str, Any]:
         found = zoo.scene(zoo.rough())
-        small = sensor["type"] in ("radiancemeter",)
+        small = sensor["type"] in ("radiancemeter", "distant")
         film = {**found["sensor"]["film"], **({"width": 1, "height": 1} if small else {})}
         return {**found, "sensor": {"film": film, **sensor}}
 

@@ -155,8 +155,8 @@ def object_ids(kind: str, items: Iterable[Any]) -> np.ndarray:
 
 
 @cache
-def _visitor(variant: str) -> type:
-    del variant  # the base class exists only under a variant
+def _visitor(_variant: str) -> type:
+    """Return the visitor of a variant: its base class exists only under one."""
 
     class Visitor(mi.TraversalCallback):
         """Fills a graph with everything below a node, each object once, by the names that `mitsuba.traverse` gives."""
@@ -176,9 +176,8 @@ def _visitor(variant: str) -> type:
         def visit(self) -> None:
             """Visit what the node holds. Objects of the scene without a name come last: by then, their users may have named them."""
             self.node.traverse(self)
-            waiting, self.deferred = self.deferred, []
-            for name, value, flags in waiting:
-                self._enter(name, value, flags)
+            for waiting in self.deferred:
+                self._enter(*waiting)
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
             """Take a value or an object."""
