@@ -27,7 +27,7 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
-from unrender.rendering.mitsuba.scene_graph import SceneGraph
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
@@ -154,7 +154,7 @@ class LoadedScene:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
         _make_distributions(self.scene)
-        self.graph = SceneGraph(self.scene)
+        self.graph = ObjectGraph(self.scene)
         self.parameters: mi.SceneParameters = self.graph.parameters()
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}

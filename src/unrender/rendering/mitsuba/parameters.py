@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
-from unrender.rendering.mitsuba.scene_graph import SceneGraph
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 __all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range"]
 
@@ -54,7 +54,7 @@ class ParameterTraits:
         return bool(self.delta_lobes)
 
 
-def parameter_traits(parameters: mi.SceneParameters, key: str, graph: SceneGraph) -> ParameterTraits:
+def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> ParameterTraits:
     """Return how the parameter `key` of a traversed scene reaches the image.
 
     A shared object reaches it by several chains of owners. Each one may forbid what the others allow.

@@ -17,14 +17,12 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["SceneGraph", "all_shapes", "has_instances", "object_ids"]
+__all__ = ["ObjectGraph", "all_shapes", "has_instances", "object_ids"]
 
-_NAMELESS = re.compile(r"object_\d{9,}")
-"""Mitsuba's name for an object without an id, made of its address."""
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
 
 
-class SceneGraph:
+class ObjectGraph:
     """The objects below a scene.
 
     Args:
@@ -85,7 +83,7 @@ class SceneGraph:
             for chain in self.chains(owner, (*above, node)):
                 yield [node, *chain]
 
-    def tables(self, other: SceneGraph) -> dict[str, mi.UInt32]:
+    def tables(self, other: ObjectGraph) -> dict[str, mi.UInt32]:
         """Return tables from the registry ids of this scene's objects to those of another load, by kind.
 
         Raises:
@@ -135,7 +133,7 @@ def all_shapes(scene: Any) -> list[Any]:
     if not has_instances(scene):
         return shapes
     known = {*shapes}
-    others = [shape for shape in SceneGraph(scene).of("shape") if shape not in known]
+    others = [shape for shape in ObjectGraph(scene).of("shape") if shape not in known]
     return shapes + [shape for shape in others if not shape.class_name().startswith("ShapeGroup")]
 
 
@@ -161,7 +159,7 @@ def _visitor(_variant: str) -> type:
     class Visitor(mi.TraversalCallback):
         """Fills a graph with everything below a node, each object once, by the names that `mitsuba.traverse` gives."""
 
-        def __init__(self, graph: SceneGraph, node: Any, depth: int = 0, name: str | None = None, flags: int = 0):
+        def __init__(self, graph: ObjectGraph, node: Any, depth: int = 0, name: str | None = None, flags: int = 0):
             super().__init__()
             if name is not None:
                 count, plain = 1, name
@@ -174,7 +172,7 @@ def _visitor(_variant: str) -> type:
             self.deferred: list[tuple[str, Any, int]] = []
 
         def visit(self) -> None:
-            """Visit what the node holds. Objects of the scene without a name come last: by then, their users may have named them."""
+            """Visit what the node holds. Textures of the scene, which keep no id, come last: by then, their users have named them."""
             self.node.traverse(self)
             for waiting in self.deferred:
                 self._enter(*waiting)
@@ -197,7 +195,7 @@ def _visitor(_variant: str) -> type:
             """Take an object, now or at the end."""
             if value is None:
                 return
-            if self.depth == 0 and _NAMELESS.fullmatch(name):
+            if self.depth == 0 and isinstance(value, mi.Texture):
                 self.deferred.append((name, value, flags))
             else:
                 self._enter(name, value, flags)
