@@ -14,6 +14,7 @@ from unrender.exporting import scene_folder as exporting
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.described import load_described
 from unrender.rendering.mitsuba.poses import Pose
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 MADE_BEFORE: list[Any] = []
 
@@ -75,6 +76,27 @@ def test_diffuse_materials_made_by_mitsuba_are_read_off_the_object(tmp_path: Pat
     np.testing.assert_allclose(np.array(mi.traverse(found)[name]), 0.75)
     assert name == "ball.bsdf.brdf_0.reflectance.value"
     assert not done.notices
+
+
+def test_a_texture_of_the_scene_that_two_materials_share_is_one_parameter_and_is_exported(tmp_path: Path) -> None:
+    values = np.random.default_rng(2).uniform(0.2, 0.9, (4, 4, 3)).astype(np.float32)
+
+    def description() -> dict[str, Any]:
+        paint = {"type": "ref", "id": "paint"}
+        return {
+            "paint": {"type": "bitmap", "id": "paint", "raw": True, "bitmap": mi.Bitmap(values)},
+            **scene({"type": "diffuse", "reflectance": paint}),
+            "other": {"type": "sphere", "center": [2, 0, 5], "bsdf": {"type": "diffuse", "reflectance": paint}},
+        }
+
+    asked = problem(description, "ball.bsdf.reflectance.data")
+    assert "other.bsdf.reflectance.data" not in asked.renderer.parameters()
+    done = ur.export((asked, {"ball.bsdf.reflectance.data": 0.5 * values}), tmp_path / "out")
+    again = MitsubaRenderer(done.scene)
+    keys = [key for key in again.parameters() if key.endswith("reflectance.data")]
+    for key in keys:
+        np.testing.assert_allclose(np.array(again.values([key])[key]), 0.5 * values, atol=1e-5)
+    assert keys
 
 
 def test_values_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.description import parse
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 __all__ = ["Place", "SceneGraph"]
 
@@ -70,7 +71,7 @@ class SceneGraph:
             if (label := _LABEL.fullmatch(emitter.id())) and self.nodes[int(label[1])].type == mi.ObjectType.Unknown:
                 self.nodes[int(label[1])].type = mi.ObjectType.Emitter
         self.names = [node.props.id() for node in self.nodes]
-        self.live = mi.traverse(self._scene)
+        self.live = ObjectGraph(self._scene).parameters()  # named as a problem's parameters are
 
     @property
     def root(self) -> Any:

@@ -27,6 +27,7 @@ from unrender.problem.render import as_tree
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.photographs import scene_renderer, scene_values
 from unrender.runs import reopen
@@ -273,7 +274,7 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         the name of each parameter of the live scene in the one that was written.
     """
     try:
-        found = mi.traverse(load(path))
+        found = ObjectGraph(load(path)).parameters()
     except Exception as error:
         raise InputError(
             f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"

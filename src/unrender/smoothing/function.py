@@ -196,7 +196,7 @@ class GradientAndProduct:
         gradient: ∇ S f(θ), (n,), smoothed along v by ε σ more.
         error: its standard error, (n,).
         product: ∇² S f(θ) v, (n,).
-        draws: z, (B, n), in units of σ.
+        draws: z, (B, n), in units of σ, without dropped ones.
         changes: of each, half the change of f(θ + σ z) − f(θ − σ z) as θ moves by u, (B,): zᵀ σ H u where f is a quadratic.
     """
 
@@ -227,8 +227,9 @@ def estimate_gradient_and_product(
     draws = (0.5 * (ahead + behind))[:, None] * kernel
     found, error = function.mean_and_error(draws) if len(z) > 1 else (draws[0], np.abs(draws[0]))
     difference = (ahead - behind) / (2 * options.epsilon)
-    product = np.mean((difference * length)[:, None] * kernel, axis=0)
-    return GradientAndProduct(found, error, product, z, -difference)
+    known = np.isfinite(difference)
+    product = np.mean((difference * length)[known, None] * kernel[known], axis=0)
+    return GradientAndProduct(found, error, product, z[known], -difference[known])
 
 
 def _first_order(

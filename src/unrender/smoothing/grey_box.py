@@ -274,10 +274,11 @@ class _BlackBox:
             raise InputError(
                 f"grey_box.loss: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
             )
-        if not np.isfinite(values).all():
-            bad = np.flatnonzero(~np.isfinite(values))[0]
-            place = np.array2string(points[bad], threshold=8, precision=4)
-            raise InputError(f"grey_box.loss: f is not finite at {place}" + f", item {items[bad]}" * self.batched)
+        finite = np.isfinite(values)
+        lost = np.setdiff1d(items, items[finite])  # of the others, `SmoothedFunction` drops what is not finite
+        if lost.size:
+            place = np.array2string(points[items == lost[0]][0], threshold=8, precision=4)
+            raise InputError(f"grey_box.loss: f is not finite at {place}" + f", item {lost[0]}" * self.batched)
         return values
 
 

@@ -52,7 +52,7 @@ class JointDerivatives:
 
     Attributes:
         value: f(θ), not smoothed.
-        draws: z, (B, n), in units of σ.
+        draws: z, (B, n), in units of σ, without dropped ones.
         curvatures: of each, f(θ + σ z) + f(θ − σ z) − 2 f(θ), (B,): zᵀ (σ H σ) z where f is a quadratic.
     """
 
@@ -67,7 +67,8 @@ class JointDerivatives:
         curvatures: np.ndarray,
     ):
         """`odd` and `even` (B,) weigh the gradient and the Hessian kernel; `curvature` (B,) is the control variate's."""
-        self.value, self.draws, self.curvatures = value, z, curvatures
+        known = np.isfinite(curvatures)
+        self.value, self.draws, self.curvatures = value, z[known], curvatures[known]
         self._function, self._z, self._odd, self._even, self._curvature = function, z, odd, even, curvature
 
     def gradient(self) -> tuple[np.ndarray, np.ndarray]:

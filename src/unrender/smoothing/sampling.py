@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core import checks
+from unrender.core.dropped import DropReport
 from unrender.core.errors import InputError
 from unrender.smoothing.options import SamplingOptions
 
@@ -19,6 +20,8 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 _REPLICATES = 8
 """Independent scramblings of a low-discrepancy sequence, over which its standard error is measured."""
+_dropped = DropReport()
+"""Perturbations of all functions of this process: a descent makes a `SmoothedFunction` at each step."""
 _ORTHOGONAL = 1 << 20
 """The stream of random numbers of orthogonal draws."""
 
@@ -131,7 +134,8 @@ class SmoothedFunction:
         return both[: len(z)], both[len(z) :]
 
     def leave_one_out_sum(self, values: np.ndarray) -> np.ndarray:
-        """Per draw, the sum of `values` (B,) over all draws that are independent of it."""
+        """Per draw, the sum of `values` (B,) over all draws that are independent of it. Dropped draws, which are not finite, count 0."""
+        values = np.where(np.isfinite(values), values, 0.0)
         if self.orthogonal:
             starts = np.arange(0, len(values), self.n)
             own = np.add.reduceat(values, starts)
@@ -142,25 +146,42 @@ class SmoothedFunction:
         return np.repeat(values.sum() - own, len(values) // _REPLICATES)
 
     def value_at_theta(self) -> float:
-        """f(θ), not smoothed."""
+        """f(θ), not smoothed. Raises `InputError` where it is not finite."""
         return float(self.evaluate(self.theta[None])[0])
 
     def evaluate(self, points: np.ndarray) -> np.ndarray:
-        """f at points (B, n). Raises `InputError` for values of another shape than (B,), or not finite."""
+        """f at points (B, n), NaN where it is not finite: such perturbations are dropped, counted and reported.
+
+        Raises `InputError` for values of another shape than (B,), or where none is finite.
+        """
         values = np.asarray(self.f(points), np.float64)
         if values.shape != (len(points),):
             raise InputError(
                 f"{self.owner}: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
             )
-        if not np.isfinite(values).all():
-            worst = points[~np.isfinite(values)][0]
-            raise InputError(f"{self.owner}: f is not finite at {np.array2string(worst, threshold=8, precision=4)}")
-        return values
+        finite = np.isfinite(values)
+        if not finite.all():
+            place = np.array2string(points[~finite][0], threshold=8, precision=4)
+            if not finite.any():
+                raise InputError(f"{self.owner}: f is not finite at {place}, nor at any other of {len(points)} points")
+            _dropped.add(int((~finite).sum()), len(points), f"{self.owner}: f is not finite at {place}")
+        return np.where(finite, values, np.nan)
 
     def mean_and_error(self, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean over draws (B, ...) and its standard error; with low discrepancy, from the means of the scramblings."""
+        """Mean over draws (B, ...) and its standard error; with low discrepancy, from the means of the scramblings.
+
+        Draws that are not finite are left out. Raises `InputError` where fewer than two remain.
+        """
+        known = np.isfinite(draws.reshape(len(draws), -1)).all(axis=1)
         if self.low_discrepancy:
-            draws = draws.reshape(_REPLICATES, -1, *draws.shape[1:]).mean(axis=1)
+            parts = zip(np.split(draws, _REPLICATES), np.split(known, _REPLICATES), strict=True)
+            draws = np.array([part[mask].mean(axis=0) for part, mask in parts if mask.any()])
+        elif not known.all():
+            draws = draws[known]
+        if len(draws) < 2:
+            raise InputError(
+                f"{self.owner}: f is finite at fewer than two perturbations; take more samples or a smaller σ"
+            )
         return draws.mean(axis=0), draws.std(axis=0, ddof=1) / np.sqrt(len(draws))
 
 

@@ -15,6 +15,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
 from unrender.rendering.renderer import SampleRequest
@@ -44,6 +45,8 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
         return "path gradients of moving shapes know no media"
     if shape is None:
         return "path gradients do not move instances"
+    if has_instances(pair.current):
+        return "boundary derivatives do not know the silhouettes of the scene's instances"
     if not shape.is_mesh():
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba.scene_graph import all_shapes
 from unrender.rendering.mitsuba.scene_loading import media
 
 __all__ = ["camera_media", "medium_id"]
@@ -54,9 +55,11 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
 
 def _may_be_inside(scene: Any, sensor: Any) -> bool:
     """False only where no shape with a medium can be around the sensor, which costs no kernel to find out."""
-    shapes = [shape for shape in scene.shapes() if shape.is_medium_transition()]
+    shapes = [shape for shape in all_shapes(scene) if shape.is_medium_transition()]
     if not shapes:
         return False
+    if {*shapes} - {*scene.shapes()}:  # the box of a shape group's child is not where its instances stand
+        return True
     if sensor.class_name() not in _AT_A_POINT or any(shape.exterior_medium() is not None for shape in shapes):
         return True
     origin = np.array(sensor.world_transform().translation().numpy(), float).reshape(3)

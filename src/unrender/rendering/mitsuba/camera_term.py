@@ -11,11 +11,12 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.camera_motion import CameraMotion
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
-__all__ = ["CameraTerm", "lens_parameters", "moved_sensor", "sensor_obstacle"]
+__all__ = ["CameraTerm", "lens_parameters", "moved_sensor", "sensor_obstacle", "translation_obstacle"]
 
 _STREAM = 4
 """Of the key of a request: numbers that neither its paths nor boundaries have."""
@@ -40,6 +41,13 @@ def sensor_obstacle(pair: ScenePair, target: str) -> str:
     kind = next(sensor.class_name() for sensor in pair.current.sensors() if sensor.id() == target)
     if kind != "PerspectiveCamera":
         return f"path gradients move perspective sensors only, and {target} is another ({kind})"
+    return ""
+
+
+def translation_obstacle(pair: ScenePair) -> str:
+    """Why there is no derivative by a sensor's position, "" where there is."""
+    if has_instances(pair.current):
+        return "boundary derivatives do not know the silhouettes of the scene's instances"
     return ""
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io.volumes import read_grid
 from unrender.rendering.mitsuba.description import parse
+from unrender.rendering.mitsuba.scene_graph import all_shapes
 
 __all__ = ["MediumKey", "attached_media", "extinction_transforms"]
 
@@ -23,7 +24,7 @@ have no id."""
 
 def attached_media(scene: mi.Scene) -> list[tuple[MediumKey, Any]]:
     """All participating media of a scene, once for each shape side or sensor that has one, in an order that two loads share."""
-    shapes, sensors = scene.shapes(), scene.sensors()
+    shapes, sensors = all_shapes(scene), scene.sensors()
     found = [
         ((shape.id(), side), medium)
         for shape in shapes
@@ -51,8 +52,10 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
     Media and volumes that are ready-made objects have none.
     """
     nodes: Any = parse(description).state.nodes
+    top = list(_children(nodes, nodes[0]).values())
+    groups = [node for node in top if node.props.plugin_name() == "shapegroup"]
     slots = []
-    for node in _children(nodes, nodes[0]).values():
+    for node in (*top, *(child for group in groups for child in _children(nodes, group).values())):
         if node.type in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
             for name, child in _children(nodes, node).items():
                 side = name if node.type == mi.ObjectType.Shape else "medium"

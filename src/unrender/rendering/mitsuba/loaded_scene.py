@@ -11,7 +11,7 @@ import gc
 import itertools
 import re
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,6 +27,7 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
@@ -153,7 +154,8 @@ class LoadedScene:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
         _make_distributions(self.scene)
-        self.parameters: mi.SceneParameters = mi.traverse(self.scene)
+        self.graph = ObjectGraph(self.scene)
+        self.parameters: mi.SceneParameters = self.graph.parameters()
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
         for key in self.parameters.keys():  # noqa: SIM118 (iterating gives pairs)
@@ -226,6 +228,7 @@ class LoadedScene:
         try:
             with _without_warnings():
                 self.parameters.update()
+                self._notify(changed)
         except RuntimeError as error:
             if not _OF_MITSUBA.search(str(error)):
                 raise
@@ -234,6 +237,11 @@ class LoadedScene:
             raise InputError(
                 f"{', '.join(changed)}: Mitsuba refuses the value, give it bounds: {reason_of(error, 200)}"
             ) from error
+
+    def _notify(self, keys: Iterable[str]) -> None:
+        """Update all owners of shared objects whose parameters changed."""
+        for node in {self.parameters.properties[key][2] for key in keys if key in self.parameters}:
+            self.graph.notify_other_owners(node)
 
     def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
         """Whether the parameter was set to this, and the scene still holds it."""
@@ -256,6 +264,7 @@ class LoadedScene:
             else:
                 self.parameters[key] = _reference(self._own[key])
         self.parameters.update()
+        self._notify(keys)
         # A mesh whose vertices were set computes its normals anew, also where it was loaded with others.
         written = [name for key in keys for name in self.poses.written(key)]
         normals = [name for name in map(normals_key, written) if name in self._own and name not in self._settings]

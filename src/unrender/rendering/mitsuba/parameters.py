@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,7 +11,8 @@ import mitsuba as mi
 
 from unrender.evaluation.parameter_errors import Role
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
-from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
+from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 __all__ = [
     "ParameterTraits",
@@ -27,6 +29,7 @@ __all__ = [
 _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
 _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
+_MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
@@ -39,19 +42,17 @@ class ParameterTraits:
 
     Attributes:
         geometric: whether it moves shapes, sensors or emitters, so that paths themselves change.
-        bsdf: the outermost BSDF it belongs to, or None.
         reason: why one path cannot serve two values of it, "" if it can.
         replayable: whether path replay gives its derivative; if not, for the same reason.
-        delta: how the BSDF's perfectly specular lobes follow it, one of the `DELTA_...` constants of the integrators.
+        delta_lobes: the BSDFs of shapes whose perfectly specular lobes follow it, each with one of the `DELTA_...` constants.
         medium: whether extinction or scattering of a participating medium depends on it.
         phase: whether it belongs to a phase function.
     """
 
     geometric: bool
-    bsdf: mi.BSDF | None
     reason: str
     replayable: bool = True
-    delta: int = DELTA_EQUAL
+    delta_lobes: tuple[tuple[Any, int], ...] = ()
     medium: bool = False
     phase: bool = False
 
@@ -63,58 +64,85 @@ class ParameterTraits:
     @property
     def changes_delta(self) -> bool:
         """Whether perfectly specular lobes change with it."""
-        return self.delta != DELTA_EQUAL
+        return bool(self.delta_lobes)
 
 
-def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTraits:
-    """How the parameter `key` of a traversed scene reaches the image, from the chain of objects that holds it."""
-    node = parameters.properties[key][2]
+def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGraph) -> ParameterTraits:
+    """Return how the parameter `key` of a traversed scene reaches the image.
+
+    A shared object reaches it by several chains of owners. Each one may forbid what the others allow.
+    """
     leaf = key.rsplit(".", 1)[-1]
-    chain: list[Any] = []
-    while node is not None and node in parameters.hierarchy:
-        chain.append(node)
-        node = parameters.hierarchy[node][0]
+    node = parameters.properties[key][2]
+    if isinstance(node, mi.Mesh) and _is_attribute(leaf):
+        readers = graph.attribute_readers(node, leaf)
+        chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
+        return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in chains], ParameterTraits(False, ""))
+    chains = list(graph.chains(node))
+    used = [
+        chain for chain in chains if len(chain) > 2
+    ] or chains  # a texture that the scene holds, too, has no effect there
+    return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in used])
+
+
+def _is_attribute(leaf: str) -> bool:
+    """Whether a mesh's parameter is an attribute that textures read."""
+    return leaf.startswith(("vertex_", "face_")) and leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED)
+
+
+def _joined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:
+    first = other if not other.replayable and one.replayable else one
+    lobes = dict(one.delta_lobes)
+    mixed = any(lobes.get(bsdf, kind) != kind for bsdf, kind in other.delta_lobes)
+    return ParameterTraits(
+        one.geometric or other.geometric,
+        first.reason or one.reason or other.reason or (_MIXED if mixed else ""),
+        one.replayable and other.replayable and not mixed,
+        tuple((lobes | dict(other.delta_lobes)).items()),
+        one.medium or other.medium,
+        one.phase or other.phase,
+    )
+
+
+def _traits_of(chain: list[Any], leaf: str) -> ParameterTraits:
+    """From one chain of objects, the one that holds the parameter first."""
     bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
     if bsdfs:
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
-            return ParameterTraits(True, None, "it moves an emitter")
-        return ParameterTraits(False, None, "")
+            return ParameterTraits(True, "it moves an emitter")
+        return ParameterTraits(False, "")
     if any(isinstance(n, mi.Medium) for n in chain):
         volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
-        return ParameterTraits(False, None, "", medium=volume, phase=phase)
+        return ParameterTraits(False, "", medium=volume, phase=phase)
     if any(isinstance(n, mi.Sensor) for n in chain):
-        return ParameterTraits(True, None, "it moves the sensor")
+        return ParameterTraits(True, "it moves the sensor")
     shapes = [n for n in chain if isinstance(n, mi.Shape)]
     if shapes:
-        if leaf.startswith(("vertex_", "face_")) and leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED):
-            return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
         if shapes[-1].is_sensor():
-            return ParameterTraits(True, None, "it moves a shape that carries a sensor", replayable=False)
-        return ParameterTraits(True, None, "it moves a shape")
-    return ParameterTraits(True, None, "it is neither a material's nor an emitter's")
+            return ParameterTraits(True, "it moves a shape that carries a sensor", replayable=False)
+        return ParameterTraits(True, "it moves a shape")
+    return ParameterTraits(True, "it is neither a material's nor an emitter's")
 
 
 def _bsdf_traits(bsdfs: list[Any], chain: list[Any]) -> ParameterTraits:
     """How a parameter inside this nest of BSDFs (innermost first) reaches the image: what its delta lobes make of it."""
     outer = bsdfs[-1]
     if not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta):
-        return ParameterTraits(False, outer, "")  # whatever mirrors stand beside it do not change
+        return ParameterTraits(False, "")  # whatever mirrors stand beside it do not change
     names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
     if names == ["MaskBSDF"] and not _masks_delta(outer):
-        return ParameterTraits(False, outer, "", delta=DELTA_MASK)
+        return ParameterTraits(False, "", delta_lobes=((outer, DELTA_MASK),))
     inner = names[0]
     if inner in _SIMPLE_DELTA and all(name in _BENDERS for name in names[1:]):
         if not any(isinstance(c, mi.Texture) for c in chain):  # the index of refraction is no texture
-            return ParameterTraits(
-                False, outer, "it bends the direction of a perfectly specular lobe", replayable=False
-            )
+            return ParameterTraits(False, "it bends the direction of a perfectly specular lobe", replayable=False)
         turned = "it lies under a bump or normal map that turns a specular lobe" if names[1:] else ""
-        return ParameterTraits(False, outer, turned, delta=DELTA_SIMPLE)
+        return ParameterTraits(False, turned, delta_lobes=((outer, DELTA_SIMPLE),))
     if inner in _BENDERS:
-        return ParameterTraits(False, outer, "it bends the direction of a perfectly specular lobe", replayable=False)
-    return ParameterTraits(False, outer, "its BSDF mixes perfectly specular lobes with others", replayable=False)
+        return ParameterTraits(False, "it bends the direction of a perfectly specular lobe", replayable=False)
+    return ParameterTraits(False, _MIXED, replayable=False)
 
 
 def _masks_delta(bsdf: Any) -> bool:

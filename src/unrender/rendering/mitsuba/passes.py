@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
-from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables
+from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables, dropped_together
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -209,7 +209,7 @@ class MovedPairPass(Pass):
                     made.append(film.rays(samples) if rays is None else rays[state])
                 choices = film.independent(numbers, size.pixels * size.spp)
                 found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[-1][0]))
-                return found[0] * made[0][1], found[1] * made[-1][1]
+                return dropped_together(found[0] * made[0][1], found[1] * made[-1][1])
 
         return launch
 

@@ -1,15 +1,20 @@
-"""What a session keeps of a rendering."""
+"""What a session keeps of a rendering, and the samples that it drops."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
+from unrender.core.dropped import DropReport
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.camera_paths import is_finite
 from unrender.rendering.renderer import SampleRequest, Space
 
-__all__ = ["Paths"]
+__all__ = ["DroppedSamples", "Paths"]
 
 
 @dataclass(frozen=True)
@@ -29,3 +34,41 @@ class Paths:
     radiance_previous: mi.Spectrum | None = None
     space: Space = "path"
     previous: Tree | None = None
+
+
+class DroppedSamples:
+    """Samples whose radiance is not finite. They add nothing to an image or a gradient, and are counted.
+
+    Args:
+        at_once: read each count at once. Otherwise it is read after the next launch, so that no launch waits for it.
+
+    """
+
+    def __init__(self, at_once: bool) -> None:
+        self._report = DropReport()
+        self._at_once = at_once
+        self._pending: list[tuple[Any, int]] = []
+
+    @property
+    def count(self) -> int:
+        """Number of samples dropped so far."""
+        self.read()
+        return self._report.count
+
+    def develop(self, radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> mi.TensorXf:
+        """Return the image that `film.develop` makes of the other samples, and count the dropped ones."""
+        self.read()
+        finite, lanes = is_finite(radiance), dr.width(radiance)
+        found = mi.Spectrum(dr.select(finite, radiance, 0))
+        dropped = dr.count(~finite)
+        dr.eval(found, dropped)
+        self._pending.append((dropped, lanes))
+        if self._at_once:
+            self.read()
+        return film.develop(found, spp, groups, shape)
+
+    def read(self) -> None:
+        """Add up the counts of earlier launches."""
+        for dropped, lanes in self._pending:
+            self._report.add(int(dropped.numpy()[0]), lanes, "samples of a picture are not finite")
+        self._pending.clear()

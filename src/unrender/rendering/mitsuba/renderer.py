@@ -15,7 +15,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.camera_poses import Camera
 from unrender.rendering.mitsuba import ignored, poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
-from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
+from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -67,7 +67,8 @@ class MitsubaRenderer:
         sensors = {sensor.id(): index for index, sensor in enumerate(self.pair.current.sensors())}
         found = self._obstacles({pose.target for pose in self._poses.values()})
         self._info |= {
-            key: poses.info(pose, found[pose.target], sensors.get(pose.target)) for key, pose in self._poses.items()
+            key: poses.info(pose, found[pose.target] or self._translates(pose), sensors.get(pose.target))
+            for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
         self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}
@@ -146,6 +147,11 @@ class MitsubaRenderer:
         if self._stock is None:
             self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.max_depth)
         return self._stock
+
+    def _translates(self, pose: poses.PoseKey) -> str:
+        """Why a pose has no derivative because it moves a sensor to another place, "" where that is not so."""
+        moves = pose.part == "translation" and any(sensor.id() == pose.target for sensor in self.pair.current.sensors())
+        return translation_obstacle(self.pair) if moves else ""
 
     def _obstacles(self, targets: set[str]) -> dict[str, str]:
         """{shape or sensor that moves: why it has no path gradient, "" where it has}."""

@@ -34,6 +34,7 @@ from unrender.rendering.mitsuba.parameters import (
     physical_range,
     role,
 )
+from unrender.rendering.mitsuba.scene_graph import object_ids
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
@@ -147,15 +148,12 @@ class ScenePair:
                 )
 
     def tables(self) -> dict[str, mi.UInt32]:
-        """Pointer tables {"bsdf" | "emitter" | "shape" | "medium": UInt32}, from registry ids of current to those of previous."""
+        """Return the pointer tables {"bsdf" | "emitter" | "shape" | "medium": UInt32}, from registry ids of current to those of previous.
+
+        They hold every object of the scene: children of shape groups, nested BSDFs and media of both sides of a shape too.
+        """
         if self._tables is None:
-            current, previous = self.current.shapes_dr(), self.previous.shapes_dr()
-            self._tables = {
-                "bsdf": _table(current.bsdf(), previous.bsdf()),  # pyright: ignore[reportAttributeAccessIssue]
-                "emitter": _table(self.current.emitters_dr(), self.previous.emitters_dr()),
-                "shape": _table(current, previous),
-                "medium": _table(_media_ids(self.current), _media_ids(self.previous)),
-            }
+            self._tables = self.loaded().graph.tables(self.loaded(previous=True).graph)
         return self._tables
 
     def emitter_tables(self, previous: bool, probabilities: np.ndarray) -> dict[str, Any]:
@@ -212,13 +210,10 @@ class ScenePair:
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
         """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current
         scene's BSDFs and, through the pointer tables, of the previous scene's."""
-        kinds = {
-            int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(traits.bsdf)).numpy()[0]): traits.delta  # pyright: ignore[reportAttributeAccessIssue]
-            for traits in all_traits
-            if traits.changes_delta
-        }
-        pointers = dr.reinterpret_array(mi.UInt32, self.current.shapes_dr().bsdf()).numpy()  # pyright: ignore[reportAttributeAccessIssue]
-        kinds = {number: kind for number, kind in kinds.items() if number in pointers}
+        changing = {bsdf: kind for traits in all_traits for bsdf, kind in traits.delta_lobes}
+        numbers = object_ids("bsdf", changing)
+        kinds = dict(zip(numbers.tolist(), changing.values(), strict=True))
+        pointers = object_ids("bsdf", self.loaded().graph.of("bsdf"))
         if kinds and not self.single:  # only then is the second load worth its while
             previous = self.tables()["bsdf"].numpy()
             kinds |= {int(previous[number]): kind for number, kind in kinds.items()}
@@ -272,7 +267,7 @@ class ScenePair:
     def _check_media(self) -> None:
         """Raise `InputError` where the scene itself gives a medium values that make no sense: Mitsuba takes them as they are."""
         for key in self.current_parameters.keys():  # noqa: SIM118 (iterating gives pairs)
-            if not parameter_traits(self.current_parameters, key).medium:
+            if not self._traits(key).medium:
                 continue
             low, high = physical_range(self.current_parameters, key)
             values = self._current.value(key).numpy()
@@ -295,13 +290,16 @@ class ScenePair:
 
     def parameter_traits(self, key: str) -> ParameterTraits:
         """How the parameter `key` reaches the picture."""
-        traits = parameter_traits(self.current_parameters, key)
+        traits = self._traits(key)
         if self.volumetric and traits.geometric:
             return replace(traits, reason=f"{traits.reason}, in a scene with media", replayable=False)
-        if self.volumetric and traits.delta == DELTA_MASK:
+        if self.volumetric and any(kind == DELTA_MASK for _, kind in traits.delta_lobes):
             # Connections to emitters pass masks, and their derivative would be needed there too.
             return replace(traits, reason="it is the opacity of a mask in a scene with media", replayable=False)
         return traits
+
+    def _traits(self, key: str) -> ParameterTraits:
+        return parameter_traits(self.current_parameters, key, self.loaded().graph)
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
@@ -365,10 +363,6 @@ class ScenePair:
         node = self.current_parameters.properties[key][2]
         axes = 4 if isinstance(node, mi.Volume) else 3 if isinstance(node, mi.Texture) else 0
         return key.endswith("data") and len(shape) == axes
-
-
-def _media_ids(scene: mi.Scene) -> mi.UInt32:
-    return mi.UInt32([0, *(medium_id(medium) for medium in media(scene))])
 
 
 def _areas(mesh: Any) -> Any:

@@ -14,7 +14,6 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
@@ -40,10 +39,10 @@ from unrender.rendering.mitsuba.passes import (
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
 from unrender.rendering.mitsuba.recordable import is_recordable
-from unrender.rendering.mitsuba.rendered_paths import Paths
+from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_pair import ScenePair
-from unrender.rendering.mitsuba.tensors import tensor
+from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
 
 __all__ = ["MitsubaSession"]
@@ -67,6 +66,9 @@ class MitsubaSession:
         max_depth: longest path in segments.
         sampler: is cloned.
         differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
+
+    Attributes:
+        dropped: the samples that were not finite.
 
     Raises `InputError` where poses and other parameters that move geometry come together, or poses with a derivative and poses without:
     the scenes that posed shapes live in are not rebuilt; and where `differential_bsdf` serves nothing.
@@ -129,6 +131,7 @@ class MitsubaSession:
         served = [key for key in keys if key in derivatives] if differential_bsdf and derivatives else None
         self._rough = RoughLobes(pair, served, self._geometric)
         self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
+        self.dropped = DroppedSamples(at_once=not derivatives)
 
     @cached_property
     def _path_kernel(self) -> Kernel:
@@ -178,7 +181,7 @@ class MitsubaSession:
         """
         count = len(next(iter(parameters.values())))
         shape = (*self._pair.resolutions[request.sensor], 3)
-        shared = all(_is_broadcast(parameters[key]) for key in self._keys if key in parameters)
+        shared = all(is_broadcast(parameters[key]) for key in self._keys if key in parameters)
         together = self._posed is not None and shared
         size = max(1, _LANES // (self._count(request) * request.spp)) if together else 1
         images = []
@@ -201,7 +204,7 @@ class MitsubaSession:
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
             radiance = self._run(PosesPass(self._posed, count), request, tensor(numbers).array)
         dr.eval(radiance)
-        return film.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
+        return self.dropped.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
@@ -259,6 +262,7 @@ class MitsubaSession:
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self._run(AdjointPairPass(), request, *states)
+        self.dropped.read()
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
     def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
@@ -314,7 +318,9 @@ class MitsubaSession:
         for term in (self._boundary, self._camera):
             if term is not None:
                 term.accumulate(scene, request, weights)
-        return scene.take_gradients()
+        found = scene.take_gradients()
+        self.dropped.read()
+        return found
 
     # ------------------------------------------------------------------ launches
 
@@ -354,7 +360,7 @@ class MitsubaSession:
 
     def _develop(self, radiance: mi.Spectrum, request: SampleRequest) -> mi.TensorXf:
         size = self._pair.resolutions[request.sensor] if request.pixels is None else (self._count(request),)
-        return film.develop(radiance, request.spp, request.groups, (*size, 3))
+        return self.dropped.develop(radiance, request.spp, request.groups, (*size, 3))
 
     def _run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
         """Launch the kernel for requests of this form: traced once, replayed at each step."""
@@ -392,8 +398,3 @@ class MitsubaSession:
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
-
-
-def _is_broadcast(values: np.ndarray) -> bool:
-    """Whether all states share a value: see `RenderSession.image_batch`."""
-    return len(values) == 1 or np.asarray(values).strides[0] == 0

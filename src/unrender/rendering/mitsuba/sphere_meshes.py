@@ -9,6 +9,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+
 __all__ = ["meshed", "moving_targets"]
 
 _ROWS, _COLUMNS = 64, 128
@@ -48,6 +50,8 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
         return scene, []
     replaced = [shape.id() for shape in spheres]
     objects = [_mesh(shape) if shape.id() in replaced else shape for shape in scene.shapes()]
+    # The scene holds the groups of its instances apart from its shapes.
+    objects += [group for group in ObjectGraph(scene).of("shape") if group.class_name().startswith("ShapeGroup")]
     objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     described: dict[str, Any] = {"type": "scene"}
     own = [] if scene.integrator() is None else [scene.integrator()]

@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.core import arrays
 
-__all__ = ["from_tensor", "native_shape", "tensor", "to_tensor"]
+__all__ = ["from_tensor", "is_broadcast", "native_shape", "tensor", "to_tensor"]
 
 
 def tensor(values: np.ndarray) -> mi.TensorXf:
@@ -50,3 +50,8 @@ def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
     if dr.depth_v(like) == 1:
         return type(like)(tensor.array)
     return dr.unravel(type(like), type(like[0])(tensor.array))
+
+
+def is_broadcast(values: np.ndarray) -> bool:
+    """Whether all states of a batch share a value: see `RenderSession.image_batch`."""
+    return len(values) == 1 or np.asarray(values).strides[0] == 0

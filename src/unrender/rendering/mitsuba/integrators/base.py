@@ -25,6 +25,7 @@ __all__ = [
     "PathKernel",
     "ReplayState",
     "ScatteringVertex",
+    "carries_light",
     "largest",
     "relative",
     "total",
@@ -60,6 +61,7 @@ class PathKernel(Protocol):
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
+        active: Bool | bool = True,
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. Call under `dr.suspend_grad()`.
 
@@ -74,6 +76,7 @@ class PathKernel(Protocol):
             replay: the current state and, with `pair`, the previous state; () with `Primal`.
             pair: whether the previous state is traced too.
             geometry: what rays are intersected with in place of `scene` (`poses.Assembly`), or None.
+            active: lanes that are traced. A replay leaves out the samples that the primal pass dropped.
 
         Returns:
             radiance per lane of the current and, with `pair`, of the previous state, both unbiased; with `Forward` the derivative of the
@@ -195,6 +198,11 @@ class ScatteringVertex:
 def total(parts: Sequence[Any]) -> Any:
     """Their sum, in order."""
     return functools.reduce(operator.add, parts)
+
+
+def carries_light(spectra: Sequence[Spectrum]) -> Bool:
+    """Whether any channel of any state is above zero or no number, per lane: a broken path goes on, to be counted as such at its end."""
+    return ~(largest(spectra) <= 0)
 
 
 def largest(spectra: Sequence[Spectrum]) -> Float:

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators import tracking
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
-from unrender.rendering.mitsuba.integrators.base import PathContext, largest
+from unrender.rendering.mitsuba.integrators.base import PathContext, carries_light
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 
 __all__ = ["Connection", "ConnectionSample", "connect"]
@@ -112,7 +112,7 @@ def _connection_segment(
         T * (dr.select(active, through, 1) * dr.select(hit, bsdf.eval_null_transmission(surface, hit), 1))
         for T, through, bsdf, surface in zip(way.T, passed, bsdfs, surfaces, strict=True)
     ]
-    way.active = hit & (largest(way.T) > 0)
+    way.active = hit & carries_light(way.T)
     way.medium = dr.select(way.active & si.is_medium_transition(), si.target_medium(ray.d), medium)
     way.ray = dr.select(way.active, si.spawn_ray_to(target), ray)
     return way

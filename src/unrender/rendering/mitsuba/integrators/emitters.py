@@ -18,11 +18,19 @@ from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 __all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
 
+_LARGEST = 1e18
+"""Solid angle density whose square, and twice that, is a finite single-precision number."""
+
 
 def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
-    """The power heuristic with exponent 2, detached."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.detach(dr.select(a > 0, a / (a + b), 0))
+    """Return the weight of strategy a by the power heuristic with exponent 2, detached. Finite for all densities that are numbers.
+
+    Densities count up to `_LARGEST` for both strategies, so the two weights still sum to one. A flat lamp seen edge-on has a density
+    above 1e19, whose square is no single-precision number.
+    """
+    # Unlike a minimum, the selection passes on a density that is no number, so that its sample is dropped and counted.
+    a, b = (dr.square(dr.select(pdf > _LARGEST, _LARGEST, pdf)) for pdf in (pdf_a, pdf_b))
+    return dr.detach(dr.select(a == 0, 0, a / (a + b)))
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
@@ -87,7 +95,7 @@ class EmitterConnection:
     def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
         self._context, self._vertex = context, vertex
         self.ds = _sample_direction(context, vertex, sample, active)
-        self.active = active & (self.ds.pdf != 0)
+        self.active = active & (self.ds.pdf > 0)  # false also where the density is not a number
 
     @property
     def emitter(self) -> UInt32:

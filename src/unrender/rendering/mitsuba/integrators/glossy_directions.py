@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.emitters import mis_weight
+
 __all__ = ["glossy_radiance", "is_glossy"]
 
 
@@ -35,9 +37,9 @@ def glossy_radiance(
         bsdf, turned = si.bsdf(), mi.SurfaceInteraction3f(si)
         ds, emitted = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
         to_emitter = si.to_local(ds.d)
-        lit = active & (ds.pdf != 0)
+        lit = active & (ds.pdf > 0)
         density = bsdf.pdf(context, si, to_emitter, lit)
-        emitted *= dr.select(ds.delta, 1, _share(ds.pdf, density))
+        emitted *= dr.select(ds.delta, 1, mis_weight(ds.pdf, density))
         bs, _ = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
         smooth = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         density = bsdf.pdf(context, si, bs.wo, smooth)
@@ -47,7 +49,7 @@ def glossy_radiance(
         arriving = trace(scene, ray, following, sampler, smooth)
         seen = mi.DirectionSample3f(scene, following, si)
         direct = following.emitter(scene, smooth).eval(following, smooth)
-        share = _share(density, scene.pdf_emitter_direction(si, seen, smooth))
+        share = mis_weight(density, scene.pdf_emitter_direction(si, seen, smooth))
         arriving += direct * (share - 1)
         arriving = dr.select(smooth, arriving / density, 0)
     with dr.resume_grad():
@@ -55,10 +57,3 @@ def glossy_radiance(
         from_emitter = bsdf.eval(context, turned, to_emitter, lit) - bsdf.eval(context, si, to_emitter, lit)
         others = bsdf.eval(context, turned, bs.wo, smooth) - bsdf.eval(context, si, bs.wo, smooth)
         return from_emitter * emitted + others * arriving
-
-
-def _share(one: Any, other: Any) -> Any:
-    """Power heuristic."""
-    square = dr.square(one)
-    total = square + dr.square(other)
-    return dr.select(total > 0, square / total, 0)

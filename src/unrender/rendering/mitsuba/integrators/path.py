@@ -22,7 +22,7 @@ from unrender.rendering.mitsuba.integrators.base import (
     PathContext,
     ReplayState,
     ScatteringVertex,
-    largest,
+    carries_light,
     relative,
     total,
 )
@@ -124,10 +124,11 @@ class PathPair:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
+        active: Bool | bool = True,
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
-        path = self._trace(context, self._begin(context, ray), sampler)
+        path = self._trace(context, self._begin(context, ray, active), sampler)
         if path.branches:
             self._follow_branches(context, path, sampler)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
@@ -152,12 +153,13 @@ class PathPair:
         ray: mi.RayDifferential3f,
         replay: ReplayState,
         connections: ConnectionRecord,
+        active: Bool | bool = True,
     ) -> None:
         """Replay the paths forward, as `sample` does, and write what connections to emitters add."""
         context = PathContext(dr.ADMode.Forward, scene, tables, (replay,), False, None, connections)
-        self._trace(context, self._begin(context, ray), sampler)
+        self._trace(context, self._begin(context, ray, active), sampler)
 
-    def _begin(self, context: PathContext, ray: mi.RayDifferential3f) -> PathState:
+    def _begin(self, context: PathContext, ray: mi.RayDifferential3f, active: Bool | bool = True) -> PathState:
         return PathState(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
@@ -167,7 +169,7 @@ class PathPair:
             β=[mi.Spectrum(1) for _ in range(context.state_count)],
             η=mi.Float(1),
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
-            active=mi.Bool(True),
+            active=mi.Bool(active),
             branches=[BranchVertex.nowhere(mi.Ray3f(dr.detach(ray)))] if self._branches_off(context) else [],
         )
 
@@ -210,7 +212,7 @@ class PathPair:
         path.last = ScatteringVertex(dr.detach(si, True), pdf, direction.delta)
 
         # -------------------- Stopping criterion ---------------------
-        active_next &= largest(path.β) > 0
+        active_next &= carries_light(path.β)
         q = dr.clip(dr.max(path.β[0]) * dr.square(path.η), ROULETTE_FLOOR, 0.95)
         roulette = path.depth >= self.rr_depth
         rr_weight = dr.select(roulette, dr.rcp(q), 1)

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Float, Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
 from unrender.rendering.mitsuba.integrators.base import ReplayState
 from unrender.rendering.mitsuba.integrators.path import PathPair
 
@@ -33,13 +33,14 @@ class PrbKernel:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
+        active: Bool | bool = True,
     ) -> tuple[Spectrum, None]:
         """See `PathKernel.sample`. Raises `ValueError` for pairs and for other geometry, which `prb` does not know."""
         del tables
         if pair or geometry is not None:
             raise ValueError("prb: expected one state and the scene's own geometry")
         δL, state_in = (replay[0].δL, replay[0].radiance) if replay else (None, None)
-        return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(True))[0], None
+        return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(active))[0], None
 
     def vertices(
         self,

@@ -224,7 +224,7 @@ def _ratio_tracking_step(segment: MediumSegment, walk: RatioTracking, sampler: A
     most = largest(walk.T)
     survival = _roulette(walking & (most < _FAINT), sampler)
     walk.T = [T * survival for T in walk.T]
-    walk.active = walking & (most > 0) & (survival > 0)
+    walk.active = walking & ~(most <= 0) & (survival > 0)
     walk.dda = dda
     return walk
 
@@ -346,7 +346,7 @@ def _offer_point(
     # Roulette, relative to what the reservoir holds: points that would hardly be taken are not worth a walk.
     survival = _roulette(most * (segment.far - t) < _FAINT * kept.total, sampler)
     walk.β = [β * survival for β in walk.β]
-    walk.active = walking & (most > 0) & (survival > 0)
+    walk.active = walking & ~(most <= 0) & (survival > 0)
     walk.dda = dda
     return walk
 

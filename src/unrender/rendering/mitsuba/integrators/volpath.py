@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
     ReplayState,
     ScatteringVertex,
+    carries_light,
     largest,
     relative,
 )
@@ -90,6 +91,7 @@ class VolumePair:
         replay: tuple[ReplayState, ...] = (),
         pair: bool = False,
         geometry: Any = None,
+        active: Bool | bool = True,
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. See `PathKernel.sample`; `tables` has also the entries of `ScenePair.media()` and `.majorants()`.
 
@@ -98,7 +100,7 @@ class VolumePair:
         if geometry is not None:
             raise ValueError("media: expected the scene's own geometry")
         camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
-        start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
+        start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(active))
         context = VolumeContext(start, mode, scene, tables, replay, pair)
         noise = None if context.primal else independent(sampler, dr.width(ray))
         path = self._trace(context, self._begin(context), sampler, noise)
@@ -187,7 +189,7 @@ class VolumePair:
         rr_weight = dr.select(roulette, dr.rcp(q), 1)
         path.β = [β * rr_weight for β in path.β]
         goes_on = vertex.scatters | (vertex.meets & (vertex.may_scatter | direction.null))
-        path.active = goes_on & (most > 0) & (~roulette | (sampler.next_1d() < q))
+        path.active = goes_on & carries_light(path.β) & (~roulette | (sampler.next_1d() < q))
         path.depth[moved] += 1
         return path
 

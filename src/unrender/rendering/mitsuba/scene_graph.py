@@ -1,0 +1,215 @@
+"""The objects of a loaded scene and every place where each is used, children of shape groups and nested BSDFs included.
+
+`mitsuba.traverse` names an object by the first place that holds it. A shared object has several. Each of them decides how the object's
+parameters reach the picture, and each keeps values of its own that depend on them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core.errors import InputError
+
+__all__ = ["ObjectGraph", "all_shapes", "has_instances", "object_ids"]
+
+_KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
+
+
+class ObjectGraph:
+    """The objects below a scene.
+
+    Args:
+        scene: a loaded scene.
+
+    Attributes:
+        nodes: every object once. Two loads of a description have equal orders.
+        owners: {object: what holds it}, in the order of visits; nothing holds the scene.
+        properties, hierarchy: of `mitsuba.SceneParameters`.
+        names: of the objects.
+    """
+
+    def __init__(self, scene: Any):
+        self._scene = scene
+        self.owners: dict[Any, list[Any]] = {scene: []}
+        self.hierarchy: dict[Any, tuple[Any, int]] = {scene: (None, 0)}
+        self.properties: dict[str, tuple[Any, Any, Any, int]] = {}
+        self.names: set[str] = set()
+        _visitor(mi.variant())(self, scene).visit()
+        self.nodes = list(self.owners)
+
+    def parameters(self) -> mi.SceneParameters:
+        """Return what `mitsuba.traverse` returns. A texture of the scene itself has the name of its first use in a material or light."""
+        return mi.SceneParameters(self.properties, self.hierarchy)
+
+    def notify_other_owners(self, node: Any) -> None:
+        """Have every owner of a shared object that changed update itself. Mitsuba updates those of its first place alone."""
+        told, owner = set(), node
+        while owner is not None:
+            told.add(owner)
+            owner = self.hierarchy[owner][0]
+        for chain in self.chains(node):
+            for owner in chain[1:]:
+                if owner not in told and not isinstance(owner, (mi.Shape, mi.Scene, mi.Sensor)):
+                    owner.parameters_changed([])
+                    told.add(owner)
+
+    def of(self, kind: str) -> list[Any]:
+        """Return the objects of a kind: "bsdf", "emitter", "medium" or "shape"."""
+        return [node for node in self.nodes if isinstance(node, getattr(mi, _KINDS[kind]))]
+
+    def attribute_readers(self, shape: Any, name: str) -> list[Any]:
+        """Return the textures of a shape's BSDF that read its attribute `name`."""
+        return [
+            node
+            for node in self.nodes
+            if node.class_name() == "MeshAttribute"
+            and re.search(r'name = "(.*)"', str(node))[1] == name  # pyright: ignore[reportOptionalSubscript]
+            and any(shape in chain for chain in self.chains(node))
+        ]
+
+    def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
+        """Yield every chain of objects from `node` up to the scene; `above` is what the caller passed on its way to `node`."""
+        owners = [owner for owner in self.owners.get(node, ()) if owner not in above]
+        if not owners:
+            yield [node]
+        for owner in owners:
+            for chain in self.chains(owner, (*above, node)):
+                yield [node, *chain]
+
+    def tables(self, other: ObjectGraph) -> dict[str, mi.UInt32]:
+        """Return tables from the registry ids of this scene's objects to those of another load, by kind.
+
+        Raises:
+            InputError: the two loads differ, or a path can meet an object that the traversal does not show.
+        """
+        if [type(node) for node in self.nodes] != [type(node) for node in other.nodes]:
+            raise InputError(
+                "scene: two loads of the description have different objects; expected equal ones, or use --method plain"
+            )
+        found = {}
+        for kind in _KINDS:
+            source, target = object_ids(kind, self.of(kind)), object_ids(kind, other.of(kind))
+            table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
+            table[source] = target
+            found[kind] = mi.UInt32(table)
+        self._check_complete()
+        return found
+
+    def _check_complete(self) -> None:
+        """Raise `InputError` for an object that a path can meet and that its owner's `traverse` does not show."""
+        shown = {kind: set(self.of(kind)) for kind in _KINDS}
+        shapes = [
+            shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"
+        ]  # its children are hit, not it
+        for owner in (*shapes, *self._scene.emitters(), *self._scene.sensors()):
+            for kind, item in _held(owner):
+                if item is not None and item not in shown[kind]:
+                    name = owner.id() or owner.class_name()
+                    raise InputError(
+                        f"scene: the {kind} of {name} ({item.class_name()}) is hidden from mitsuba.traverse, so its previous state cannot "
+                        "be found; announce it in the plugin's traverse(), or use --method plain"
+                    )
+
+
+def _held(owner: Any) -> list[tuple[str, Any]]:
+    """What a path can reach from a shape, an emitter or a sensor by a pointer."""
+    if isinstance(owner, mi.Shape):
+        media = [("medium", owner.interior_medium()), ("medium", owner.exterior_medium())]
+        return [("shape", owner), ("bsdf", owner.bsdf()), ("emitter", owner.emitter()), *media]
+    found = [("medium", owner.get_medium())]
+    return [*found, ("emitter", owner)] if isinstance(owner, mi.Emitter) else found
+
+
+def all_shapes(scene: Any) -> list[Any]:
+    """Return all shapes that have surfaces or media of their own: those of the scene, and the children of its shape groups behind them."""
+    shapes = scene.shapes()
+    if not has_instances(scene):
+        return shapes
+    known = {*shapes}
+    others = [shape for shape in ObjectGraph(scene).of("shape") if shape not in known]
+    return shapes + [shape for shape in others if not shape.class_name().startswith("ShapeGroup")]
+
+
+def has_instances(scene: Any) -> bool:
+    """Whether the scene has instances of shape groups."""
+    return any(shape.class_name() == "Instance" for shape in scene.shapes())
+
+
+def object_ids(kind: str, items: Iterable[Any]) -> np.ndarray:
+    """Return the registry ids of objects of one kind, (N,)."""
+    items = list(items)
+    if not items:
+        return np.zeros(0, np.uint32)
+    pointers: Any = getattr(mi, f"{_KINDS[kind]}Ptr")(items)
+    numbers: Any = dr.reinterpret_array(mi.UInt32, pointers)
+    return numbers.numpy()
+
+
+@cache
+def _visitor(_variant: str) -> type:
+    """Return the visitor of a variant: its base class exists only under one."""
+
+    class Visitor(mi.TraversalCallback):
+        """Fills a graph with everything below a node, each object once, by the names that `mitsuba.traverse` gives."""
+
+        def __init__(self, graph: ObjectGraph, node: Any, depth: int = 0, name: str | None = None, flags: int = 0):
+            super().__init__()
+            if name is not None:
+                count, plain = 1, name
+                while name in graph.names:
+                    name = f"{plain}_{count}"
+                    count += 1
+                graph.names.add(name)
+            self.graph, self.node, self.depth, self.name = graph, node, depth, name
+            self.flags = flags | +mi.ParamFlags.Differentiable
+            self.deferred: list[tuple[str, Any, int]] = []
+
+        def visit(self) -> None:
+            """Visit what the node holds. Textures of the scene, which keep no id, come last: by then, their users have named them."""
+            self.node.traverse(self)
+            for waiting in self.deferred:
+                self._enter(*waiting)
+
+        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            """Take a value or an object."""
+            if isinstance(value, mi.Object):
+                self.put_object(name, value, flags)
+            else:
+                self.put_value(name, value, flags, cpptype)
+
+        def put_value(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            """Take a value."""
+            flags = self.flags | flags
+            if flags & mi.ParamFlags.NonDifferentiable:
+                flags &= ~mi.ParamFlags.Discontinuous
+            self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
+
+        def put_object(self, name: str, value: Any, flags: int) -> None:
+            """Take an object, now or at the end."""
+            if value is None:
+                return
+            if self.depth == 0 and isinstance(value, mi.Texture):
+                self.deferred.append((name, value, flags))
+            else:
+                self._enter(name, value, flags)
+
+        def _enter(self, name: str, value: Any, flags: int) -> None:
+            owners = self.graph.owners
+            if value not in owners:
+                owners[value] = [self.node]
+                self.graph.hierarchy[value] = self.node, self.depth + 1
+                type(self)(self.graph, value, self.depth + 1, self._full(name), self.flags | flags).visit()
+            elif self.node not in owners[value]:
+                owners[value].append(self.node)
+
+        def _full(self, name: str) -> str:
+            return name if self.name is None else f"{self.name}.{name}"
+
+    return Visitor
