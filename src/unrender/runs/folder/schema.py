@@ -9,6 +9,7 @@ A run writes what these models say, and `reader` checks what it reads against th
 | `problem.toml`, `problem/` | see `problem.serialization` |
 | `history.jsonl` | one JSON object per step, see `HISTORY_COLUMNS` |
 | `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the first, the true values where they are known |
+| `last.npz` | {key: array} after the last step, where `parameters.npz` holds better ones of an earlier step |
 | `pictures.npz` | {"view0/reference": (H, W, 3), ...}, see `PICTURE_NAME` |
 | `sensitivity.npz` | {key: array}: see `Result.sensitivity` |
 | `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the meshes that were recovered |
@@ -31,8 +32,10 @@ from unrender.core.text import printable
 
 __all__ = [
     "COMMANDS",
+    "ENDED",
     "HISTORY_AXES",
     "HISTORY_COLUMNS",
+    "NOT_VERIFIED",
     "PICTURE_NAME",
     "REPORT",
     "LiveStatus",
@@ -48,7 +51,7 @@ __all__ = [
 
 RECORD, METHOD, HISTORY, LOCK, CONTROL = "run.json", "method.toml", "history.jsonl", "lock", "control.json"
 PARAMETERS, INITIAL, TRUTH, PICTURES = "parameters.npz", "initial.npz", "truth.npz", "pictures.npz"
-SENSITIVITY, MESHES = "sensitivity.npz", "meshes.npz"
+SENSITIVITY, MESHES, LAST = "sensitivity.npz", "meshes.npz", "last.npz"
 REPORT = "report.html"
 CHECKPOINTS, STATE, MANIFEST = "checkpoints", "state.safetensors", "manifest.json"
 LIVE, LIVE_STATUS, LIVE_START, LIVE_VIEWS = "live", "status.json", "start.npz", "views.npz"
@@ -67,7 +70,12 @@ and may have "parameter_error", {key: root mean square error}, and "resolution",
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-_Status = Literal["running", "finished", "interrupted", "failed"]
+_Status = Literal["running", "finished", "interrupted", "failed", "worse than start", "memory disagrees"]
+
+ENDED = ("finished", "worse than start", "memory disagrees")
+"""What run.json says of runs that used up their budget."""
+NOT_VERIFIED = "not verified"
+"""What is said of runs without `RunRecord.verification`."""
 
 
 # ---------------------------------------------------------------------- run.json
@@ -108,6 +116,7 @@ class RunRecord(BaseModel):
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
         image_errors, phases: see `Result`.
+        verification: see `Result`; empty for runs that were not verified.
         error: the exception by which the run failed; "" for none.
     """
 
@@ -133,8 +142,15 @@ class RunRecord(BaseModel):
     problem: ProblemRecord = ProblemRecord()
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
+    verification: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
+
+    @property
+    def verified(self) -> str:
+        """The status that fresh pictures give the run; "not verified" where none were rendered, as in folders of earlier versions."""
+        found = self.verification.get("status")
+        return found if found in ENDED else NOT_VERIFIED
 
 
 # ---------------------------------------------------------------------- live/status.json
