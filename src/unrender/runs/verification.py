@@ -20,19 +20,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.render import view_request
 from unrender.rendering.renderer import SampleRequest
 
-__all__ = [
-    "FINISHED",
-    "MEMORY_DISAGREES",
-    "WORSE",
-    "FreshPictures",
-    "Picture",
-    "Remembering",
-    "is_finite",
-    "remembered",
-]
-
-FINISHED, WORSE, MEMORY_DISAGREES = "finished", "worse than start", "memory disagrees"
-"""What `Result.status` says of a run that used up its budget."""
+__all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
 
 _GROUPS = 4
 """Independent images of each fresh picture."""
@@ -195,9 +183,9 @@ def is_finite(first: Picture, other: Picture) -> bool:
     """Return whether `other` is finite wherever `first` is, but for very few pixels."""
     broken, known = 0, 0
     for a, b in zip(first.images, other.images, strict=True):
-        at_first = np.isfinite(a).all(axis=(0, 2))
-        broken += int((at_first & ~np.isfinite(b).all(axis=(0, 2))).sum())
-        known += len(at_first)
+        at_first, here = (np.isfinite(images.sum(axis=(0, 2))) for images in (a, b))
+        broken += int((at_first & ~here).sum())
+        known += at_first.size
     return broken <= _MOST_NON_FINITE * known
 
 

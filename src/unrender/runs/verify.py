@@ -15,13 +15,11 @@ from unrender.display import formatting
 from unrender.evaluation import paired_losses
 from unrender.problem.problem import Problem
 from unrender.runs import phase_times
+from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.hooks import Hook
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.verification import (
-    FINISHED,
-    MEMORY_DISAGREES,
-    WORSE,
     FreshPictures,
     Picture,
     is_finite,
@@ -41,6 +39,8 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _SCORE, _OF_RESIDUAL, _OF_PICTURE = math.sqrt(-2 * math.log(_LEVEL)), 0.1, 0.02
 """Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
+_WORTH_A_LINE = 1.25
+"""Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
 _FIRST_CANDIDATE = 64
 """The step after which the first candidate is taken; the next ones after twice as many steps each."""
 _CANDIDATES, _END = 1, 2
@@ -123,13 +123,14 @@ class Verify(Hook):
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
-        lines = _lines(first, last, best, memory if disagrees else None, worse)
+        kept = places[best][0] if places else last
+        lines = _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
         told: dict[str, Any] = {
-            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else FINISHED,
+            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
             "start": _numbers(*first.loss),
             "end": _numbers(*last.loss),
             "best": best,
-            "best_loss": _numbers(*(places[best][0] if places else last).loss),
+            "best_loss": _numbers(*kept.loss),
             "paths": pictures.paths,
         }
         if memory is not None:
@@ -172,9 +173,15 @@ def compare_memory(
 
 
 def _memory(descent: Descent, pictures: FreshPictures, last: Picture) -> Memory | None:
-    """What a fresh picture says about the images that the estimator's state remembers; the worst of several, None for none."""
+    """What a fresh picture says about the images that the estimator's state remembers; the worst of several, None for none.
+
+    Images that workers remember are judged in runs with a run folder only, whose last checkpoint collects them anyway.
+    """
     problem, state = descent.run.problem, descent.state.estimator
-    state = state if problem.gatherer is None else problem.gatherer.collected(state)
+    if problem.gatherer is not None:
+        if descent.run.folder is None:
+            return None
+        state = problem.gatherer.collected(state)
     found = [
         compare_memory(pictures, pictures.memory(images), pictures.images(parameters), last)
         for parameters, images in remembered(state)
@@ -186,8 +193,8 @@ def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
     """Whether the loss of `other` is above that of `first` beyond noise; a picture that is not finite is worse."""
     if not is_finite(first, other):
         return True
-    finite = np.isfinite(first.losses).all(axis=0) & np.isfinite(other.losses).all(axis=0)
-    if not finite.any():
+    finite = np.flatnonzero(np.isfinite(first.losses.sum(axis=0) + other.losses.sum(axis=0)))
+    if not finite.size:
         return False
     a, b = first.losses[:, finite], other.losses[:, finite]
     change = paired_losses.difference(a, b, pictures.sampled)
@@ -200,7 +207,8 @@ def _other_meshes(problem: Problem) -> bool:
     return bool(problem.remeshings) or problem.remeshed_from is not None
 
 
-def _lines(first: Picture, last: Picture, best: str, memory: Memory | None, worse: bool) -> list[str]:
+def _lines(first: Picture, last: Picture, best: str, kept_loss: float, memory: Memory | None, worse: bool) -> list[str]:
+    """The warnings, one sentence each."""
     found = []
     if worse:
         kept = {"end": "no earlier parameters can be kept", "start": "the result holds the initial parameters"}
@@ -209,7 +217,7 @@ def _lines(first: Picture, last: Picture, best: str, memory: Memory | None, wors
             f"the final picture is worse than the initial one: loss {_loss(last)}, {_loss(first)} at the start; {words}; "
             "try a lower learning_rate, more samples per pixel, or another method"
         )
-    elif best != "end":
+    elif kept_loss * _WORTH_A_LINE < last.loss[0]:
         found.append(
             f"the final picture is worse than that of {best}: the result holds the parameters of {best}; try a lower learning_rate"
         )

@@ -32,12 +32,15 @@ from unrender.core.text import printable
 
 __all__ = [
     "COMMANDS",
+    "DOUBTFUL",
     "ENDED",
     "HISTORY_AXES",
     "HISTORY_COLUMNS",
+    "MEMORY_DISAGREES",
     "NOT_VERIFIED",
     "PICTURE_NAME",
     "REPORT",
+    "WORSE",
     "LiveStatus",
     "Manifest",
     "Model",
@@ -72,8 +75,11 @@ _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Status = Literal["running", "finished", "interrupted", "failed", "worse than start", "memory disagrees"]
 
-ENDED = ("finished", "worse than start", "memory disagrees")
-"""What run.json says of runs that used up their budget."""
+WORSE, MEMORY_DISAGREES = "worse than start", "memory disagrees"
+DOUBTFUL = frozenset({WORSE, MEMORY_DISAGREES})
+"""Statuses of runs that used up their budget, and that fresh pictures contradict."""
+ENDED = DOUBTFUL | {"finished"}
+"""Statuses of runs that used up their budget."""
 NOT_VERIFIED = "not verified"
 """What is said of runs without `RunRecord.verification`."""
 
