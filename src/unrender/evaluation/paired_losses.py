@@ -18,7 +18,7 @@ __all__ = [
     "systematic",
 ]
 
-_FEW_TILES, _MANY_TILES = 40, 96
+_FEW_TILES, _MANY_TILES = 40, 48
 """Number of tiles below which colour channels are tiles of their own, and above which tiles grow."""
 
 
@@ -122,11 +122,11 @@ def systematic(values: np.ndarray, weights: np.ndarray | None = None) -> Systema
     pairs = (np.asarray(values, np.float64) * weight[:, None])[:count].reshape(-1, 2, values.shape[1])[kept]
     if len(pairs) == 0:
         return SystematicDifference(0.0, 0.0)
-    tiles = np.array_split(pairs, min(len(pairs), _MANY_TILES))
-    halves = np.stack([tile.mean(axis=0) for tile in tiles])
-    sizes = np.array([len(tile) for tile in tiles])[:, None]
+    starts = np.linspace(0, len(pairs), min(len(pairs), _MANY_TILES), endpoint=False).astype(np.int64)
+    sizes = np.diff([*starts, len(pairs)])[:, None]
+    halves = np.add.reduceat(pairs, starts, axis=0) / sizes[..., None]
     products = halves[:, 0] * halves[:, 1] * sizes
     square = float(products.sum() / (sizes.sum() * products.shape[1]))
-    parts = products.ravel() if len(tiles) < _FEW_TILES else products.sum(axis=1)
+    parts = products.ravel() if len(starts) < _FEW_TILES else products.sum(axis=1)
     norm = float(np.sqrt((parts**2).sum()))
     return SystematicDifference(square, float(parts.sum()) / norm if norm > 0 else 0.0)

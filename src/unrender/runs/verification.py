@@ -24,8 +24,10 @@ __all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
 
 _GROUPS = 4
 """Independent images of each fresh picture."""
-_LEAST_PATHS, _MOST_PATHS = 1 << 14, 1 << 22
+_LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22
 """Paths of a fresh picture."""
+_FEW_PIXELS = 1 << 12
+"""Number of pixels of all views up to which all are rendered, whatever the number of paths."""
 _STREAM = 2
 """Stream of the run's key that fresh pictures draw from; a run's steps use 0, its warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -192,7 +194,7 @@ def is_finite(first: Picture, other: Picture) -> bool:
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
     """The pixels that are looked at, at most about `allowed` of them, and whether they are a sample."""
     count, total = len(problem.views), problem.pixels
-    if total <= allowed:
+    if total <= max(allowed, _FEW_PIXELS):
         return [_whole(problem, view) for view in range(count)], False
     generator = np.random.default_rng(key.uint32())
     known = problem.renderer.parameters()
