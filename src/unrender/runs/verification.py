@@ -141,6 +141,17 @@ class FreshPictures:
             found.append(images.reshape(_GROUPS, -1, 3))
         return found
 
+    @property
+    def weights(self) -> np.ndarray:
+        """How much each pixel counts, (N,), of all frames one after the other; at most 1."""
+        factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
+        return factors / max(float(factors.max(initial=0.0)), 1e-300)
+
+    @property
+    def references(self) -> np.ndarray:
+        """The reference of each pixel, (N, 3)."""
+        return np.concatenate([frame.reference for frame in self.frames]).astype(np.float64)
+
     def memory(self, images: Sequence[Array]) -> list[np.ndarray]:
         """Return the pixels (N, 3) of each frame from one image (H, W, 3) of each view."""
         flat: dict[int, np.ndarray] = {}

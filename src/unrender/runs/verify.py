@@ -37,12 +37,14 @@ _LEVEL = 1e-4
 """False positive rate of each test."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
-_SCORE, _OF_RESIDUAL, _OF_PICTURE = math.sqrt(-2 * math.log(_LEVEL)), 0.1, 0.02
+_SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
 """Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
 _FIRST_CANDIDATE = 64
 """The step after which the first candidate is taken; the next ones after twice as many steps each."""
+_EARLIER, _STILL = 0.75, 0.85
+"""Share of the steps up to which an earlier picture counts as such; ratio of the last loss to its, above which a run no longer improves."""
 _CANDIDATES, _END = 1, 2
 """Numbers of the sets of random numbers."""
 
@@ -82,6 +84,7 @@ class Verify(Hook):
     """
 
     _pictures: FreshPictures | None = field(default=None, init=False)
+    _earlier: list[_Earlier] = field(default_factory=list, init=False)
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """See `Hook.on_step`."""
@@ -92,7 +95,9 @@ class Verify(Hook):
         if self._pictures is None:
             self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
         values = run.full()
-        loss = self._pictures.picture(values).loss[0]
+        found = _Earlier.of(run.step, self._pictures, values)
+        self._earlier = [*self._earlier[-1:], found]
+        loss = found.loss
         known = descent.state.candidate
         if known is None or loss < known.loss:
             descent.state.candidate = Candidate(run.step, loss, values)
@@ -124,7 +129,8 @@ class Verify(Hook):
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
         kept = places[best][0] if places else last
-        lines = _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
+        lines = self._residual(result)
+        lines += _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
         told: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
             "start": _numbers(*first.loss),
@@ -143,6 +149,53 @@ class Verify(Hook):
             warnings=[*result.warnings, *lines],
         )
 
+    def _residual(self, result: Result) -> list[str]:
+        """The warning that the pictures have stopped to improve, and still differ from the references by more than noise."""
+        earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
+        if self._pictures is None or earlier is None:
+            return []
+        last = _Earlier.of(result.steps, self._pictures, result.parameters)
+        if not _STILL * earlier.loss < last.loss < math.inf:
+            return []
+        weights, references = self._pictures.weights, self._pictures.references
+        residual = last.residual
+        if not (np.isfinite(residual).all() and np.isfinite(earlier.residual).all()):
+            return []
+        found = paired_losses.systematic(residual, weights, earlier.residual)
+        total = max(float(weights.sum()) * 3, 1e-300)
+        size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
+        error = math.sqrt(max(found.mean_square, 0.0))
+        if found.score <= _SCORE or error <= _OF_PICTURE * size:
+            return []
+        noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - found.mean_square, 0.0))
+        times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
+        return [
+            f"the final picture differs from the references by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and "
+            "no longer improves: light, depth or something else that is not among the unknowns may be wrong"
+        ]
+
+
+@dataclass(frozen=True)
+class _Earlier:
+    """A fresh picture of an earlier step.
+
+    Attributes:
+        step: how many steps were done.
+        loss: without noise.
+        residual: (N, 3), the picture minus the references.
+    """
+
+    step: int
+    loss: float
+    residual: np.ndarray
+
+    @classmethod
+    def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
+        """Render the parameters of a step."""
+        found = pictures.picture(values)
+        mean = np.concatenate([images.mean(axis=0) for images in found.images])
+        return cls(step, found.loss[0], mean - pictures.references)
+
 
 def compare_memory(
     pictures: FreshPictures, memory: list[np.ndarray], fresh: list[np.ndarray], residual: Picture
@@ -151,8 +204,7 @@ def compare_memory(
 
     `residual`: the picture whose distance from the references the error is compared with.
     """
-    counts = np.concatenate([frame.factors[:, 0] for frame in pictures.frames])
-    weights = counts / max(float(counts.max(initial=0.0)), 1e-300)
+    weights = pictures.weights
     means = np.concatenate([images.mean(axis=0) for images in fresh])
     differences = np.concatenate(memory) - means
     finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
@@ -167,9 +219,8 @@ def compare_memory(
         products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
         return math.sqrt(max(float(products.sum()) / total, 0.0))
 
-    references = np.concatenate([frame.reference for frame in pictures.frames]).astype(np.float64)
     error = math.sqrt(max(found.mean_square, 0.0))
-    return Memory(error, product(fresh, 0.0), product(list(residual.images), references), found.score)
+    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), found.score)
 
 
 def _memory(descent: Descent, pictures: FreshPictures, last: Picture) -> Memory | None:
