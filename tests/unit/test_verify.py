@@ -39,6 +39,15 @@ def made(
     return ur.Problem(renderer, [ur.Parameter("x", initial=begin)], seen, loss, truth={"x": truth})
 
 
+@ur.register
+@dataclass(frozen=True)
+class Rising(ur.schedules.Schedule):
+    """A rate that rises after 70 steps and spoils what was reached."""
+
+    def __call__(self, step: int) -> float:
+        return 1.0 if step < 70 else 40.0
+
+
 # ---------------------------------------------------------------------- the statistics
 
 
@@ -195,11 +204,6 @@ def test_a_memory_with_a_wrong_weight_disagrees(factor: float) -> None:
 def test_earlier_parameters_are_kept_where_they_are_better(tmp_path: Path) -> None:
     """A rate that rises after 64 steps spoils what was reached."""
 
-    @dataclass(frozen=True)
-    class Rising(ur.schedules.Schedule):
-        def __call__(self, step: int) -> float:
-            return 1.0 if step < 70 else 40.0
-
     problem = made()
     adam = ur.optimizers.Adam(0.05, schedule=Rising())
     result = ur.optimize(problem, ur.PathGradient(spp=4), adam, steps=90)
@@ -334,3 +338,34 @@ def test_runs_that_cannot_succeed_tell_so(
 ) -> None:
     result = ur.optimize(problem, estimator, optimizer, steps=steps)
     assert told == result.status or any(told in line for line in result.warnings), (result.status, result.verification)
+
+
+# ---------------------------------------------------------------------- resuming
+
+
+class Kill(ur.Callback):
+    """Ends the run by an exception, as a second Ctrl-C does."""
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        if run.step == 85:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.mitsuba
+def test_a_resumed_run_keeps_the_same_parameters(tmp_path: Path) -> None:
+    """Earlier parameters come back with the checkpoint, and the descent goes on from the last ones."""
+    parts = ur.PathGradient(spp=4), ur.optimizers.Adam(0.05, schedule=Rising())
+    whole = ur.optimize(made(), *parts, steps=90, run_directory=tmp_path / "whole", checkpoint_every=10)
+    assert whole.verification["best"] == "step 64"
+    options: Any = {"run_directory": tmp_path / "part", "checkpoint_every": 10, "callbacks": [Kill()]}
+    with pytest.raises(KeyboardInterrupt):
+        ur.optimize(made(), *parts, steps=90, **options)
+    resumed = ur.resume(tmp_path / "part", made())
+    assert resumed.resumed == [80]
+    assert resumed.verification == whole.verification
+    np.testing.assert_array_equal(resumed.parameters["x"], whole.parameters["x"])
+    np.testing.assert_array_equal(resumed.last["x"], whole.last["x"])
+    further = ur.resume(tmp_path / "whole", made(), steps=91)
+    assert np.abs(further.last["x"] - whole.last["x"]).max() < 5 * 40 * 0.05
+    assert np.abs(further.last["x"] - whole.parameters["x"]).max() > 0
+    assert "last.npz" in {path.name for path in (tmp_path / "whole").iterdir()}

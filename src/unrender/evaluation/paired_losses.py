@@ -104,8 +104,11 @@ def difference(first: np.ndarray, second: np.ndarray, sampled: bool = False) -> 
                 return Difference(value, math.inf, 1.0)
             return Difference(value, math.sqrt(parts * float(mean.var(ddof=1))), parts - 1.0)
         variances = changes.var(axis=0, ddof=1) / groups
-        total, squares = float(variances.sum()), float((variances**2).sum())
-    degrees = total**2 / squares * (groups - 1) if squares > 0 else math.inf
+        total, largest = float(variances.sum()), float(variances.max(initial=0.0))
+    if not math.isfinite(total):
+        return Difference(value, math.inf, 1.0)
+    shares = variances / largest if largest > 0 else variances
+    degrees = float(shares.sum() ** 2 / (shares**2).sum()) * (groups - 1) if largest > 0 else math.inf
     return Difference(value, math.sqrt(total), degrees)
 
 

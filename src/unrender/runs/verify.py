@@ -249,6 +249,8 @@ def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
         return False
     a, b = first.losses[:, finite], other.losses[:, finite]
     change = paired_losses.difference(a, b, pictures.sampled)
+    if not pictures.sampled and not math.isfinite(change.standard_error):
+        return not change.value <= 0  # numbers that overflow
     least = _LEAST_CHANGE * abs(float(a.mean(axis=0).sum()))
     return change.value > least and change.exceeds_noise(_LEVEL)
 
