@@ -17,7 +17,7 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
 
-SIDE, SIZE = 12, 6
+SIDE, WIDE, SIZE = 12, 20, 6
 RCV = ur.PathGradient(image=RecursiveControlVariate(), spp=4)
 
 
@@ -253,12 +253,12 @@ def test_pixels_are_drawn_where_there_are_many() -> None:
 
 def smooth(offset: float, seed: int) -> ur.Problem:
     """Colours of broad blobs; `offset` is a gradient of light that the references have and the renderer has not."""
-    x, y = np.meshgrid(*[np.linspace(0, 1, SIDE)] * 2)
+    x, y = np.meshgrid(*[np.linspace(0, 1, WIDE)] * 2)
     blobs = [np.exp(-8 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in ((0.2, 0.2), (0.8, 0.3), (0.4, 0.8))]
     matrix = np.kron(np.stack([blob.ravel() for blob in blobs], axis=1), np.eye(3)) + 0.02
     truth = np.random.default_rng(seed).uniform(0.3, 0.9, 9)
-    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, matrix, noise=0.3, shape=(SIDE, SIDE))
-    reference = (matrix @ truth).reshape(SIDE, SIDE, 3) + offset * x[..., None] ** 4
+    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, matrix, noise=0.3, shape=(WIDE, WIDE))
+    reference = (matrix @ truth).reshape(WIDE, WIDE, 3) + offset * x[..., None] ** 4
     return ur.Problem(renderer, [ur.Parameter("x", initial=np.full(9, 0.5))], [ur.View(reference)])
 
 
@@ -289,7 +289,7 @@ def contradicting(seed: int) -> ur.Problem:
     """Two views of one scene whose references are of different scenes, as of swapped files."""
     one, other = smooth(0.0, seed), smooth(0.0, seed + 50)
     assert isinstance(one.renderer, AnalyticRenderer)
-    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, one.renderer.matrix, noise=0.3, shape=(SIDE, SIDE), sensors=2)
+    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, one.renderer.matrix, noise=0.3, shape=(WIDE, WIDE), sensors=2)
     views = [ur.View(np.asarray(problem.views[0].reference), sensor) for sensor, problem in enumerate((one, other))]
     return ur.Problem(renderer, [ur.Parameter("x", initial=np.full(9, 0.5))], views)
 
@@ -301,7 +301,7 @@ def hopeless() -> list[Any]:
     found: list[Any] = []
     found += [
         pytest.param(made(s, 0.45), plain, ur.optimizers.SGD(r), 12, told, id=f"rate {r}")
-        for s, r in enumerate((2.0, 5.0, 20.0, 1e3, 1e30))
+        for s, r in enumerate((2.0, 5.0, 20.0, 1e3, 1e6))
     ]
     found += [
         pytest.param(made(s, None), plain, adam(r), 30, told, id=f"from the truth, rate {r}")
