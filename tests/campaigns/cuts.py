@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns.machine import KILLED, Disk, Victims
+from unrender.runs.folder.schema import ENDED
 
 __all__ = ["METHODS", "campaign", "final_state", "leftovers"]
 
@@ -117,7 +118,7 @@ def _cut_after_the_end(victims: Victims, disk: Disk, runs: _Runs, expected: Any)
     with disk.mounted() as place:
         run = place / "run"
         record = json.loads((run / "run.json").read_text())
-        same = record["status"] == "finished" and final_state(run) == expected
+        same = record["status"] in ENDED and final_state(run) == expected
         empty = [path.name for path in run.rglob("*") if path.is_file() and path.stat().st_size == 0]
         status = victims.carry_out("resume", run, "--steps", runs.steps + 1)
         resumed = json.loads((run / "run.json").read_text())["resumed"]
@@ -133,7 +134,7 @@ def _cut_after_the_end(victims: Victims, disk: Disk, runs: _Runs, expected: Any)
 
 def _go_on(victims: Victims, run: Path, runs: _Runs, expected: Any, promised: int) -> dict[str, Any]:
     if (run / "run.json").exists():
-        finished = json.loads((run / "run.json").read_text())["status"] == "finished"
+        finished = json.loads((run / "run.json").read_text())["status"] in ENDED
         status = 0 if finished else victims.carry_out("resume", run)
         since = ([runs.steps] if finished else json.loads((run / "run.json").read_text())["resumed"])[-1]
     else:  # it had not begun

@@ -12,6 +12,7 @@ from typing import Any
 
 from tests.campaigns.cuts import final_state, leftovers
 from tests.campaigns.machine import KILLED, Victims
+from unrender.runs.folder.schema import ENDED
 
 __all__ = ["COMMANDS", "campaign"]
 
@@ -57,7 +58,7 @@ class _Case:
     def go_on(self, run: Path, whole: dict[str, bytes], anew: Sequence[object]) -> str:
         """Resume a run, or begin it anew where it had not begun."""
         if (run / "run.json").exists():
-            finished = json.loads((run / "run.json").read_text())["status"] == "finished"
+            finished = json.loads((run / "run.json").read_text())["status"] in ENDED
             self.must("report" if finished else "resume", run)
         else:
             self.must(*anew)

@@ -29,7 +29,7 @@ from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import seen_cells
 
-__all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise"]
+__all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise", "verified"]
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,16 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
     return line if seen is None else f"{line}, {measure.text(seen)} where seen ({where.mean():.0%} of it)"
 
 
+def verified(result: Result) -> str:
+    """Return what fresh pictures say about the run, in words: status, losses, and which parameters are kept."""
+    found = result.verification
+    first, last = (
+        formatting.with_error(*found[name]) if None not in found[name] else "not finite" for name in ("start", "end")
+    )
+    kept = "" if found["best"] == "end" else f"; kept: the parameters of {found['best']}"
+    return f"{found['status']}: loss {first} before, {last} after (fresh pictures, noise removed){kept}"
+
+
 def introduce(console: Console, problem: Problem, variant: str) -> None:
     """What is about to be recovered, and what was done to the input."""
     views = describe_views(problem)
@@ -145,6 +155,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         where = " where masks count" if any(mask is not None for mask in masks) else ""
         removed = "" if last.endswith("noise") else ", noise removed"
         table.add_row("image error", f"{first} before, {last} after (root mean square{where}{removed})")
+    if result.verification:
+        table.add_row("verified", verified(result))
     start = problem.parameter_error(result.initial)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():

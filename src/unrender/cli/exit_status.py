@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-__all__ = ["ENVIRONMENT", "FAILED", "INPUT", "INTERRUPTED", "TERMINATED", "WORDS"]
+__all__ = ["DOUBTFUL", "ENVIRONMENT", "FAILED", "INPUT", "INTERRUPTED", "TERMINATED", "WORDS"]
 
-INPUT, ENVIRONMENT, FAILED = 2, 3, 4
-"""What the user gave is wrong; this machine cannot; a run was given up."""
+INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
+"""What the user gave is wrong; this machine cannot; a run was given up; fresh pictures contradict a run."""
 INTERRUPTED, TERMINATED = 130, 143
 """Ctrl-C, and SIGTERM: 128 and the number of the signal, as shells and schedulers expect."""
 WORDS = {
     FAILED: "the run failed: it was given up, and what was finite is kept",
+    DOUBTFUL: "the result is doubtful: see the warnings",
     INTERRUPTED: "interrupted",
     TERMINATED: "terminated",
 }

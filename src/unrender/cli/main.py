@@ -1,7 +1,7 @@
 """The `unrender` command: how it starts and how it ends.
 
-Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 4 where a run failed; 130 where it was interrupted, 143
-where it was told to terminate, and what a run had reached is saved.
+Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 4 where a run failed; 5 where fresh pictures contradict
+it; 130 where it was interrupted, 143 where it was told to terminate, and what a run had reached is saved.
 Whatever is wrong is one line on standard error.
 """
 

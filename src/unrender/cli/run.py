@@ -23,7 +23,7 @@ from unrender.cli.arguments import (
     WorkersOption,
 )
 from unrender.cli.dealing import Compress
-from unrender.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
+from unrender.cli.exit_status import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
 
@@ -114,7 +114,7 @@ def conclude(
     again: Path | None = None,
     page: bool = True,
 ) -> None:
-    """Write the page, say what came out, and leave with the status of an interrupted or failed run where it is one.
+    """Write the page, say what came out, and leave with the status of an interrupted, failed or doubtful run where it is one.
 
     Args:
         console, problem, result, folder, progress: of the run.
@@ -138,6 +138,8 @@ def conclude(
         why = "to go on" if result.status == "interrupted" else "to try once more from its last step"
         console.print(f"{why}: unrender resume {escape(shlex.quote(str(again or folder)))}", soft_wrap=True)
         raise typer.Exit(status)
+    if result.status != "finished":
+        raise typer.Exit(DOUBTFUL)
 
 
 def exit_status(stopped: str) -> int:

@@ -9,7 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from unrender.cli import arguments
+from unrender.cli.exit_status import DOUBTFUL
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
@@ -160,7 +163,10 @@ def reopen(
 
 
 def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
-    """Run the stages that are left, each to its end, or until one is interrupted or fails: leave with its status then."""
+    """Run the stages that are left, each to its end, or until one is interrupted or fails: leave with its status then.
+
+    A doubtful stage does not end the others: the next one begins with the parameters that it verified.
+    """
     try:
         _run_stages(run, console, progress)
     finally:
@@ -189,6 +195,7 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
     from unrender.stages import stages_file
 
     values: dict[str, np.ndarray] = {}
+    doubtful = False
     for index, stage in enumerate(run.stages.stages):
         folder = stages_file.folder_of(run.stages, index, run.out)
         console.print(f"[bold]stage {index + 1} of {len(run.stages.stages)}[/]: {escape(stage.name)}", soft_wrap=True)
@@ -198,9 +205,16 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
             problem, result = _run_stage(run, index, values, console, progress)
             last = index == len(run.stages.stages) - 1
             page = last or run.options.final_spp is not None
-            conclude(console, problem, result, folder, progress, again=run.out, page=page)
+            try:
+                conclude(console, problem, result, folder, progress, again=run.out, page=page)
+            except typer.Exit as left:
+                if left.exit_code != DOUBTFUL:
+                    raise
+                doubtful = True
         # Of the file, so that a stage begins with the same whether the one before it was run just now or earlier.
         values |= reader.read(folder).parameters
+    if doubtful:
+        raise typer.Exit(DOUBTFUL)
 
 
 def _run_stage(
@@ -248,7 +262,7 @@ def _read(stages: Stages) -> Whole:
 def _is_finished(folder: Path) -> bool:
     from unrender.runs.folder import reader, schema
 
-    return (folder / schema.RECORD).is_file() and reader.read_run_record(folder).status == "finished"
+    return (folder / schema.RECORD).is_file() and reader.read_run_record(folder).status in schema.ENDED
 
 
 def _clear(out: Path) -> None:

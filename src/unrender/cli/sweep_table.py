@@ -10,6 +10,7 @@ from rich.text import Text
 from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console
+from unrender.runs.folder.schema import DOUBTFUL
 from unrender.sweeps.record import SweepRecord, TrialRecord
 from unrender.sweeps.trials import Trials
 
@@ -25,6 +26,7 @@ def line(trial: TrialRecord) -> str:
         return f"{what}failed: {trial.message}"
     share = max((float(share) for share in trial.runs[0].rungs), default=0.0)
     where = f" (pruned at {share:.0%})" if trial.status == "pruned" else ""
+    where += "".join(f" ({status})" for status in sorted({run.status for run in trial.runs} & DOUBTFUL))
     return f"{what}error {_error(trial)}{where}"
 
 
@@ -77,7 +79,8 @@ def _table(trials: list[TrialRecord], most: int) -> Table:
         steps = "+".join(str(run.steps) for run in trial.runs)
         seconds = f"{sum(run.seconds for run in trial.runs):.1f}"
         values = [Text(visible(trial.settings.get(name, ""))) for name in names]
-        note = "" if trial.status == "finished" else trial.status
+        doubts = sorted({run.status for run in trial.runs} & DOUBTFUL)
+        note = "; ".join(doubts) if trial.status == "finished" else trial.status
         table.add_row(str(trial.number), *values, _error(trial), steps, seconds, note)
     return table
 

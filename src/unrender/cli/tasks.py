@@ -24,7 +24,7 @@ from unrender.problem.problem import Problem
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
 from unrender.runs.folder.lock import holder
-from unrender.runs.folder.schema import CHECKPOINTS, RECORD
+from unrender.runs.folder.schema import CHECKPOINTS, ENDED, RECORD
 from unrender.runs.live import Live
 from unrender.runs.progress import Progress
 from unrender.runs.result import PRUNED
@@ -112,7 +112,7 @@ def carry_out(
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
     started = time.perf_counter()
-    if record is None or record.status != "finished":
+    if record is None or record.status not in ENDED:
         looking = [] if task.limits is None else [Pruning(folder, task.limits)]
         listeners = [progress, *looking, *callbacks]
         if record is None or record.steps == 0 or not _resumed(folder, problem, listeners, record.command):
@@ -198,7 +198,7 @@ def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOut
     with progress:
         for task in tasks:
             found.append(carry_out(job, task, problem, console, progress))
-            if found[-1].status != "finished":
+            if found[-1].status not in ENDED:
                 break
     return found
 

@@ -88,6 +88,10 @@ class RecursiveControlVariateState:
         """See `Upsamplable`: the previous parameters are interpolated, images stay."""
         return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
+    def remembered(self) -> tuple[Tree, tuple[Array, ...]] | None:
+        """Return the parameters of the control variates, and the control variate of each view; None before the first step."""
+        return None if self.parameters is None else (self.parameters, tuple(memory.image for memory in self.views))
+
 
 @register
 @dataclass(frozen=True)

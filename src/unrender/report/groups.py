@@ -13,6 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.report.html import flatten
 from unrender.runs.folder.reader import RunFolder
+from unrender.runs.folder.schema import DOUBTFUL
 
 __all__ = ["Group", "check_comparable", "group"]
 
@@ -100,6 +101,7 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
         who = f"{run.record.method}, seed {run.record.seed}"
         notices += [f"{who}: {line}" for line in run.record.warnings]
         ends = {run.record.status, run.record.stopped} & {"interrupted", "failed"}
+        ends |= {run.record.status} & DOUBTFUL
         notices += [f"{who}: {end} after {run.record.seconds:.3g} s." for end in sorted(ends)]
     return list(dict.fromkeys(notices))
 

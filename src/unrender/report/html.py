@@ -58,6 +58,7 @@ def facts(record: RunRecord) -> dict[str, str]:
             "adapted": "; ".join(record.adapted),
             "settings": record.settings,
             "seed": record.seed,
+            "verified": {"status": record.verified, **record.verification},
             "time": formatting.phases(record.phases),
             "variant": record.variant,
             "hardware": record.hardware,

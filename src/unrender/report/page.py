@@ -37,7 +37,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
     content = html.render(
         "page.html",
         run=run,
-        stopped=tables.STOP_REASONS.get(run.record.stopped, run.record.stopped),
+        stopped=tables.ending(run.record),
         command=run.record.command,
         facts=html.facts(run.record),
         tiles=tables.tiles(run),

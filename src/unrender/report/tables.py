@@ -10,9 +10,10 @@ from unrender.display import formatting
 from unrender.evaluation import debiased
 from unrender.report import curves, image_metrics, tone_mapping
 from unrender.runs.folder.reader import RunFolder, root_mean_square
+from unrender.runs.folder.schema import DOUBTFUL, RunRecord
 from unrender.runs.sensitivity import seen_cells
 
-__all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "parameter_row", "tiles", "view_rows"]
+__all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "ending", "parameter_row", "tiles", "view_rows"]
 
 STOP_REASONS = {
     "steps": "all steps done",
@@ -25,6 +26,12 @@ STOP_REASONS = {
 }
 """How a run may end, in words."""
 _LISTED_VALUES = 4
+
+
+def ending(record: RunRecord) -> str:
+    """Return how a run ended, in words, and what fresh pictures say where they contradict it; "" while it goes on."""
+    reason = STOP_REASONS.get(record.stopped, record.stopped)
+    return "; ".join(part for part in (record.status if record.status in DOUBTFUL else "", reason) if part)
 
 
 @dataclass(frozen=True)

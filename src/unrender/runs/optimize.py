@@ -45,6 +45,7 @@ from unrender.runs.refinement import Refinement
 from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, terminate_if_told
+from unrender.runs.verify import Verify
 
 __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
 
@@ -161,6 +162,7 @@ def assemble_hooks(
         Budget(),
         Refinement(),
         MeshRefinement(),
+        Verify(),
         *folder,
         CallbackHook(callbacks),
     ]

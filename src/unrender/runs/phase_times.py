@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
     from unrender.runs.result import Result
 
-__all__ = ["ASIDE", "COMPILING", "PICTURES", "RUN_PHASES", "STEPS", "PhaseTimes", "with_phase"]
+__all__ = ["ASIDE", "COMPILING", "PICTURES", "RUN_PHASES", "STEPS", "VERIFYING", "PhaseTimes", "with_phase"]
 
-COMPILING, STEPS, ASIDE, PICTURES = "compiling", "steps", "checkpoints and callbacks", "final pictures"
+COMPILING, STEPS, ASIDE = "compiling", "steps", "checkpoints and callbacks"
+VERIFYING, PICTURES = "verification", "final pictures"
 """Phases of a run, in their order: before the first step; the steps themselves; what stands between and after them."""
 
-RUN_PHASES = (COMPILING, STEPS, ASIDE, PICTURES)
+RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
 
 
 class PhaseTimes(Hook):

@@ -37,8 +37,9 @@ class Result:
     """The outcome of `optimize`.
 
     Attributes:
-        parameters: {key: array}, float32, the recovered values.
+        parameters: {key: array}, float32, the recovered values: the best ones that fresh pictures verify, see `verification`.
         initial: {key: array}, where the descent began.
+        last: {key: array}, the values after the last step; the same as `parameters` unless earlier values were better.
         history: one dictionary per step (of a run of millions of steps in a run folder, per second, fourth, ... of the earlier
             ones): "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
             "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
@@ -56,6 +57,9 @@ class Result:
         adapted: what the optimizer has found as it went, such as how far its rates have changed, one line each.
         resumed: the steps at which it was resumed.
         truth: {key: array} where it is known.
+        verification: what fresh pictures say about the run, see `runs.verify`; empty where there were none. "status", "start", "end" and
+            "best_loss" (loss and its standard error), "best" ("start", "step N" or "end"), "paths" (of each picture), and "memory" (the
+            root mean square "error" of remembered images, and of the "picture").
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
             reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
         phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
@@ -95,6 +99,12 @@ class Result:
     phases: Mapping[str, float] = field(default_factory=dict)
     meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
     undetermined: Sequence[str] = ()
+    last: Mapping[str, np.ndarray] = field(default_factory=dict)
+    verification: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.last:
+            object.__setattr__(self, "last", self.parameters)
 
     def __repr__(self) -> str:
         from unrender.runs import notebook
@@ -120,14 +130,23 @@ class Result:
         return steps_in(self.history)
 
     @property
+    def best(self) -> dict[str, np.ndarray]:
+        """The best values that fresh pictures verify: `parameters`."""
+        return self.parameters
+
+    @property
     def status(self) -> str:
-        """ "finished", "interrupted", or "failed": given up, `parameters` those of the last step that was applied."""
+        """How the run ended: "finished", "interrupted", or "failed" (given up).
+
+        A run that used up its budget may also be "worse than start" (the final picture is worse than the initial one) or "memory disagrees"
+        (a control variate differs from a fresh picture).
+        """
         if self.stopped in (INTERRUPTED, TERMINATED):
             return "interrupted"
-        return "failed" if self.stopped == NON_FINITE else "finished"
+        return "failed" if self.stopped == NON_FINITE else str(self.verification.get("status", "finished"))
 
     def save(self, directory: str | Path, status: str | None = None) -> Path:
-        """Write the run folder: run.json, history.jsonl, parameters.npz, initial.npz, truth.npz, pictures.npz, sensitivity.npz.
+        """Write the run folder: run.json, history.jsonl, and the arrays. last.npz is written where `last` differs from `parameters`.
 
         Each file is written beside its place, renamed, and on the disk when this returns; run.json, with `status` (None for the result's
         own), comes last. Raises `InputError` where the folder cannot be written.
@@ -139,10 +158,14 @@ class Result:
         try:
             files.make_folder(folder)
             archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
+            last = {} if self.last is self.parameters else dict(self.last)
             others = {schema.PICTURES: self.pictures, schema.SENSITIVITY: self.sensitivity, schema.MESHES: self.meshes}
+            others[schema.LAST] = last
             for name, values in {**archives, **others}.items():
                 if values or name in (schema.PARAMETERS, schema.INITIAL):
                     files.write_arrays(folder / name, values, name_too=False)
+            if not last:
+                (folder / schema.LAST).unlink(missing_ok=True)
             files.write(folder / schema.HISTORY, lines(self.history), name_too=False)
             files.sync_folder(folder)
             files.write(folder / schema.RECORD, record)
@@ -158,7 +181,7 @@ class Result:
         """run.json, see `schema.RunRecord`.
 
         Args:
-            status: "running", "finished", "interrupted" or "failed".
+            status: "running", or one of `Result.status`.
             error: the exception by which the run failed; "" for none.
         """
         if status == "failed" and not error:
@@ -187,6 +210,7 @@ class Result:
                 name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
             },
             "undetermined": list(self.undetermined),
+            "verification": dict(self.verification),
             "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }
         if error:

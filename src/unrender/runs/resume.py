@@ -25,7 +25,7 @@ from unrender.runs.folder import checkpoint, history, method_file, reader
 from unrender.runs.folder.checkpoint import Checkpoint
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.method_file import Method
-from unrender.runs.folder.schema import HISTORY, METHOD, RunRecord
+from unrender.runs.folder.schema import ENDED, HISTORY, METHOD, RunRecord
 from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import Hook
@@ -39,7 +39,7 @@ __all__ = ["StoredRun", "load_run", "resume_run"]
 
 _MOST_SHOWN = 6
 _WARNINGS = "warnings"
-_SENT = "sent"
+_SENT, _CANDIDATE = "sent", "candidate"
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     budget = (method.steps, method.seconds) if steps is None and seconds is None else (steps, seconds)
     check_budget(*budget)
     done = (steps is None or steps <= record.steps) and (seconds is None or seconds <= record.seconds)
-    if record.status == "finished" and done:
+    if record.status in ENDED and done:
         so_far = f"finished, after {record.steps} steps and {record.seconds:.3g} s"
         raise InputError(
             f"run folder {folder}: {so_far}; to go on, give a larger budget, in steps or seconds from its start"
@@ -225,7 +225,11 @@ class _Restore(Hook):
     def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """See `Hook.on_warm_up`."""
         log, source = descent.log, self.source
-        saved = fresh if source.checkpoint is None else self._unpack(source.checkpoint, fresh, warm)
+        saved = (
+            fresh
+            if source.checkpoint is None
+            else self._unpack(source.checkpoint, fresh, warm, descent.run.problem.shapes())
+        )
         warnings = [f"passed over: {line}" for line in source.passed_over]
         warnings += [f"resumed by force though not as it was: {self.changes}"] if self.changes else []
         saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
@@ -237,16 +241,24 @@ class _Restore(Hook):
             descent.state.skipped_in_a_row = 0
         self.writer.resume(log.history, descent.result())
 
-    def _unpack(self, found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
+    def _unpack(
+        self,
+        found: Checkpoint,
+        fresh: dict[str, Any],
+        warm: dict[str, Any],
+        shapes: Mapping[str, tuple[int, ...]],
+    ) -> dict[str, Any]:
         try:
-            return _unpack(found, fresh, warm)
+            return _unpack(found, fresh, warm, shapes)
         except _SentOtherwise:
             raise
         except InputError as error:
             raise _UnusableCheckpoint(str(error)) from error
 
 
-def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> dict[str, Any]:
+def _unpack(
+    found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], full_shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, Any]:
     """The snapshot in a checkpoint, which must have the types and shapes of one of this run's."""
     saved = unpack(found.packed, [fresh, warm])
     where = f"checkpoint of step {found.manifest.step}"
@@ -256,13 +268,13 @@ def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> d
             "as 16-bit differences: resume it with --workers and --compress",
         )
         raise _SentOtherwise(f"{where}: the run sent its parameters {words[_SENT in saved]}")
-    if not isinstance(saved, dict) or list(saved) != list(fresh):
+    if not isinstance(saved, dict) or [n for n in saved if n != _CANDIDATE] != list(fresh):
         raise InputError(f"{where}: expected the state of a run, got {repr(saved)[:60]}")
     warnings = saved[_WARNINGS]
     if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
         raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
-        if name not in (_WARNINGS, _SENT):
+        if name not in (_WARNINGS, _SENT, _CANDIDATE):
             check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
@@ -277,7 +289,24 @@ def _unpack(found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any]) -> d
             raise InputError(f"{where}: {part}: not finite")
     if _SENT in saved:
         _check_sent(saved[_SENT], expected, f"{where}: {_SENT}")
+    if _CANDIDATE in saved:
+        _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
     return saved
+
+
+def _check_candidate(found: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
+    """Raise `InputError` for what is no `Candidate` of parameters of these shapes."""
+    if not isinstance(found, dict) or found.keys() != {"step", "loss", "parameters"}:
+        raise InputError(f"{where}: expected step, loss and parameters, got {repr(found)[:60]}")
+    if not all(isinstance(found[name], (int, float)) for name in ("step", "loss")):
+        raise InputError(f"{where}: expected numbers, got {found['step']!r:.20} and {found['loss']!r:.20}")
+    values = found["parameters"]
+    if not isinstance(values, dict) or not all(isinstance(x, np.ndarray) for x in values.values()):
+        raise InputError(f"{where}: expected arrays, got {repr(values)[:60]}")
+    if {key: x.shape for key, x in values.items()} != shapes:
+        raise InputError(f"{where}: expected shapes {shapes}, got { {key: x.shape for key, x in values.items()} }")
+    if part := not_finite(values, "parameters"):
+        raise InputError(f"{where}: {part}: not finite")
 
 
 def _check_sent(sent: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:

@@ -22,7 +22,16 @@ from unrender.problem.problem import Problem
 from unrender.runs.noise import GradientNoise
 from unrender.runs.result import INTERRUPTED, TERMINATED
 
-__all__ = ["SNAPSHOT_COUNTS", "Run", "RunState", "interruptible", "restore", "snapshot", "terminate_if_told"]
+__all__ = [
+    "SNAPSHOT_COUNTS",
+    "Candidate",
+    "Run",
+    "RunState",
+    "interruptible",
+    "restore",
+    "snapshot",
+    "terminate_if_told",
+]
 
 
 @dataclass
@@ -91,6 +100,21 @@ class Run:
         return min(max(shares), 1.0)
 
 
+@dataclass(frozen=True)
+class Candidate:
+    """Parameters of an earlier step that may turn out better than the last ones.
+
+    Attributes:
+        step: how many steps were done.
+        loss: of a fresh picture.
+        parameters: {key: array} at the scene's own resolution.
+    """
+
+    step: int
+    loss: float
+    parameters: dict[str, np.ndarray]
+
+
 @dataclass
 class RunState:
     """What a run carries from step to step beside what `Run` shows.
@@ -102,6 +126,7 @@ class RunState:
         samples: paths traced so far.
         skipped_in_a_row: steps that were not applied since the last that was.
         next_error: when the parameters' error is due again, on the run's clock.
+        candidate: the best of the earlier parameters that were looked at; None before there are any.
     """
 
     estimator: Any
@@ -111,6 +136,7 @@ class RunState:
     samples: int = 0
     skipped_in_a_row: int = 0
     next_error: float = 0.0
+    candidate: Candidate | None = None
 
 
 def snapshot(run: Run, state: RunState) -> dict[str, Any]:
@@ -130,7 +156,11 @@ def snapshot(run: Run, state: RunState) -> dict[str, Any]:
         "samples": state.samples,
         "skipped_in_a_row": state.skipped_in_a_row,
         "next_error": state.next_error,
-    } | ({} if sent is None else {"sent": sent})
+    } | {name: part for name, part in (("sent", sent), ("candidate", _packed(state.candidate))) if part is not None}
+
+
+def _packed(candidate: Candidate | None) -> dict[str, Any] | None:
+    return None if candidate is None else vars(candidate)
 
 
 SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")
@@ -145,6 +175,7 @@ def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
     state.noise = GradientNoise(**saved["noise"])
     state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
     state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
+    state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
     run.problem.executor.restore(saved.get("sent"))
 
 

@@ -63,7 +63,7 @@ class RunOutcome(BaseModel):
     Attributes:
         folder: its run folder, within the sweep's.
         seed: of its random numbers.
-        status: "finished", "pruned", "failed" or "interrupted".
+        status: "pruned", or that of the run folder when its run ended.
         stopped: see `Result.stopped`.
         error, standard_error: see `pruning.stated_error`; None where they are not known.
         rungs: {share of the budget: error} on the way.
@@ -76,7 +76,7 @@ class RunOutcome(BaseModel):
 
     folder: _Name
     seed: _Count
-    status: Literal["finished", "pruned", "failed", "interrupted"]
+    status: Literal["finished", "worse than start", "memory disagrees", "pruned", "failed", "interrupted"]
     stopped: StrictStr = ""
     error: FiniteFloat | None = None
     standard_error: FiniteFloat | None = None

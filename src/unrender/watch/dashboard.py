@@ -173,7 +173,7 @@ def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
     paused = snapshot.state == monitor.PAUSED
     state_text = _STATES[snapshot.state]
     if run is not None and snapshot.state in (monitor.FINISHED, monitor.SAVING):
-        reason = tables.STOP_REASONS.get(run.record.stopped, run.record.stopped)
+        reason = tables.ending(run.record)
         if snapshot.state == monitor.FINISHED and run.record.status in ("interrupted", "failed"):
             state_text = reason or run.record.status
         elif reason:

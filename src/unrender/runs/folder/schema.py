@@ -9,6 +9,7 @@ A run writes what these models say, and `reader` checks what it reads against th
 | `problem.toml`, `problem/` | see `problem.serialization` |
 | `history.jsonl` | one JSON object per step, see `HISTORY_COLUMNS` |
 | `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the first, the true values where they are known |
+| `last.npz` | {key: array} after the last step, where `parameters.npz` holds better ones of an earlier step |
 | `pictures.npz` | {"view0/reference": (H, W, 3), ...}, see `PICTURE_NAME` |
 | `sensitivity.npz` | {key: array}: see `Result.sensitivity` |
 | `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the meshes that were recovered |
@@ -36,10 +37,15 @@ from unrender.io import bounded_files
 
 __all__ = [
     "COMMANDS",
+    "DOUBTFUL",
+    "ENDED",
     "HISTORY_AXES",
     "HISTORY_COLUMNS",
+    "MEMORY_DISAGREES",
+    "NOT_VERIFIED",
     "PICTURE_NAME",
     "REPORT",
+    "WORSE",
     "LiveStatus",
     "Manifest",
     "Model",
@@ -54,7 +60,7 @@ __all__ = [
 
 RECORD, METHOD, HISTORY, LOCK, CONTROL = "run.json", "method.toml", "history.jsonl", "lock", "control.json"
 PARAMETERS, INITIAL, TRUTH, PICTURES = "parameters.npz", "initial.npz", "truth.npz", "pictures.npz"
-SENSITIVITY, MESHES = "sensitivity.npz", "meshes.npz"
+SENSITIVITY, MESHES, LAST = "sensitivity.npz", "meshes.npz", "last.npz"
 REPORT = "report.html"
 CHECKPOINTS, STATE, MANIFEST = "checkpoints", "state.safetensors", "manifest.json"
 LIVE, LIVE_STATUS, LIVE_START, LIVE_VIEWS = "live", "status.json", "start.npz", "views.npz"
@@ -73,7 +79,15 @@ and may have "parameter_error", {key: see `Problem.parameter_error`}, and "resol
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-_Status = Literal["running", "finished", "interrupted", "failed"]
+_Status = Literal["running", "finished", "interrupted", "failed", "worse than start", "memory disagrees"]
+
+WORSE, MEMORY_DISAGREES = "worse than start", "memory disagrees"
+DOUBTFUL = frozenset({WORSE, MEMORY_DISAGREES})
+"""Statuses of runs that used up their budget, and that fresh pictures contradict."""
+ENDED = DOUBTFUL | {"finished"}
+"""Statuses of runs that used up their budget."""
+NOT_VERIFIED = "not verified"
+"""What is said of runs without `RunRecord.verification`."""
 
 
 # ---------------------------------------------------------------------- run.json
@@ -120,6 +134,7 @@ class RunRecord(BaseModel):
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
         image_errors, undetermined, phases: see `Result`.
+        verification: see `Result`; empty for runs that were not verified.
         error: the exception by which the run failed; "" for none.
     """
 
@@ -146,8 +161,15 @@ class RunRecord(BaseModel):
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
     undetermined: list[StrictStr] = []
+    verification: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
+
+    @property
+    def verified(self) -> str:
+        """The status that fresh pictures give the run; "not verified" where none were rendered, as in folders of earlier versions."""
+        found = self.verification.get("status")
+        return found if found in ENDED else NOT_VERIFIED
 
 
 # ---------------------------------------------------------------------- live/status.json

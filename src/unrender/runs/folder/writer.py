@@ -30,8 +30,10 @@ from unrender.runs.folder.meshes import FOLDER as MESH_FILES
 from unrender.runs.folder.meshes import write_files
 from unrender.runs.folder.schema import (
     CONTROL,
+    ENDED,
     HISTORY,
     INITIAL,
+    LAST,
     LIVE,
     MESHES,
     METHOD,
@@ -52,7 +54,7 @@ if TYPE_CHECKING:
 __all__ = ["RunWriter"]
 
 _FILES = (
-    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES),
+    *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES, LAST),
     *(REPORT, CONTROL),
 )
 _STEPS, _MOST_SECONDS = 50, 60.0
@@ -158,9 +160,9 @@ class RunWriter(Hook):
         """
         self.write_checkpoint(descent, result)
         if result.stopped not in (TERMINATED, PRUNED):
-            if result.status != "finished" or self._written_step != result.steps:
+            if result.status not in ENDED or self._written_step != result.steps:
                 # What took long is safe, and how it ended is known, before what takes seconds more.
-                self._save(result, "running" if result.status == "finished" else result.status)
+                self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
             images = render_final_images(descent.run.problem, result, self.final_spp)
             result = replace(

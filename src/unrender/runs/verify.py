@@ -1,0 +1,296 @@
+"""Every run checks itself: fresh pictures of its start and its end, and of what its control variates remember."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unrender.core import phases
+from unrender.display import formatting
+from unrender.evaluation import paired_losses
+from unrender.problem.problem import Problem
+from unrender.runs import phase_times
+from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
+from unrender.runs.hooks import Hook
+from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
+from unrender.runs.run import Candidate
+from unrender.runs.verification import (
+    FreshPictures,
+    Picture,
+    is_finite,
+    remembered,
+)
+
+if TYPE_CHECKING:
+    from unrender.runs.loop import Descent
+
+__all__ = ["Memory", "Verify", "compare_memory"]
+
+_SHARE = 0.004
+"""Share of the run's paths that one fresh picture traces; there are at most four."""
+_LEVEL = 1e-4
+"""False positive rate of each test."""
+_LEAST_CHANGE = 1e-3
+"""Relative change of the loss below which two points count as equal."""
+_SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
+"""Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
+_WORTH_A_LINE = 1.25
+"""Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
+_FIRST_CANDIDATE = 64
+"""The step after which the first candidate is taken; the next ones after twice as many steps each."""
+_EARLIER, _STILL = 0.75, 0.85
+"""Share of the steps up to which an earlier picture counts as such; ratio of the last loss to its, above which a run no longer improves."""
+_CANDIDATES, _END = 1, 2
+"""Numbers of the sets of random numbers."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a fresh picture says about remembered images.
+
+    Attributes:
+        error: root mean square of what the difference shares between neighbouring pixels.
+        picture: root mean square of the fresh picture.
+        residual: root mean square difference of the fresh picture from the references, without noise.
+        score: of `error`; see `paired_losses.SystematicDifference`.
+    """
+
+    error: float
+    picture: float
+    residual: float
+    score: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the error is beyond noise, and a share of the residual that misleads a descent."""
+        if not math.isfinite(self.error):
+            return True
+        relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_PICTURE * self.picture
+        return self.score > _SCORE and relevant
+
+
+@dataclass
+class Verify(Hook):
+    """Judges a run at its end by fresh pictures, and keeps the best parameters that they verify.
+
+    Of the start, of parameters after 64, 128, 256, … steps, and of the end, those of the least loss are `Result.parameters`. Another point
+    than the end is taken only where its loss is lower beyond noise. Each picture traces 0.4 % of the run's paths, or 8,000 paths in a
+    short run. Nothing here changes a step.
+    """
+
+    _pictures: FreshPictures | None = field(default=None, init=False)
+    _earlier: list[_Earlier] = field(default_factory=list, init=False)
+
+    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+        """See `Hook.on_step`."""
+        del record
+        run, ratio = descent.run, descent.run.step / _FIRST_CANDIDATE
+        if ratio < 1 or run.step % _FIRST_CANDIDATE or math.log2(ratio) % 1 or _other_meshes(run.problem):
+            return
+        if self._pictures is None:
+            self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
+        values = run.full()
+        found = _Earlier.of(run.step, self._pictures, values)
+        self._earlier = [*self._earlier[-1:], found]
+        loss = found.loss
+        known = descent.state.candidate
+        if known is None or loss < known.loss:
+            descent.state.candidate = Candidate(run.step, loss, values)
+
+    def on_result(self, descent: Descent, result: Result) -> Result:
+        """See `Hook.on_result`."""
+        if result.stopped in (INTERRUPTED, TERMINATED, PRUNED) or not result.steps:
+            return result
+        started = time.perf_counter()
+        with phases.phase(phase_times.VERIFYING):
+            result = self._verified(descent, result)
+        return phase_times.with_phase(result, phase_times.VERIFYING, time.perf_counter() - started)
+
+    def _verified(self, descent: Descent, result: Result) -> Result:
+        run, problem = descent.run, descent.run.problem
+        pictures = FreshPictures(problem, run.seed, _SHARE * descent.state.samples, _END)
+        first = pictures.picture(result.initial, problem.remeshed_from or problem)
+        last = pictures.picture(result.parameters)
+        worse = _is_worse(pictures, first, last)
+        places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
+        if worse and problem.remeshed_from is None:
+            places["start"] = first, result.initial
+        candidate = descent.state.candidate
+        if candidate is not None and not _other_meshes(problem) and not candidate.loss >= last.loss[0]:
+            found = pictures.picture(candidate.parameters)
+            if _is_worse(pictures, found, last):
+                places[f"step {candidate.step}"] = found, candidate.parameters
+        best = min(places, key=lambda name: places[name][0].loss[0], default="end")
+        memory = _memory(descent, pictures, last)
+        disagrees = memory is not None and memory.disagrees
+        kept = places[best][0] if places else last
+        lines = self._residual(result)
+        lines += _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
+        told: dict[str, Any] = {
+            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
+            "start": _numbers(*first.loss),
+            "end": _numbers(*last.loss),
+            "best": best,
+            "best_loss": _numbers(*kept.loss),
+            "paths": pictures.paths,
+        }
+        if memory is not None:
+            told["memory"] = {"error": _number(memory.error), "picture": _number(memory.picture)}
+        return replace(
+            result,
+            parameters=dict(places[best][1]) if places else result.parameters,
+            last=result.parameters,
+            verification=told,
+            warnings=[*result.warnings, *lines],
+        )
+
+    def _residual(self, result: Result) -> list[str]:
+        """The warning that the pictures have stopped to improve, and still differ from the references by more than noise."""
+        earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
+        if self._pictures is None or earlier is None:
+            return []
+        last = _Earlier.of(result.steps, self._pictures, result.parameters)
+        if not _STILL * earlier.loss < last.loss < math.inf:
+            return []
+        weights, references = self._pictures.weights, self._pictures.references
+        residual = last.residual
+        if not (np.isfinite(residual).all() and np.isfinite(earlier.residual).all()):
+            return []
+        found = paired_losses.systematic(residual, weights, earlier.residual)
+        total = max(float(weights.sum()) * 3, 1e-300)
+        size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
+        error = math.sqrt(max(found.mean_square, 0.0))
+        if found.score <= _SCORE or error <= _OF_PICTURE * size:
+            return []
+        noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - found.mean_square, 0.0))
+        times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
+        return [
+            f"the final picture differs from the references by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and "
+            "no longer improves: light, depth or something else that is not among the unknowns may be wrong"
+        ]
+
+
+@dataclass(frozen=True)
+class _Earlier:
+    """A fresh picture of an earlier step.
+
+    Attributes:
+        step: how many steps were done.
+        loss: without noise.
+        residual: (N, 3), the picture minus the references.
+    """
+
+    step: int
+    loss: float
+    residual: np.ndarray
+
+    @classmethod
+    def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
+        """Render the parameters of a step."""
+        found = pictures.picture(values)
+        mean = np.concatenate([images.mean(axis=0) for images in found.images])
+        return cls(step, found.loss[0], mean - pictures.references)
+
+
+def compare_memory(
+    pictures: FreshPictures, memory: list[np.ndarray], fresh: list[np.ndarray], residual: Picture
+) -> Memory:
+    """Return what fresh images (K, N, 3) say about remembered ones (N, 3) of the same parameters, frame by frame.
+
+    `residual`: the picture whose distance from the references the error is compared with.
+    """
+    weights = pictures.weights
+    means = np.concatenate([images.mean(axis=0) for images in fresh])
+    differences = np.concatenate(memory) - means
+    finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
+    if not np.isfinite(differences[finite]).all():
+        return Memory(math.inf, 0.0, 0.0, math.inf)
+    found = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
+    total = max(float((weights * finite).sum()) * 3, 1e-300)
+
+    def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
+        joined = np.concatenate(images, axis=1)
+        one, other = joined[0::2].mean(axis=0) - subtracted, joined[1::2].mean(axis=0) - subtracted
+        products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
+        return math.sqrt(max(float(products.sum()) / total, 0.0))
+
+    error = math.sqrt(max(found.mean_square, 0.0))
+    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), found.score)
+
+
+def _memory(descent: Descent, pictures: FreshPictures, last: Picture) -> Memory | None:
+    """What a fresh picture says about the images that the estimator's state remembers; the worst of several, None for none.
+
+    Images that workers remember are judged in runs with a run folder only, whose last checkpoint collects them anyway.
+    """
+    problem, state = descent.run.problem, descent.state.estimator
+    if problem.executor.variant is not None:
+        if descent.run.folder is None:
+            return None
+        state = problem.executor.collect(state)
+    found = [
+        compare_memory(pictures, pictures.memory(images), pictures.images(parameters), last)
+        for parameters, images in remembered(state)
+    ]
+    return max(found, key=lambda memory: (memory.disagrees, memory.score), default=None)
+
+
+def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
+    """Whether the loss of `other` is above that of `first` beyond noise; a picture that is not finite is worse."""
+    if not is_finite(first, other):
+        return True
+    (finite,) = np.nonzero(np.isfinite(np.sum(first.losses + other.losses, axis=0)))
+    if not finite.size:
+        return False
+    a, b = first.losses[:, finite], other.losses[:, finite]
+    change = paired_losses.difference(a, b, pictures.sampled)
+    if not pictures.sampled and not math.isfinite(change.standard_error):
+        return not change.value <= 0  # numbers that overflow
+    least = _LEAST_CHANGE * abs(float(a.mean(axis=0).sum()))
+    return change.value > least and change.exceeds_noise(_LEVEL)
+
+
+def _other_meshes(problem: Problem) -> bool:
+    """Whether meshes get other triangles on the way, so that parameters of different steps have different shapes."""
+    return bool(problem.remeshings) or problem.remeshed_from is not None
+
+
+def _lines(first: Picture, last: Picture, best: str, kept_loss: float, memory: Memory | None, worse: bool) -> list[str]:
+    """The warnings, one sentence each."""
+    found = []
+    if worse:
+        kept = {"end": "no earlier parameters can be kept", "start": "the result holds the initial parameters"}
+        words = kept.get(best, f"the result holds the parameters of {best}")
+        found.append(
+            f"the final picture is worse than the initial one: loss {_loss(last)}, {_loss(first)} at the start; {words}; "
+            "try a lower learning_rate, more samples per pixel, or another method"
+        )
+    elif best != "end" and kept_loss * _WORTH_A_LINE < last.loss[0]:
+        found.append(
+            f"the final picture is worse than that of {best}: the result holds the parameters of {best}; try a lower learning_rate"
+        )
+    if memory is not None:
+        share = f"{memory.error / memory.picture:.0%} of the picture" if memory.picture > 0 else "not finite"
+        found.append(
+            f"the control variate differs from a fresh picture by {formatting.number(memory.error)} ({share}), so the reported loss "
+            "is wrong; try --method plain, or the control variate's space = primary"
+        )
+    return found
+
+
+def _loss(picture: Picture) -> str:
+    value, error = picture.loss
+    return formatting.with_error(value, error) if math.isfinite(value) else "not finite"
+
+
+def _number(value: float) -> float | None:
+    return float(f"{value:.6g}") if math.isfinite(value) else None
+
+
+def _numbers(*values: float) -> list[float | None]:
+    return [_number(value) for value in values]

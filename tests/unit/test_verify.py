@@ -1,0 +1,371 @@
+"""Fresh pictures judge a run: no false alarms, and planted faults are found. All in NumPy."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.evaluation import paired_losses
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.folder import reader
+from unrender.runs.folder.schema import NOT_VERIFIED
+
+SIDE, WIDE, SIZE = 12, 20, 6
+RCV = ur.PathGradient(image=RecursiveControlVariate(), spp=4)
+
+
+def made(
+    seed: int = 0,
+    start: float | None = 0.1,
+    noise: float = 0.5,
+    offset: float = 0.0,
+    views: int = 1,
+    loss: ur.losses.Loss | None = None,
+) -> ur.Problem:
+    """A linear problem; `start` None begins at the truth, `offset` is light that the references have and the renderer has not."""
+    generator = np.random.default_rng(seed)
+    matrix, truth = generator.random((SIDE * SIDE * 3, SIZE)), generator.random(SIZE)
+    renderer = AnalyticRenderer({"x": np.full(SIZE, 0.5)}, matrix, noise=noise, shape=(SIDE, SIDE), sensors=views)
+    reference = (matrix @ truth + offset).reshape(SIDE, SIDE, 3)
+    begin = truth if start is None else np.full(SIZE, start)
+    seen = [ur.View(reference, sensor) for sensor in range(views)]
+    return ur.Problem(renderer, [ur.Parameter("x", initial=begin)], seen, loss, truth={"x": truth})
+
+
+@ur.register
+@dataclass(frozen=True)
+class Rising(ur.schedules.Schedule):
+    """A rate that rises after 70 steps and spoils what was reached."""
+
+    def __call__(self, step: int) -> float:
+        return 1.0 if step < 70 else 40.0
+
+
+# ---------------------------------------------------------------------- the statistics
+
+
+def skewed(generator: np.random.Generator, *shape: int) -> np.ndarray:
+    """Noise of mean 0 with rare bright values, as of fireflies."""
+    return generator.lognormal(0.0, 1.2, shape) - np.exp(0.72)
+
+
+@pytest.mark.parametrize("name", ["normal", "skewed"])
+def test_a_difference_of_nothing_rarely_exceeds_its_noise(name: str) -> None:
+    """4,000 pairs of equal losses at a level of 1 in 100, so that a rate above the level would show: at most its 5 σ."""
+    generator = np.random.default_rng(1)
+    alarms = 0
+    for _ in range(4000):
+        noise = generator.normal(size=(2, 4, 64)) if name == "normal" else skewed(generator, 2, 4, 64)
+        alarms += paired_losses.difference(noise[0], noise[1]).exceeds_noise(0.01)
+    assert alarms <= 40 + 5 * np.sqrt(40)
+
+
+def test_a_difference_is_estimated_with_its_standard_error() -> None:
+    generator = np.random.default_rng(2)
+    found = [
+        paired_losses.difference(generator.normal(size=(4, 50)), generator.normal(0.3, 1, (4, 50))) for _ in range(500)
+    ]
+    values = np.array([one.value for one in found])
+    errors = np.array([one.standard_error for one in found])
+    assert abs(values.mean() - 15.0) < 4 * values.std() / np.sqrt(500)
+    assert 0.9 < values.std() / np.sqrt((errors**2).mean()) < 1.1
+    assert all(one.exceeds_noise(1e-3) == (one.value > 0) for one in found if abs(one.value) > 8 * one.standard_error)
+
+
+def test_the_jackknife_takes_the_noise_out_of_a_quadratic_loss() -> None:
+    generator = np.random.default_rng(3)
+    losses = []
+    for _ in range(4000):
+        images = 0.2 + generator.normal(size=(4, 10))
+        pseudo = paired_losses.pseudo_values(images.mean(axis=0) ** 2, paired_losses.leave_one_out(images) ** 2)
+        losses.append(pseudo.mean())
+    assert abs(np.mean(losses) - 0.04) < 4 * np.std(losses) / np.sqrt(len(losses))
+
+
+@pytest.mark.parametrize("name", ["normal", "skewed"])
+def test_independent_noise_has_no_systematic_part(name: str) -> None:
+    """Of 2,000 scores none is above the threshold of a run, and few are above 3."""
+    generator = np.random.default_rng(4)
+    scores, squares = [], []
+    for _ in range(2000):
+        noise = [generator.normal(size=(256, 3)) if name == "normal" else skewed(generator, 256, 3) for _ in range(2)]
+        found = paired_losses.systematic(noise[0] - noise[1])
+        scores.append(found.score)
+        squares.append(found.mean_square)
+    assert max(scores) < 4.5
+    assert np.mean(np.array(scores) > 3.0) < 0.01
+    assert abs(np.mean(squares)) < 5 * np.std(squares) / np.sqrt(len(squares))
+
+
+def test_a_shared_part_is_measured() -> None:
+    generator = np.random.default_rng(5)
+    found = [paired_losses.systematic(0.7 + generator.normal(size=(256, 3))) for _ in range(300)]
+    squares = np.array([one.mean_square for one in found])
+    assert abs(squares.mean() - 0.49) < 4 * squares.std() / np.sqrt(300)
+    assert np.mean([one.score > 4.5 for one in found]) > 0.9
+
+
+# ---------------------------------------------------------------------- runs that are right
+
+
+@pytest.mark.parametrize("count", [4, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        pytest.param(ur.PathGradient(spp=4), id="plain"),
+        pytest.param(RCV, id="control variate"),
+        pytest.param(replace(RCV, pixels=ur.pixels.Uniform(32)), id="control variate of mini-batches"),
+        pytest.param(ur.MetaEstimator(), id="meta"),
+    ],
+)
+def test_runs_that_succeed_are_finished(estimator: Any, count: int) -> None:
+    for seed in range(count):
+        result = ur.optimize(made(seed % 7), estimator, ur.optimizers.Adam(0.03), steps=70, seed=seed)
+        assert result.status == "finished", (seed, result.warnings, result.verification)
+        assert result.verification["end"][0] < result.verification["start"][0]
+
+
+@pytest.mark.parametrize(
+    "loss", [ur.losses.L1(), ur.losses.RelativeL2(), ur.losses.Huber(0.1)], ids=lambda loss: type(loss).__name__
+)
+def test_every_loss_is_verified(loss: ur.losses.Loss) -> None:
+    result = ur.optimize(made(loss=loss), RCV, ur.optimizers.Adam(0.03), steps=70)
+    assert result.status == "finished"
+    assert result.verification["end"][0] < 0.5 * result.verification["start"][0]
+
+
+# ---------------------------------------------------------------------- runs that cannot succeed
+
+
+def test_a_rate_that_is_too_high_ends_worse_than_it_began() -> None:
+    problem = made(start=0.45)
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.SGD(5.0), steps=10)
+    assert result.status == "worse than start"
+    np.testing.assert_array_equal(result.parameters["x"], result.initial["x"])
+    assert np.abs(result.last["x"] - result.initial["x"]).max() > 1
+    (line,) = [line for line in result.warnings if "worse than the initial one" in line]
+    assert "lower learning_rate" in line
+
+
+def test_a_descent_from_the_truth_that_leaves_it_is_told() -> None:
+    result = ur.optimize(made(start=None), ur.PathGradient(spp=1), ur.optimizers.Adam(0.5), steps=20)
+    assert result.status == "worse than start"
+    assert result.best is result.parameters
+
+
+def test_values_that_render_no_number_are_worse() -> None:
+    class Broken(AnalyticRenderer):
+        """Renders no number where the parameters are above 0.3, and more than one group is asked for."""
+
+        def image(self, parameters: Any, request: Any) -> Any:
+            found = super().image(parameters, request)
+            bad = request.groups == 4 and float(np.max(parameters["x"])) > 0.3
+            return replace(found, images=found.images * np.nan) if bad else found
+
+    problem = made()
+    assert isinstance(problem.renderer, AnalyticRenderer)
+    broken = Broken({"x": np.full(SIZE, 0.5)}, problem.renderer.matrix, shape=(SIDE, SIDE))
+    result = ur.optimize(problem.rendered_by(broken), ur.PathGradient(spp=2), ur.optimizers.Adam(0.05), steps=30)
+    assert result.status == "worse than start"
+    assert result.verification["end"] == [None, None]
+
+
+@dataclass(frozen=True)
+class WrongWeight(RecursiveControlVariate):
+    """Subtracts the previous image with another weight than it adds the memory with."""
+
+    factor: float = 1.0
+
+    def _combine_view(self, memory: Any, rendering: Any, asked: Any, frame: Any) -> Any:
+        wrong = replace(rendering, previous=rendering.previous * self.factor)
+        return super()._combine_view(memory, wrong, asked, frame)
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.97, 1.1])
+def test_a_memory_with_a_wrong_weight_disagrees(factor: float) -> None:
+    for seed in range(3):
+        estimator = ur.PathGradient(image=WrongWeight(factor=factor), spp=4)
+        result = ur.optimize(made(seed), estimator, ur.optimizers.Adam(0.03), steps=120, seed=seed)
+        assert result.status in ("memory disagrees", "worse than start"), result.verification
+        assert any("differs from a fresh picture" in line for line in result.warnings)
+        assert result.verification["memory"]["error"] > 0
+
+
+# ---------------------------------------------------------------------- what is kept
+
+
+def test_earlier_parameters_are_kept_where_they_are_better(tmp_path: Path) -> None:
+    """A rate that rises after 64 steps spoils what was reached."""
+
+    problem = made()
+    adam = ur.optimizers.Adam(0.05, schedule=Rising())
+    result = ur.optimize(problem, ur.PathGradient(spp=4), adam, steps=90)
+    assert result.verification["best"] == "step 64"
+    assert problem.parameter_error(result.parameters)["x"] < 0.5 * problem.parameter_error(dict(result.last))["x"]
+    assert result.verification["best_loss"][0] < result.verification["end"][0]
+    result.save(tmp_path / "run")
+    found = reader.read(tmp_path / "run")
+    np.testing.assert_array_equal(found.parameters["x"], result.parameters["x"].astype(np.float32))
+    np.testing.assert_array_equal(np.load(tmp_path / "run" / "last.npz")["x"], result.last["x"].astype(np.float32))
+    assert found.record.verified == "finished"
+
+
+def test_a_result_says_the_same_as_its_folder_and_old_folders_are_not_verified(tmp_path: Path) -> None:
+    result = ur.optimize(made(), RCV, ur.optimizers.Adam(0.03), steps=70)
+    result.save(tmp_path / "run")
+    path = tmp_path / "run" / "run.json"
+    record = json.loads(path.read_text())
+    assert record["status"] == "finished"
+    assert record["verification"] == dict(result.verification)
+    assert not (tmp_path / "run" / "last.npz").exists()
+    del record["verification"]
+    path.write_text(json.dumps(record))
+    assert reader.read(tmp_path / "run").record.verified == NOT_VERIFIED
+
+
+def test_verification_changes_no_step_and_repeats() -> None:
+    first, second = (ur.optimize(made(), RCV, ur.optimizers.Adam(0.03), steps=70) for _ in range(2))
+    assert first.verification == second.verification
+    np.testing.assert_array_equal(first.parameters["x"], second.parameters["x"])
+
+
+def test_pixels_are_drawn_where_there_are_many() -> None:
+    """30 views of 144 pixels are more than 4,096 pixels: a sample of pixels is verified, its loss that of all."""
+    problem = made(views=30)
+    result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.03), steps=5)
+    assert isinstance(problem.renderer, AnalyticRenderer)
+    exact = problem.renderer.exact(result.parameters)
+    loss = 30 * float(np.mean((exact - np.asarray(problem.views[0].reference)) ** 2))
+    assert result.verification["paths"] == 1 << 13
+    assert result.verification["end"][0] == pytest.approx(loss, rel=0.15)
+    assert result.status == "finished"
+
+
+# ---------------------------------------------------------------------- what no parameters can explain
+
+
+def smooth(offset: float, seed: int) -> ur.Problem:
+    """Colours of broad blobs; `offset` is a gradient of light that the references have and the renderer has not."""
+    x, y = np.meshgrid(*[np.linspace(0, 1, WIDE)] * 2)
+    blobs = [np.exp(-8 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in ((0.2, 0.2), (0.8, 0.3), (0.4, 0.8))]
+    matrix = np.kron(np.stack([blob.ravel() for blob in blobs], axis=1), np.eye(3)) + 0.02
+    truth = np.random.default_rng(seed).uniform(0.3, 0.9, 9)
+    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, matrix, noise=0.3, shape=(WIDE, WIDE))
+    reference = (matrix @ truth).reshape(WIDE, WIDE, 3) + offset * x[..., None] ** 4
+    return ur.Problem(renderer, [ur.Parameter("x", initial=np.full(9, 0.5))], [ur.View(reference)])
+
+
+UNEXPLAINED = "no longer improves"
+
+
+@pytest.mark.parametrize("estimator", [ur.PathGradient(spp=4), RCV], ids=["plain", "control variate"])
+def test_light_that_no_unknown_explains_is_told(estimator: Any) -> None:
+    for seed in range(2):
+        result = ur.optimize(smooth(0.5, seed), estimator, ur.optimizers.Adam(0.02), steps=300, seed=seed)
+        assert any(UNEXPLAINED in line for line in result.warnings), (seed, result.verification)
+        assert result.status == "finished"
+
+
+@pytest.mark.parametrize("count", [3, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rate", [0.02, 0.2])
+def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: int) -> None:
+    for seed in range(count):
+        result = ur.optimize(smooth(0.0, seed), RCV, ur.optimizers.Adam(rate), steps=200, seed=seed)
+        assert not any(UNEXPLAINED in line for line in result.warnings), (seed, result.warnings)
+        assert result.status == "finished"
+
+
+# ---------------------------------------------------------------------- thirty runs that cannot succeed
+
+
+def contradicting(seed: int) -> ur.Problem:
+    """Two views of one scene whose references are of different scenes, as of swapped files."""
+    one, other = smooth(0.0, seed), smooth(0.0, seed + 50)
+    assert isinstance(one.renderer, AnalyticRenderer)
+    renderer = AnalyticRenderer({"x": np.full(9, 0.5)}, one.renderer.matrix, noise=0.3, shape=(WIDE, WIDE), sensors=2)
+    views = [ur.View(np.asarray(problem.views[0].reference), sensor) for sensor, problem in enumerate((one, other))]
+    return ur.Problem(renderer, [ur.Parameter("x", initial=np.full(9, 0.5))], views)
+
+
+def hopeless() -> list[Any]:
+    """(problem, estimator, optimizer, steps, what is told) of each run."""
+    plain = ur.PathGradient(spp=2)
+    adam, told = ur.optimizers.Adam, "worse than start"
+    found: list[Any] = []
+    found += [
+        pytest.param(made(s, 0.45), plain, ur.optimizers.SGD(r), 12, told, id=f"rate {r}")
+        for s, r in enumerate((2.0, 5.0, 20.0, 1e3, 1e6))
+    ]
+    found += [
+        pytest.param(made(s, None), plain, adam(r), 30, told, id=f"from the truth, rate {r}")
+        for s, r in enumerate((0.3, 0.6, 1.0, 3.0, 30.0))
+    ]
+    found += [
+        pytest.param(
+            made(s),
+            ur.PathGradient(image=WrongWeight(factor=f), spp=4),
+            adam(0.03),
+            120,
+            "differs from a fresh picture",
+            id=f"weight {f}",
+        )
+        for s, f in enumerate((0.8, 0.9, 0.95, 1.03, 1.1))
+    ]
+    found += [
+        pytest.param(smooth(o, s), plain, adam(0.02), 300, UNEXPLAINED, id=f"other light {o}")
+        for s, o in enumerate((0.4, 0.5, 0.7, 1.0, -0.4))
+    ]
+    found += [
+        pytest.param(smooth(0.4, 10 + s), RCV, adam(0.02), 300, UNEXPLAINED, id=f"missing light {s}") for s in range(5)
+    ]
+    found += [
+        pytest.param(contradicting(s), plain, adam(0.02), 300, UNEXPLAINED, id=f"swapped views {s}") for s in range(5)
+    ]
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("problem", "estimator", "optimizer", "steps", "told"), hopeless())
+def test_runs_that_cannot_succeed_tell_so(
+    problem: ur.Problem, estimator: Any, optimizer: Any, steps: int, told: str
+) -> None:
+    result = ur.optimize(problem, estimator, optimizer, steps=steps)
+    assert told == result.status or any(told in line for line in result.warnings), (result.status, result.verification)
+
+
+# ---------------------------------------------------------------------- resuming
+
+
+class Kill(ur.Callback):
+    """Ends the run by an exception, as a second Ctrl-C does."""
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        if run.step == 85:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.mitsuba
+def test_a_resumed_run_keeps_the_same_parameters(tmp_path: Path) -> None:
+    """Earlier parameters come back with the checkpoint, and the descent goes on from the last ones."""
+    parts = ur.PathGradient(spp=4), ur.optimizers.Adam(0.05, schedule=Rising())
+    whole = ur.optimize(made(), *parts, steps=90, run_directory=tmp_path / "whole", checkpoint_every=10)
+    assert whole.verification["best"] == "step 64"
+    options: Any = {"run_directory": tmp_path / "part", "checkpoint_every": 10, "callbacks": [Kill()]}
+    with pytest.raises(KeyboardInterrupt):
+        ur.optimize(made(), *parts, steps=90, **options)
+    resumed = ur.resume(tmp_path / "part", made())
+    assert resumed.resumed == [80]
+    assert resumed.verification == whole.verification
+    np.testing.assert_array_equal(resumed.parameters["x"], whole.parameters["x"])
+    np.testing.assert_array_equal(resumed.last["x"], whole.last["x"])
+    further = ur.resume(tmp_path / "whole", made(), steps=91)
+    assert np.abs(further.last["x"] - whole.last["x"]).max() < 5 * 40 * 0.05
+    assert np.abs(further.last["x"] - whole.parameters["x"]).max() > 0
+    assert "last.npz" in {path.name for path in (tmp_path / "whole").iterdir()}
