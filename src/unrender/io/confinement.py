@@ -1,9 +1,9 @@
 """Files that an input names must lie in the input's own folder.
 
 A capture, a scene or a mesh may come from somebody else. What it names elsewhere on this machine would be read, and would show in what is
-made of it. So photographs and masks of a capture must lie in its folder, and textures, meshes and grids of an XML scene in the scene's
-folder or in that of its problem file. Links are followed before that is decided. What the user names on the command line or in a script
-may lie anywhere.
+made of it. So photographs and masks of a capture must lie in its folder, and textures, meshes and grids of a problem file's scene in the
+scene's folder or in that of the problem file. Links are followed before that is decided. What the user names on the command line may lie
+anywhere, and so may what a scene names that a script opens.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from unrender.core.errors import InputError
 from unrender.core.text import shorten, visible
 
-__all__ = ["VARIABLE", "allow", "check", "is_outside_allowed", "within"]
+__all__ = ["VARIABLE", "allow", "check", "is_confined", "is_outside_allowed", "within"]
 
 VARIABLE = "UNRENDER_ALLOW_OUTSIDE"
 """Environment variable that allows files outside: any value but "" and "0". Worker processes inherit it."""
@@ -45,6 +45,11 @@ def within(folder: Path) -> Iterator[None]:
         yield
     finally:
         _folders.reset(token)
+
+
+def is_confined() -> bool:
+    """Return whether an input that may come from somebody else is being read, within `within`."""
+    return bool(_folders.get())
 
 
 def check(path: Path, folders: Sequence[Path], what: str) -> None:
