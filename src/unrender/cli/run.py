@@ -12,6 +12,7 @@ from unrender.cli import arguments, dealing, stages
 from unrender.cli.arguments import (
     CheckpointEvery,
     FinalSpp,
+    Insecure,
     NoCache,
     Overwrite,
     ProblemName,
@@ -57,11 +58,11 @@ def run(
     no_cache: NoCache = False,
     workers: WorkersOption = None,
     compress: Compress = False,
+    insecure: Insecure = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
     PROBLEM may also be a file of stages: a run folder for each, which begins with what the one before it found.
-
     Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
     """
     from unrender.display.terminal import Console
@@ -74,7 +75,7 @@ def run(
             from unrender.cli.execute import Plan, execute, introduce
             from unrender.methods import method
 
-            chosen, processes = method(method_name), dealing.check(workers, compress)
+            chosen, processes = method(method_name), dealing.check(workers, compress, insecure)
             steps, seconds = _budget_settings(given, steps, seconds)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
@@ -88,9 +89,9 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            rest = (steps, seconds, seed, final_spp, command, options, checkpoint_every)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                result = execute(Plan(dealt, chosen, given, *rest), folder, console, progress)
+                task = Plan(dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
+                result = execute(task, folder, console, progress)
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)

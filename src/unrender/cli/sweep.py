@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Threads, Variant, WorkersOption
+from unrender.cli.arguments import (
+    FinalSpp,
+    Insecure,
+    NoCache,
+    Overwrite,
+    ProblemSettings,
+    Threads,
+    Variant,
+    WorkersOption,
+)
 from unrender.core import phases
 from unrender.core.errors import InputError
 
@@ -23,7 +32,7 @@ __all__ = ["MARK", "plan_of", "search_of", "sweep"]
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
-_FREE = ("what", "workers", "trials", "threads")
+_FREE = ("what", "workers", "insecure", "trials", "threads")
 """What may be given anew for a sweep that goes on."""
 
 _What = Annotated[
@@ -75,6 +84,7 @@ def sweep(
     seeds: _Seeds = 1,
     seed: _Seed = 0,
     workers: WorkersOption = None,
+    insecure: Insecure = False,
     out: _Out = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
@@ -93,7 +103,7 @@ def sweep(
     from unrender.sweeps.record import SweepRecord, read_sweep
 
     console = Console(highlight=False)
-    where = arguments.workers(workers)
+    where = arguments.workers(workers, insecure)
     if _is_sweep(what):
         _check_alone(context, what)
         record = _extended(read_sweep(Path(what)), trials)
