@@ -124,6 +124,13 @@ def test_ray_folder_that_others_can_change_is_refused(home: Path) -> None:
     check_cluster(fake_ray(session, Path("/on/another/machine")), "a:1")
 
 
+def test_a_cluster_without_nodes_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says nothing of its folders, so it is not joined."""
+    monkeypatch.setattr("unrender.cluster.trust._SECONDS", 0.0)
+    with pytest.raises(InputError, match="the cluster at a:1 has no node"):
+        check_cluster(fake_ray(), "a:1")
+
+
 def test_a_cluster_that_lets_nobody_in_is_one_line() -> None:
     def refuse(address: str) -> None:
         raise RuntimeError("Unauthenticated:\nno token")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +53,23 @@ def check_cluster(ray: Any, address: str) -> None:
     Raises:
         InputError: they can, or the cluster lets nobody in.
     """
-    try:
-        nodes = ray._raylet.GcsClient(address=address).get_all_node_info(timeout=_SECONDS).values()
-    except Exception as error:  # of many kinds
-        reason = one_line(reason_of(error, 200))
-        raise InputError(f"workers: Ray cannot be reached at {address}: {reason}") from error
-    for folder in sorted({node.session_dir for node in nodes}):
+    for folder in sorted({node.session_dir for node in _nodes(ray, address)}):
         if folder and os.path.isdir(folder) and (reason := can_change(Path(folder))):
             raise InputError(
                 f"workers: Ray's folder {reason}; start the cluster with --temp-dir below a folder of mode 0700{_HOW}"
             )
+
+
+def _nodes(ray: Any, address: str) -> list[Any]:
+    """Return the nodes of the cluster, of which a new one has none for a while. Raises `InputError`."""
+    until = time.monotonic() + _SECONDS
+    try:
+        client = ray._raylet.GcsClient(address=address)
+        while not (found := list(client.get_all_node_info(timeout=_SECONDS).values())) and time.monotonic() < until:
+            time.sleep(0.1)
+    except Exception as error:  # of many kinds
+        reason = one_line(reason_of(error, 200))
+        raise InputError(f"workers: Ray cannot be reached at {address}: {reason}") from error
+    if not found:
+        raise InputError(f"workers: the cluster at {address} has no node; ray status tells whether its nodes are alive")
+    return found
