@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from unrender.backend import variant
+from unrender.backend import limits, variant
 from unrender.cluster.head import HeadNode, reach
 from unrender.cluster.private import check_private, private_cluster
 from unrender.cluster.trust import check_cluster, check_token, has_token
@@ -115,7 +115,7 @@ def connect(
         if address is None:
             gpu = name == variant.CUDA or (name == "auto" and variant.gpu_problem() is None)
             given = stack.enter_context(private_cluster(ray))
-            given |= {"num_cpus": variant.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
+            given |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
             given |= {} if gpu else {"num_gpus": 0}
         else:
             gpu = name == variant.CUDA

@@ -20,7 +20,7 @@ _SECONDS = 10.0
 def _token_files() -> list[Path]:
     """Return where Ray looks for a token of this user."""
     named = os.environ.get("RAY_AUTH_TOKEN_PATH")
-    return [Path(named)] if named else [Path("~/.ray/auth_token").expanduser()]
+    return [Path(named)] if named else [Path(os.path.expanduser("~/.ray/auth_token"))]
 
 
 def has_token() -> bool:

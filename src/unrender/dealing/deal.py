@@ -9,7 +9,8 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from unrender.backend.variant import cores
+from unrender.backend.limits import cores
+from unrender.backend.variant import check_threads
 from unrender.cluster import Workers, connect
 from unrender.core.errors import InputError
 from unrender.dealing.assignment import deal as dealt_views
@@ -76,6 +77,8 @@ def deal(
         tell(f"workers: {views} for {views} views, in place of {parsed.count}")
         parsed = replace(parsed, count=views)
     with connect(parsed, variant, store_bytes=_store_bytes(problem, parsed), most=views) as cluster:
+        if threads is not None and cluster.address is None:
+            check_threads(threads)
         resolutions = problem.renderer.resolutions()
         pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
         shares = dealt_views(pixels, cluster.share.count)
