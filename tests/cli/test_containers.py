@@ -23,7 +23,11 @@ sys.exit(main())
 
 
 def run(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("HOME", "XDG", "UNRENDER"))}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("HOME", "XDG", "UNRENDER", "DRJIT_CACHE"))
+    }
     return subprocess.run(
         [sys.executable, "-c", NAMELESS, *words],
         cwd=folder,
