@@ -12,6 +12,7 @@ import functools
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,6 +50,8 @@ _THREADS = 4
 """Threads for each core at most."""
 
 _kept = False
+_setting = threading.RLock()
+"""Mitsuba's names are half there while another thread sets its variant."""
 
 _GPU_TRIAL = """
 import os, sys
@@ -124,12 +127,13 @@ def use(variant: str = "auto") -> str:
         _check_llvm()
     elif mi.variant() != CUDA and (problem := gpu_problem()):
         raise VariantError(f"{CUDA} cannot run here: {problem}; {LLVM!r} runs on the CPU")
-    if mi.variant() != chosen:
-        try:
-            mi.set_variant(chosen)
-        except ImportError as error:
-            raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
-        _keep_to_container()
+    with _setting:
+        if mi.variant() != chosen:
+            try:
+                mi.set_variant(chosen)
+            except ImportError as error:
+                raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
+            _keep_to_container()
     return chosen
 
 
