@@ -19,6 +19,8 @@ from unrender.core.signals import GRACEFUL
 
 __all__ = ["Signals"]
 
+_LATER = 0.02
+"""Seconds until a signal comes again that came during an import."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -36,6 +38,7 @@ class Signals:
         self.status = 0
         self._process = process
         self._before: dict[int, Any] = {}
+        self._deferred: set[int] = set()
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
@@ -51,15 +54,29 @@ class Signals:
             ignored = self._process and number == signal.SIGINT
             signal.signal(number, signal.SIG_IGN if ignored else handler)
 
-    def receive(self, number: int) -> None:
-        """What a signal does."""
-        if self.status:
+    def receive(self, number: int, frame: FrameType | None) -> None:
+        """End the command where it is; at once where it is busy with that already.
+
+        In the midst of an import the signal comes again a little later: compiled code that imports modules may abort at an exception.
+        """
+        if self.status or number in self._deferred:
+            status = self.status or 128 + number
             if sys.stderr.isatty():
                 os.write(2, _SHOW_CURSOR)
-            os.write(2, f"unrender: {WORDS[self.status]}\n".encode())
-            os._exit(self.status)
+            os.write(2, f"unrender: {WORDS[status]}\n".encode())
+            os._exit(status)
+        if _is_importing(frame):
+            self._deferred.add(number)
+            timer = threading.Timer(_LATER, self._send_again, (number,))
+            timer.daemon = True
+            timer.start()
+            return
         self.status = 128 + number
         raise KeyboardInterrupt
+
+    def _send_again(self, number: int) -> None:
+        self._deferred.discard(number)
+        os.kill(os.getpid(), number)
 
 
 class _Handler:
@@ -70,5 +87,12 @@ class _Handler:
         setattr(self, GRACEFUL, True)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        self._signals.receive(number)
+        self._signals.receive(number, frame)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
