@@ -7,10 +7,12 @@ written remains, as after a kill.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -19,8 +21,8 @@ from unrender.core.signals import GRACEFUL
 
 __all__ = ["Signals"]
 
-_LATER = 0.02
-"""Seconds until a signal comes again that came during an import."""
+_LATER, _LONGEST = 0.02, 1.5
+"""Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -39,6 +41,7 @@ class Signals:
         self._process = process
         self._before: dict[int, Any] = {}
         self._deferred: set[int] = set()
+        self._first: dict[int, float] = {}
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
@@ -59,7 +62,8 @@ class Signals:
 
         In the midst of an import the signal comes again a little later: compiled code that imports modules may abort at an exception.
         """
-        if self.status or number in self._deferred:
+        waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
+        if self.status or number in self._deferred or waited > _LONGEST:
             status = self.status or 128 + number
             if sys.stderr.isatty():
                 os.write(2, _SHOW_CURSOR)
@@ -69,7 +73,8 @@ class Signals:
             self._deferred.add(number)
             timer = threading.Timer(_LATER, self._send_again, (number,))
             timer.daemon = True
-            timer.start()
+            with contextlib.suppress(RuntimeError):  # no memory for a thread: the next signal ends the command
+                timer.start()
             return
         self.status = 128 + number
         raise KeyboardInterrupt
