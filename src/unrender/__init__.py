@@ -10,6 +10,11 @@
 Names are loaded when first used, so that `import unrender` is quick and works where Mitsuba does not (yet).
 """
 
+# ruff: noqa: E402
+from unrender.core.signals import end_at_once as _end_at_once
+
+_end_at_once()  # before anything that takes time
+
 from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -157,7 +157,7 @@ class Machines:
     def start(self, n: int) -> None:
         """Start a node, and wait until it is there; the head has to be the first."""
         ray = Path(sys.executable).with_name("ray")
-        own = ["--head", f"--port={_PORT}", "--include-dashboard=false", f"--temp-dir={self._folder}"]
+        own = ["--head", f"--port={_PORT}", "--include-dashboard=false", f"--temp-dir={self._folder / 'r'}"]
         words = [
             *(own if n == self.head else [f"--address={self.address}"]),
             f"--node-ip-address={_NETWORK}.{n + 1}",

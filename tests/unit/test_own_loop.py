@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -387,3 +388,67 @@ def test_a_loop_keeps_nothing_of_its_steps(name: str, steps: int) -> None:
         assert objects[1] <= objects[0] + 50
     finally:
         gc.enable()
+
+
+# ---------------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_derivative_that_is_not_finite_is_one_line(bad: float) -> None:
+    renderer = ur.Renderer(scene(), KEYS)
+    image = renderer.render(START)
+    given = np.ones_like(image)
+    given[0, 1, 2] = bad
+    line = rf"derivative of the loss by the image is not finite, {bad} at \(0, 1, 2\), one of 1 of {image.size} values"
+    with pytest.raises(InputError, match=line):
+        renderer.backward(given)
+    assert all(np.isfinite(g).all() for g in renderer.backward(np.ones_like(image)).values())
+
+
+def test_values_that_would_be_ignored_are_one_line() -> None:
+    renderer = ur.Renderer(scene(), ["colour"])
+    with pytest.raises(InputError, match=r"Renderer: colour2 is none of its parameters; did you mean colour\?"):
+        renderer.render({"colour": START["colour"], "colour2": START["colour"]})
+    with pytest.raises(InputError, match="map is none of its parameters; it was made for colour, and would ignore it"):
+        renderer.render(START)
+
+    class Optimizer:
+        """As of Dr.Jit: a mapping that is no dictionary, with a variable that is nothing of the scene's."""
+
+        def __init__(self, **values: Any) -> None:
+            self.values = values
+
+        def keys(self) -> Any:
+            return self.values.keys()
+
+        def __getitem__(self, key: str) -> Any:
+            return self.values[key]
+
+    renderer.render(Optimizer(colour=START["colour"], latent=np.zeros(3)))
+    with pytest.raises(InputError, match="map is none of its parameters"):
+        renderer.render(Optimizer(**START))
+
+
+@pytest.mark.parametrize("value", [None, [None, 0.1, 0.2], [0.1, np.nan, 0.2], "red", {}])
+def test_values_that_are_no_numbers_are_one_line(value: Any) -> None:
+    renderer = ur.Renderer(scene(), ["colour"])
+    with pytest.raises(InputError, match="parameter colour: expected ") as raised:
+        renderer.render({"colour": value})
+    assert "\n" not in str(raised.value)
+    renderer.render({"colour": START["colour"]})
+    with pytest.raises(InputError, match="Renderer: "):
+        renderer.backward(None)
+
+
+def test_backward_of_another_threads_image_is_one_line() -> None:
+    renderer = ur.Renderer(scene(), KEYS)
+    image = renderer.render(START)
+    thread = threading.Thread(target=renderer.render, args=(START,))
+    thread.start()
+    thread.join()
+    with pytest.raises(
+        InputError, match=r"backward in another thread than the last render.*give each thread a Renderer"
+    ):
+        renderer.backward(np.ones_like(image))
+    image = renderer.render(START)
+    renderer.backward(np.ones_like(image))

@@ -45,13 +45,16 @@ _bypassed = False
 
 
 def root() -> Path | None:
-    """The cache folder, whether it exists or not; None where it is switched off."""
+    """Return the cache folder, whether it exists or not; None where it is switched off or the user has no home folder."""
     given = os.environ.get(ENVIRONMENT_VARIABLE)
     if given is not None:
         return Path(given).absolute() if given else None
     import platformdirs
 
-    return Path(platformdirs.user_cache_dir("unrender", appauthor=False))
+    try:
+        return Path(platformdirs.user_cache_dir("unrender", appauthor=False))
+    except (RuntimeError, KeyError):  # HOME is not set, and this user has no entry in the password file
+        return None
 
 
 def folder(part: str) -> Path | None:

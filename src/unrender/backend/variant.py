@@ -12,13 +12,14 @@ import functools
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unrender.backend import cache, install_hints, llvm, plugins
-from unrender.core.errors import VariantError
+from unrender.backend import cache, install_hints, limits, llvm, plugins
+from unrender.core.errors import InputError, VariantError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import reason_of
 
@@ -26,7 +27,7 @@ __all__ = [
     "CUDA",
     "LLVM",
     "VARIANTS",
-    "cores",
+    "check_threads",
     "current",
     "ensure",
     "gpu_problem",
@@ -44,6 +45,13 @@ VARIANTS = (CUDA, LLVM)
 
 _INITIALISATION = 0.5
 """Seconds that Dr.Jit takes at most to find that a library will not do."""
+
+_THREADS = 4
+"""Threads for each core at most."""
+
+_kept = False
+_setting = threading.RLock()
+"""Mitsuba's names are half there while another thread sets its variant."""
 
 _GPU_TRIAL = """
 import os, sys
@@ -119,16 +127,44 @@ def use(variant: str = "auto") -> str:
         _check_llvm()
     elif mi.variant() != CUDA and (problem := gpu_problem()):
         raise VariantError(f"{CUDA} cannot run here: {problem}; {LLVM!r} runs on the CPU")
-    if mi.variant() != chosen:
-        try:
-            mi.set_variant(chosen)
-        except ImportError as error:
-            raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
+    with _setting:
+        if mi.variant() != chosen:
+            try:
+                mi.set_variant(chosen)
+            except ImportError as error:
+                raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
+            _keep_to_container()
     return chosen
 
 
+def _keep_to_container() -> None:
+    """Let Dr.Jit have no more threads than a container has cores. By itself it counts those of the machine."""
+    global _kept
+    if _kept:
+        return
+    _kept = True
+    import drjit as dr
+
+    if (cores := limits.cores()) < dr.thread_count():
+        dr.set_thread_count(cores)
+
+
+def check_threads(count: int) -> None:
+    """Raise `InputError` for more threads than a few for each core: they take those of all other processes of the machine."""
+    cores = limits.cores()
+    if count > _THREADS * cores:
+        raise InputError(
+            f"threads {count}: this process may use {cores} core{'s' * (cores > 1)}; expected at most {_THREADS * cores}"
+        )
+
+
 def use_threads(count: int) -> None:
-    """Let that many threads of the processor work, >= 1. Before the first kernel of the process: later, Dr.Jit may crash."""
+    """Let that many threads of the processor work, >= 1. Before the first kernel of the process: later, Dr.Jit may crash.
+
+    Raises:
+        InputError: they are far more than this process has cores.
+    """
+    check_threads(count)
     ensure()
     import drjit as dr
 
@@ -294,8 +330,3 @@ def _silent_stderr() -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
-
-
-def cores() -> int:
-    """How many of the processor's cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

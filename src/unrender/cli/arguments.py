@@ -28,6 +28,7 @@ __all__ = [
     "AllowOutside",
     "CheckpointEvery",
     "FinalSpp",
+    "Insecure",
     "NoCache",
     "Overwrite",
     "ProblemName",
@@ -114,17 +115,35 @@ WorkersOption = Annotated[
 ]
 
 
-def workers(text: str | None) -> Workers | None:
-    """What --workers says; None for this process alone, which one worker without an address is, too. Raises `InputError`."""
+Insecure = Annotated[
+    bool,
+    typer.Option(
+        "--insecure",
+        help="With --workers: join a cluster that other users can enter. They can run programs as its user.",
+        show_default=False,
+    ),
+]
+
+
+def workers(text: str | None, insecure: bool = False) -> Workers | None:
+    """Return what --workers and --insecure say; None for this process alone, which one worker without an address is, too.
+
+    Raises:
+        InputError: --workers cannot be understood, or --insecure is given without it.
+    """
     if text is None:
+        if insecure:
+            raise InputError("--insecure: applies to the cluster of --workers HOST:PORT; give that, too")
         return None
+    from dataclasses import replace
+
     from unrender.cluster import Workers, load_ray
 
     found = Workers.parse(text)
     if found == Workers(1):
         return None
     load_ray()  # what is missing is known before anything that takes time
-    return found
+    return replace(found, insecure=insecure)
 
 
 def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:

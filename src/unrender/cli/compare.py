@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.cli import arguments
-from unrender.cli.arguments import AllowOutside, FinalSpp, NoCache, Overwrite, ProblemSettings, Variant, WorkersOption
+from unrender.cli.arguments import (
+    AllowOutside,
+    FinalSpp,
+    Insecure,
+    NoCache,
+    Overwrite,
+    ProblemSettings,
+    Variant,
+    WorkersOption,
+)
 from unrender.cli.exit_status import FAILED
 from unrender.cli.run import exit_status
 from unrender.core import phases
@@ -63,6 +72,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")] = None,
     problem_settings: ProblemSettings = None,
     workers: WorkersOption = None,
+    insecure: Insecure = False,
     variant: Variant = "auto",
     final_spp: FinalSpp = None,
     overwrite: Overwrite = False,
@@ -79,7 +89,7 @@ def compare(
 
     console = Console(highlight=False)
     check_seed("--seed", seed, seeds)
-    where = arguments.workers(workers)
+    where = arguments.workers(workers, insecure)
     if all(Path(name).is_dir() for name in what):
         run_options = methods or settings or problem_settings or workers or seconds is not None
         return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))

@@ -30,11 +30,11 @@ Compress = Annotated[
 ]
 
 
-def check(workers: str | None, compress: bool) -> Workers | None:
+def check(workers: str | None, compress: bool, insecure: bool = False) -> Workers | None:
     """See `arguments.workers`; raises `InputError` for --compress without workers, too."""
     if compress and workers is None:
         raise InputError("--compress: is of what is sent to workers; give --workers, too")
-    found = arguments.workers(workers)
+    found = arguments.workers(workers, insecure)
     if compress and found is None:
         raise InputError(
             "--compress: is of what is sent to workers; --workers 1 is this process alone, which is sent nothing"

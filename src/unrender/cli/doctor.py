@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from unrender.backend import cache, llvm, variant
+from unrender.backend import cache, limits, llvm, variant
 from unrender.core.errors import VariantError
 from unrender.display.terminal import Console
 
@@ -148,7 +148,7 @@ def _llvm() -> str:
 def _hardware() -> list[tuple[str, str]]:
     problem = variant.gpu_problem()
     gpu = _first_line("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
-    cores = variant.cores()
+    cores = limits.cores()
     return [
         ("CPU", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
         ("GPU", (gpu or "CUDA works") if problem is None else f"not used: {problem}" + (f" ({gpu})" if gpu else "")),

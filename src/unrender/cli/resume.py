@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from unrender.cli import arguments, dealing, stages
-from unrender.cli.arguments import AllowOutside, Threads, WorkersOption
+from unrender.cli.arguments import AllowOutside, Insecure, Threads, WorkersOption
 from unrender.cli.dealing import Compress
 from unrender.cli.run import conclude
 from unrender.core import phases
@@ -33,6 +33,7 @@ def resume(
     workers: WorkersOption = None,
     compress: Compress = False,
     allow_outside: AllowOutside = False,
+    insecure: Insecure = False,
 ) -> None:
     """Go on with a run that was interrupted or killed, or give a finished one more.
 
@@ -61,7 +62,7 @@ def resume(
             from unrender.runs.live import Live
             from unrender.runs.resume import load_run, resume_run
 
-            processes = dealing.check(workers, compress)
+            processes = dealing.check(workers, compress, insecure)
             found = load_run(directory, steps, seconds)
             alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
             running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)

@@ -13,6 +13,7 @@ from unrender.cli.arguments import (
     AllowOutside,
     CheckpointEvery,
     FinalSpp,
+    Insecure,
     NoCache,
     Overwrite,
     ProblemName,
@@ -39,20 +40,24 @@ __all__ = ["conclude", "exit_status", "run"]
 _MethodName = Annotated[
     str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
 ]
+_Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
+]
+_Steps = Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")]
+_Seconds = Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")]
+_Out = Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")]
 
 
 def run(
     context: typer.Context,
     problem: ProblemName,
     method_name: _MethodName = "auto",
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
-    ] = None,
-    steps: Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")] = None,
+    settings: _Settings = None,
+    steps: _Steps = None,
+    seconds: _Seconds = None,
     seed: Seed = 0,
-    out: Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")] = None,
+    out: _Out = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
     final_spp: FinalSpp = None,
@@ -63,11 +68,11 @@ def run(
     workers: WorkersOption = None,
     compress: Compress = False,
     allow_outside: AllowOutside = False,
+    insecure: Insecure = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
     PROBLEM may also be a file of stages: a run folder for each, which begins with what the one before it found.
-
     Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
     """
     from unrender.display.terminal import Console
@@ -83,7 +88,7 @@ def run(
 
             planned = method_name.endswith(SUFFIX)
             chosen = PlanFile(Path(method_name)) if planned else method(method_name)
-            processes = dealing.check(workers, compress)
+            processes = dealing.check(workers, compress, insecure)
             steps, seconds = _budget_settings(given, steps, seconds)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
@@ -97,9 +102,11 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            rest = (steps, seconds, seed, final_spp, command, options, checkpoint_every)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                result = execute(RunOrder(dealt, chosen, given, *rest), folder, console, progress)
+                task = RunOrder(
+                    dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every
+                )
+                result = execute(task, folder, console, progress)
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)

@@ -7,10 +7,12 @@ written remains, as after a kill.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -19,6 +21,8 @@ from unrender.core.signals import GRACEFUL
 
 __all__ = ["Signals"]
 
+_LATER, _LONGEST = 0.02, 1.5
+"""Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -36,6 +40,8 @@ class Signals:
         self.status = 0
         self._process = process
         self._before: dict[int, Any] = {}
+        self._deferred: set[int] = set()
+        self._first: dict[int, float] = {}
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
@@ -51,15 +57,31 @@ class Signals:
             ignored = self._process and number == signal.SIGINT
             signal.signal(number, signal.SIG_IGN if ignored else handler)
 
-    def receive(self, number: int) -> None:
-        """What a signal does."""
-        if self.status:
+    def receive(self, number: int, frame: FrameType | None) -> None:
+        """End the command where it is; at once where it is busy with that already.
+
+        In the midst of an import the signal comes again a little later: compiled code that imports modules may abort at an exception.
+        """
+        waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
+        if self.status or number in self._deferred or waited > _LONGEST:
+            status = self.status or 128 + number
             if sys.stderr.isatty():
                 os.write(2, _SHOW_CURSOR)
-            os.write(2, f"unrender: {WORDS[self.status]}\n".encode())
-            os._exit(self.status)
+            os.write(2, f"unrender: {WORDS[status]}\n".encode())
+            os._exit(status)
+        if _is_importing(frame):
+            self._deferred.add(number)
+            timer = threading.Timer(_LATER, self._send_again, (number,))
+            timer.daemon = True
+            with contextlib.suppress(RuntimeError):  # no memory for a thread: the next signal ends the command
+                timer.start()
+            return
         self.status = 128 + number
         raise KeyboardInterrupt
+
+    def _send_again(self, number: int) -> None:
+        self._deferred.discard(number)
+        os.kill(os.getpid(), number)
 
 
 class _Handler:
@@ -70,5 +92,12 @@ class _Handler:
         setattr(self, GRACEFUL, True)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        self._signals.receive(number)
+        self._signals.receive(number, frame)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False

@@ -12,6 +12,7 @@ from unrender.cli import arguments
 from unrender.cli.arguments import (
     AllowOutside,
     FinalSpp,
+    Insecure,
     NoCache,
     Overwrite,
     ProblemSettings,
@@ -33,7 +34,7 @@ __all__ = ["MARK", "plan_of", "search_of", "sweep"]
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
-_FREE = ("allow_outside", "what", "workers", "trials", "threads")
+_FREE = ("allow_outside", "what", "workers", "insecure", "trials", "threads")
 """What may be given anew for a sweep that goes on."""
 
 _What = Annotated[
@@ -85,6 +86,7 @@ def sweep(
     seeds: _Seeds = 1,
     seed: _Seed = 0,
     workers: WorkersOption = None,
+    insecure: Insecure = False,
     out: _Out = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
@@ -104,7 +106,7 @@ def sweep(
     from unrender.sweeps.record import SweepRecord, read_sweep
 
     console = Console(highlight=False)
-    where = arguments.workers(workers)
+    where = arguments.workers(workers, insecure)
     if _is_sweep(what):
         _check_alone(context, what)
         record = _extended(read_sweep(Path(what)), trials)

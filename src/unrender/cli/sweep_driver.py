@@ -13,6 +13,7 @@ from pathlib import Path
 
 import typer
 
+from unrender.backend.variant import check_threads
 from unrender.cli import arguments, sweep_page, sweep_table, tasks
 from unrender.cli.execute import introduce
 from unrender.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
@@ -134,6 +135,8 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
         cluster = None
         if session.workers is not None:
             cluster = stack.enter_context(connect(session.workers, plan.variant))
+            if session.threads is not None and cluster.address is None:
+                check_threads(session.threads)
         running = arguments.use_variant(plan.variant, None if cluster else session.threads)
         problem = arguments.open_problem(plan.problem, plan.problem_settings, plan.cached)
         job = Job(

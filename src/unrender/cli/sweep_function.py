@@ -41,6 +41,7 @@ def sweep(
     variant: str = "auto",
     final_spp: int | None = None,
     overwrite: bool = False,
+    insecure: bool = False,
 ) -> SweepRecord:
     """Search a method's options for those of the least error, on one problem: `unrender sweep` as a function, silent.
 
@@ -53,8 +54,7 @@ def sweep(
         over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
         settings: options that stay the same.
         search: which settings to try; None for a grid, or random ones where a range has no points.
-        trials: how many, by random or tpe; None for 16.
-        prune, window: see the guide.
+        trials, prune, window: how many by random or tpe, None for 16; see the guide.
         steps, seconds: budget of each run; None of both for 300 steps.
         seeds, seed: how many runs of each trial, and the first one's seed.
         workers: how many processes, "auto", or where, as of `deal`; None for this process.
@@ -64,6 +64,7 @@ def sweep(
         variant: Mitsuba's.
         final_spp: samples per pixel of the final pictures.
         overwrite: whether `out` may hold an earlier sweep, which is lost.
+        insecure: whether to join a cluster that other users can enter.
 
     Returns:
         What sweep.json holds; `best` is None where every trial failed.
@@ -77,7 +78,7 @@ def sweep(
     names |= {"problem": str(problem), "method": method, "search": search}
     names |= {"over": [f"{name}={value}" for name, value in _texts(over).items()]}
     names |= {"settings": _texts(settings), "problem_settings": _texts(problem_settings)}
-    where = arguments.workers(None if workers is None else str(workers))
+    where = arguments.workers(None if workers is None else str(workers), insecure)
     return _carried_out(names, None if out is None else Path(out), overwrite, where, threads)
 
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import shutil
 import signal
 import sys
-import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from unrender.backend import variant
+from unrender.backend import limits, variant
 from unrender.cluster.head import HeadNode, reach
+from unrender.cluster.private import check_private, private_cluster
+from unrender.cluster.trust import check_cluster, check_token, has_token
 from unrender.cluster.workers import Share, Workers, share
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
@@ -71,9 +70,7 @@ def load_ray() -> Any:
     """
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
-    if (
-        _has_token() and "ray" not in sys.modules
-    ):  # which has read the mode by then, unlike the processes that it starts
+    if has_token() and "ray" not in sys.modules:  # which has read the mode by then, unlike the processes that it starts
         os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         with warnings.catch_warnings():
@@ -83,12 +80,6 @@ def load_ray() -> Any:
         raise InputError(f"workers need Ray ({error}): pip install 'unrender[ray]'") from error
     _silence(ray)
     return ray
-
-
-def _has_token() -> bool:
-    """Whether this user has a token for clusters that ask for one, where Ray looks for it. Others are shown it in vain."""
-    paths = [os.environ.get("RAY_AUTH_TOKEN_PATH"), os.path.expanduser("~/.ray/auth_token")]
-    return bool(os.environ.get("RAY_AUTH_TOKEN")) or any(path and os.path.isfile(path) for path in paths)
 
 
 def _silence(ray: Any) -> None:
@@ -103,6 +94,7 @@ def connect(
 ) -> Iterator[Cluster]:
     """Start Ray on this machine, or join a cluster; leave it at the end, and stop what was started here.
 
+    A cluster that is started here lets in nobody but this user. One that was started elsewhere is joined where it looks closed, too.
     Handlers of SIGTERM and SIGINT stay as they are. A process has one connection at a time.
 
     Args:
@@ -112,42 +104,34 @@ def connect(
         most: workers that there is work for, see `share`.
 
     Raises:
-        InputError: Ray is not installed, there is no cluster at the address, it has no GPU though `name` asks for one, or the process is
-            connected already.
+        InputError: Ray is not installed, there is no cluster at the address, it is open to other users, it has no GPU though `name` asks
+            for one, or the process is connected already.
     """
     ray = load_ray()
     if ray.is_initialized():
         raise InputError("workers: this process is connected to Ray already")
     address = workers.address or os.environ.get("RAY_ADDRESS") or None
     with contextlib.ExitStack() as stack:
-        common: dict[str, Any] = {
-            "namespace": _NAMESPACE,
-            "logging_level": logging.ERROR,
-            "log_to_driver": False,
-            "configure_logging": True,
-        }
         if address is None:
             gpu = name == variant.CUDA or (name == "auto" and variant.gpu_problem() is None)
-            folder = stack.enter_context(_temporary_folder())
-            common |= {
-                "address": "local",
-                "num_cpus": variant.cores(),
-                "include_dashboard": False,
-                "object_store_memory": store_bytes,
-                "_temp_dir": str(folder),
-            } | ({} if gpu else {"num_gpus": 0})
+            given = stack.enter_context(private_cluster(ray))
+            given |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
+            given |= {} if gpu else {"num_gpus": 0}
         else:
             gpu = name == variant.CUDA
-            common["address"] = address
+            given = {"address": address}
             _check_answers(address)
-        where = "cannot start on this machine" if address is None else f"cannot be reached at {address}"
+            if not workers.insecure:
+                check_token(address)
+                if _is_located(address):
+                    check_cluster(ray, address)
         stack.callback(_leave, ray)
-        with _own_signals():
-            try:
-                ray.init(**common)
-            except Exception as error:  # of many kinds
-                reason = one_line(reason_of(error, 200))
-                raise InputError(f"workers: Ray {where}: {reason}") from error
+        _init(ray, address, given)
+        gcs_address = ray.get_runtime_context().gcs_address
+        if address is None:
+            check_private(ray)
+        elif not workers.insecure and not _is_located(address):
+            check_cluster(ray, gcs_address)
         machines = _machines(ray)
         if name == "auto" and address is not None:
             gpu = any(gpus >= 1 for _, gpus in machines)
@@ -156,8 +140,20 @@ def connect(
             variant.CUDA if gpu else variant.LLVM,
             share(machines, workers.count, gpu, most),
             workers.address or address,
-            HeadNode(ray.get_runtime_context().gcs_address),
+            HeadNode(gcs_address),
         )
+
+
+def _init(ray: Any, address: str | None, given: dict[str, Any]) -> None:
+    """Start or join the cluster. Raises `InputError`."""
+    where = "cannot start on this machine" if address is None else f"cannot be reached at {address}"
+    quiet = {"logging_level": logging.ERROR, "log_to_driver": False, "configure_logging": True}
+    with _own_signals():
+        try:
+            ray.init(namespace=_NAMESPACE, **quiet, **given)
+        except Exception as error:  # of many kinds
+            reason = one_line(reason_of(error, 200))
+            raise InputError(f"workers: Ray {where}: {reason}") from error
 
 
 def _machines(ray: Any) -> list[tuple[float, float]]:
@@ -166,22 +162,16 @@ def _machines(ray: Any) -> list[tuple[float, float]]:
     return [(resources.get("CPU", 0.0), resources.get("GPU", 0.0)) for resources in alive]
 
 
-@contextlib.contextmanager
-def _temporary_folder() -> Iterator[Path]:
-    """Where a cluster of this machine keeps sockets and logs, removed at the end. Its path must be short, for sockets."""
-    base = tempfile.gettempdir()
-    folder = Path(tempfile.mkdtemp(prefix="unrender-ray-", dir=base if len(base) < 30 else "/tmp"))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+def _is_located(address: str) -> bool:
+    """Return whether an address is HOST:PORT. RAY_ADDRESS may hold "auto"."""
+    _, colon, port = address.rpartition(":")
+    return bool(colon) and port.isdigit()
 
 
 def _check_answers(address: str) -> None:
     """Raise `InputError` where nobody listens, which Ray takes two minutes to say."""
-    _, colon, port = address.rpartition(":")
-    if not colon or not port.isdigit():
-        return  # RAY_ADDRESS may hold "auto"
+    if not _is_located(address):
+        return
     try:
         reach(address, _ANSWER_SECONDS)
     except OSError as error:

@@ -21,10 +21,12 @@ class Workers:
     Attributes:
         count: how many; None for one a GPU, or one a processor core where no GPU is to be used.
         address: HOST:PORT of a Ray cluster to join; None for this machine (or for the cluster that RAY_ADDRESS names).
+        insecure: Whether to join a cluster that other users can enter.
     """
 
     count: int | None = None
     address: str | None = None
+    insecure: bool = False
 
     @classmethod
     def parse(cls, text: str, option: str = "--workers") -> Workers:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import socket
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unrender.backend import limits
 from unrender.cluster import load_ray, prepare_worker
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class ViewWorker:
     def place(self) -> Place:
         """Where it runs. Its first answer says that it is ready."""
         gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "") if self._variant.startswith("cuda") else ""
-        free = _free_gpu_memory() if gpu else _free_memory()
+        free = _free_gpu_memory() if gpu else limits.free_memory()
         return Place(socket.gethostname(), os.getpid(), free, gpu)
 
     def alive(self) -> bool:
@@ -86,20 +86,6 @@ class ViewWorker:
     def fetch(self, share: int, number: int) -> Packed:
         """See `ViewShare.fetch`."""
         return self._shares[share].fetch(number)
-
-
-def _free_memory() -> int:
-    """Bytes that this machine, or this container, has left; 0 where that is unknown."""
-    found = []
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        found += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable")]
-        limit, used = (Path("/sys/fs/cgroup", name).read_text().strip() for name in ("memory.max", "memory.current"))
-        if limit.isdigit() and used.isdigit():
-            found.append(max(int(limit) - int(used), 1))
-    except (OSError, ValueError):
-        pass
-    return min(found, default=0)
 
 
 def _free_gpu_memory() -> int:

@@ -7,8 +7,10 @@ import logging
 import math
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
-from unrender.backend.variant import cores
+from unrender.backend.limits import cores
+from unrender.backend.variant import check_threads
 from unrender.cluster import Workers, connect
 from unrender.core.errors import InputError
 from unrender.dealing.assignment import deal as dealt_views
@@ -33,6 +35,7 @@ def deal(
     variant: str = "auto",
     threads: int | None = None,
     tell: Callable[[str], None] = _log.warning,
+    insecure: bool = False,
 ) -> Iterator[Problem]:
     """The problem, its views dealt to workers: within the context, `optimize` and `resume` have them compute its gradients.
 
@@ -57,12 +60,14 @@ def deal(
         variant: Mitsuba's, of the workers.
         threads: of the processor for each worker; None for its share.
         tell: is told of workers that are lost or lag, a line each.
+        insecure: whether to join a cluster that other users can enter.
 
     Raises:
-        InputError: Ray is not installed, no cluster at the address; the problem cannot be sent, has too few views, or does not fit a
-            worker's memory; workers are lost again and again.
+        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
+            has too few views, or does not fit a worker's memory; workers are lost again and again.
     """
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
+    parsed = replace(parsed, insecure=parsed.insecure or insecure)
     views = len(problem.views)
     if parsed.count is not None and parsed.count > 1 and views == 1:
         raise InputError(
@@ -70,8 +75,10 @@ def deal(
         )
     if parsed.count is not None and parsed.count > views:
         tell(f"workers: {views} for {views} views, in place of {parsed.count}")
-        parsed = Workers(views, parsed.address)
+        parsed = replace(parsed, count=views)
     with connect(parsed, variant, store_bytes=_store_bytes(problem, parsed), most=views) as cluster:
+        if threads is not None and cluster.address is None:
+            check_threads(threads)
         resolutions = problem.renderer.resolutions()
         pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
         shares = dealt_views(pixels, cluster.share.count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,7 @@ class Renderer:
         self._streams: dict[str, Stream] = {}
         self._step = 0
         self._last: tuple[Given, list[tuple[Stream, Rendered]]] | None = None
+        self._thread: threading.Thread | None = None
         self._variances: list[Tree] = []
         for name in self._names(None):
             self._stream(name)
@@ -163,6 +165,7 @@ class Renderer:
         """
         if self._last is None:
             raise InputError("Renderer: backward comes after render")
+        self._check_thread("backward")
         given, done = self._last
         derivatives = tuple(derivative) if isinstance(derivative, (tuple, list)) else (derivative,)
         if len(derivatives) != len(done):
@@ -182,6 +185,7 @@ class Renderer:
         """The pixels of the last render, arrays of the kind of its values. Raises `InputError` where it was of whole images."""
         if self._last is None or (batch := self._last[1][0][1].batch) is None:
             raise InputError("Renderer: there is no mini-batch; it has pixels=All(), or nothing was rendered yet")
+        self._check_thread("batch")
         given = self._last[0]
         if given.framework == "drjit":
             return batch
@@ -274,7 +278,7 @@ class Renderer:
             done.append((stream, rendered))
             images.append(self._exchange.image(image, given))
         self._step += 1
-        self._last = given.detached(), done
+        self._last, self._thread = (given.detached(), done), threading.current_thread()
         return given, done, tuple(images)
 
     @exclusive("Renderer")
@@ -289,6 +293,13 @@ class Renderer:
             raise InputError("Renderer: nothing was rendered")
         arrays.evaluate(total)
         return total
+
+    def _check_thread(self, what: str) -> None:
+        """Raise `InputError` where another thread has rendered last: what is asked for belongs to its image."""
+        if self._thread is not threading.current_thread():
+            raise InputError(
+                f"Renderer: {what} in another thread than the last render, whose image it would belong to; give each thread a Renderer"
+            )
 
     def _with_torch(self, given: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
         from unrender.loops import torch_operation

@@ -64,12 +64,29 @@ class Exchange:
                 raise InputError(f"Renderer: expected {{key: array}} for {', '.join(self._keys)}, got {_kind(values)}")
             values = dict.fromkeys(self._keys, values)
         known = list(values.keys())
+        others = [name for name in known if name not in self._keys]
         for key in self._keys:
             if key not in known:
-                others = [name for name in known if name not in self._keys]
                 raise InputError(f"Renderer: no value for parameter {key}{did_you_mean(key, others)}")
+        self._refuse_unused(values, others)
         found = {key: values[key] for key in self._keys}
         return Given(frameworks.framework(found.values(), "Renderer"), found)
+
+    def _refuse_unused(self, values: Any, others: list[Any]) -> None:
+        """Raise `InputError` for values that would be ignored.
+
+        A dictionary may hold nothing but the parameters. An optimizer may hold other variables, but no parameter of the scene, whose
+        gradient would stay zero. `mi.SceneParameters` always hold all of the scene.
+        """
+        if hasattr(values, "hierarchy"):  # mi.SceneParameters
+            return
+        if not isinstance(values, dict):
+            others = [name for name in others if name in self._renderer.parameters()]
+        if others:
+            raise InputError(
+                f"Renderer: {others[0]} is none of its parameters{did_you_mean(str(others[0]), self._keys)}; "
+                f"it was made for {', '.join(self._keys)}, and would ignore it"
+            )
 
     def tree(self, given: Given) -> Tree:
         """The parameters as the renderer's arrays, detached. Raises `InputError` for a shape that none has."""
@@ -114,8 +131,14 @@ class Exchange:
         if found != shape:
             raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {found}")
         if self._on_device and arrays.is_drjit(derivative):
-            return dr.detach(derivative)
-        return self._renderer.array(frameworks.host(derivative, "Renderer: the derivative of the loss"))
+            detached = dr.detach(derivative)
+            if not arrays.all_finite(detached):
+                _refuse_derivative(arrays.numpy(detached))
+            return detached
+        found = frameworks.host(derivative, "Renderer: the derivative of the loss")
+        if not np.isfinite(found).all():
+            _refuse_derivative(found)
+        return self._renderer.array(found)
 
     def gradient(self, gradient: Tree, given: Given) -> dict[str, Any]:
         """A gradient as arrays of the loop, each of the type of its parameter."""
@@ -144,7 +167,10 @@ class Exchange:
             raise InputError(f"parameter {key}: expected shape {self._info[key].shape}, got {_kind(value)}") from error
 
     def _host(self, key: str, value: Any) -> np.ndarray:
-        return self._fit(key, frameworks.host(value, f"parameter {key}"))
+        found = frameworks.host(value, f"parameter {key}")
+        if not np.isfinite(found).all():
+            raise InputError(f"parameter {key}: expected finite numbers, got {_first_of(found)}")
+        return self._fit(key, found)
 
     def _fit(self, key: str, value: Array) -> Array:
         """Of the parameter's shape; of another resolution where it has several."""
@@ -166,3 +192,17 @@ class Exchange:
 
 def _kind(value: Any) -> str:
     return type(value).__name__
+
+
+def _refuse_derivative(values: np.ndarray) -> None:
+    raise InputError(
+        f"Renderer: the derivative of the loss by the image is not finite, {_first_of(values)}; mask such pixels, or keep the loss away "
+        "from roots, logarithms and divisions at zero"
+    )
+
+
+def _first_of(values: np.ndarray) -> str:
+    """Return how many values are not finite, and the first of them."""
+    wrong = np.argwhere(~np.isfinite(values))
+    place = tuple(int(n) for n in wrong[0])
+    return f"{values[place]} at {place}, one of {len(wrong)} of {values.size} values"

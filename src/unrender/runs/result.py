@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.backend.variant import LLVM, cores, current, llvm_version
+from unrender.backend.limits import cores
+from unrender.backend.variant import LLVM, current, llvm_version
 from unrender.core.errors import InputError
 from unrender.core.text import plain
 from unrender.io import files

@@ -1,0 +1,65 @@
+"""Which files and folders other users of this machine can read or change. Nothing here needs Ray."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+__all__ = ["can_change", "can_read"]
+
+_UIDS = Path("/proc/self/uid_map")
+_OVERFLOW = Path("/proc/sys/kernel/overflowuid")
+
+
+def can_change(folder: Path, shared: bool = False) -> str:
+    """Return how others could change entries of a folder or replace it, as words for a message; "" where they cannot.
+
+    Args:
+        folder: one that exists.
+        shared: whether others may add entries, as in the system's temporary folder. Its sticky bit must be set.
+    """
+    place = Path(os.path.realpath(folder))
+    for above in (place, *place.parents):
+        if _shielded(above.parent):
+            return ""
+        status = above.stat()
+        mode = stat.S_IMODE(status.st_mode)
+        if status.st_uid not in _trusted():
+            return f"{above} belongs to user {status.st_uid}"
+        sticky = mode & stat.S_ISVTX and (shared or above != place)
+        if mode & 0o022 and not sticky:
+            return f"{above} is writable by others (mode {mode:04o})"
+    return ""
+
+
+def can_read(path: Path) -> str:
+    """Return how others can read a file, as words for a message; "" where they cannot."""
+    path = Path(os.path.realpath(path))
+    if _shielded(path.parent):
+        return ""
+    status = path.stat()
+    mode = stat.S_IMODE(status.st_mode)
+    if status.st_uid not in _trusted():
+        return f"{path} belongs to user {status.st_uid}"
+    return f"{path} is readable by others (mode {mode:04o})" if mode & 0o066 else ""
+
+
+def _shielded(folder: Path) -> bool:
+    """Return whether nobody else can enter the folder: it, or one above it, is closed to them."""
+    for place in (folder, *folder.parents):
+        status = place.stat()
+        if status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o011:
+            return True
+    return False
+
+
+def _trusted() -> set[int]:
+    """Return the owners that a folder may have: this user, root, and in a container those who have no number there."""
+    found = {0, os.geteuid()}
+    try:
+        if _UIDS.read_text().split() != ["0", "0", "4294967295"]:
+            found.add(int(_OVERFLOW.read_text()))
+    except (OSError, ValueError):  # no Linux
+        pass
+    return found

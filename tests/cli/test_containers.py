@@ -1,0 +1,63 @@
+"""The command in containers: users without a name or a home folder, homes that cannot be written, numbers of threads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NAMELESS = """
+import pwd, sys
+
+def unknown(uid):
+    raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+pwd.getpwuid = unknown
+from unrender.cli.main import main
+sys.exit(main())
+"""
+"""The command of a user whose number has no name, as of `docker run --user 4321`."""
+
+
+def run(folder: Path, *words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("HOME", "XDG", "UNRENDER", "DRJIT_CACHE"))
+    }
+    return subprocess.run(
+        [sys.executable, "-c", NAMELESS, *words],
+        cwd=folder,
+        env=kept | {"COLUMNS": "100"} | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.mark.parametrize("words", [["--version"], ["methods", "rcv"], ["gallery"]])
+def test_no_home_and_no_name(tmp_path: Path, words: list[str]) -> None:
+    done = run(tmp_path, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("home", ["missing", "file"])
+def test_a_home_that_cannot_be_written(tmp_path: Path, home: str) -> None:
+    (tmp_path / "file").touch()
+    words = ["run", "exponential", "--method", "plain", "--steps", "2", "--out", str(tmp_path / "run")]
+    done = run(tmp_path, *words, HOME=str(tmp_path / "file" / home))
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
+    assert (tmp_path / "run" / "run.json").exists()
+
+
+def test_a_million_threads_are_one_line(unrender, tmp_path: Path, mitsuba_variant: str) -> None:
+    words = ["exponential", "--method", "plain", "--steps", 1, "--threads", 1_000_000, "--variant", mitsuba_variant]
+    answer = unrender("run", *words, "--out", tmp_path / "run")
+    assert answer.status == 2
+    assert answer.error.startswith("unrender: threads 1000000: this process may use ")
+    assert answer.error.count("\n") == 1
+    assert not (tmp_path / "run").exists()

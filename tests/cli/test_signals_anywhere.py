@@ -1,0 +1,139 @@
+"""Ctrl-C and SIGTERM at any moment from the command's start to its end: one line, an exit status, nothing half written.
+
+`UNRENDER_SIGNALS=100 pytest tests/cli/test_signals_anywhere.py -m slow` draws more moments.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from unrender.cli import signals as handled
+from unrender.core.errors import InputError
+from unrender.runs.folder import reader
+
+COUNT = int(os.environ.get("UNRENDER_SIGNALS", "20"))
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+RUN = [
+    "run",
+    "exponential",
+    "--method",
+    "plain",
+    "--steps",
+    "400",
+    "--checkpoint-every",
+    "20",
+    "--final-spp",
+    "64",
+    "--out",
+    "run",
+]
+COMMAND = "import sys; sys.argv[0] = 'unrender'; import unrender; print('loading', file=sys.stderr, flush=True); "
+COMMAND += "from unrender.cli.main import main; sys.exit(main())"
+"""As the command's script, and it tells when the package is there: until then, what happens is Python's own affair."""
+
+
+def start(folder: Path, *words: str) -> subprocess.Popen[str]:
+    folder.mkdir()
+    line = [sys.executable, "-c", COMMAND, *words]
+    return subprocess.Popen(line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process: subprocess.Popen[str], number: signal.Signals) -> float:
+    """Send a signal to a command that was started, and hold it to its end; return the seconds that this took."""
+    process.send_signal(number)
+    before = time.monotonic()
+    _, said = process.communicate(timeout=60)
+    if process.returncode == 0:  # it came too late
+        assert said == ""
+    else:
+        assert (process.returncode, said) == (128 + number, f"unrender: {WORDS[number]}\n")
+    return time.monotonic() - before
+
+
+def await_package(process: subprocess.Popen[str]) -> None:
+    assert process.stderr is not None
+    assert process.stderr.readline() == "loading\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_while_the_command_is_loaded(tmp_path: Path, number: signal.Signals) -> None:
+    for n, moment in enumerate((0.0, 0.1, 0.25, 0.4)):
+        process = start(tmp_path / str(n), "methods", "rcv")
+        await_package(process)
+        time.sleep(moment)
+        ended(process, number)
+
+
+def test_an_import_that_never_ends_is_interrupted_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "endless_module.py").write_text("import time\nwhile True: time.sleep(0.02)\n")
+    code = textwrap.dedent("""
+        import os, signal, sys, threading
+        sys.path.insert(0, sys.argv[1])
+        from unrender.cli.signals import Signals
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with Signals(process=True):
+            import endless_module
+    """)
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (143, "unrender: terminated\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_at_uniformly_drawn_moments(tmp_path: Path, number: signal.Signals, part: int) -> None:
+    begun = time.monotonic()
+    process = start(tmp_path / "undisturbed", *RUN)
+    await_package(process)
+    process.communicate(timeout=120)
+    whole = time.monotonic() - begun
+    draw = random.Random(100 * int(number) + part)
+    for n in range(-(-COUNT // 5)):
+        folder = tmp_path / str(n)
+        process = start(folder, *RUN)
+        await_package(process)
+        time.sleep(draw.uniform(0, whole))
+        ended(process, number)
+        if (folder / "run" / "run.json").exists():
+            reader.read(folder / "run")
+        else:
+            with pytest.raises(InputError):
+                reader.read(folder / "run")
+
+
+def test_an_interrupt_waits_for_the_end_of_an_import(tmp_path: Path) -> None:
+    """Compiled code that imports modules aborts at an exception in them."""
+    (tmp_path / "slow_module.py").write_text(
+        "import time\nfor _ in range(20): time.sleep(0.02)\nprint('whole', flush=True)\n"
+    )
+    code = textwrap.dedent("""
+        import os, signal, sys, threading, time
+        sys.path.insert(0, sys.argv[1])
+        from unrender.cli.signals import Signals
+        signals = Signals(process=True)
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+        try:
+            with signals:
+                import slow_module
+                time.sleep(10)
+        except KeyboardInterrupt:
+            print("interrupted", signals.status)
+    """)
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("whole\ninterrupted 130\n", "")
+
+
+def test_a_program_that_imports_the_package_keeps_its_handlers() -> None:
+    code = "import signal, unrender; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
+    assert handled.WORDS[130] == "interrupted"
