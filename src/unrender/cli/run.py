@@ -30,6 +30,8 @@ from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
     from unrender.display.terminal import Console
+    from unrender.methods import Method
+    from unrender.methods.plan_file import PlanFile
     from unrender.problem.problem import Problem
     from unrender.runs.progress import Progress
     from unrender.runs.result import Result
@@ -83,12 +85,8 @@ def run(
     with Progress(console) as progress:
         with phases.phase("loading"):
             from unrender.cli.execute import RunOrder, execute, introduce
-            from unrender.methods import method
-            from unrender.methods.plan_file import SUFFIX, PlanFile
 
-            planned = method_name.endswith(SUFFIX)
-            chosen = PlanFile(Path(method_name)) if planned else method(method_name)
-            processes = dealing.check(workers, compress, insecure)
+            chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
             steps, seconds = _budget_settings(given, steps, seconds)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
@@ -110,6 +108,14 @@ def run(
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)
+
+
+def _method(name: str) -> Method | PlanFile:
+    """Return the method of a name, or the plan of a TOML file. Raises `InputError`."""
+    from unrender.methods import method
+    from unrender.methods.plan_file import SUFFIX, PlanFile
+
+    return PlanFile(Path(name)) if name.endswith(SUFFIX) else method(name)
 
 
 def conclude(

@@ -68,9 +68,8 @@ def optimize(
 
     Args:
         problem: what to recover, from which images.
-        estimator: Computes gradients. Or a `methods.plan.Plan`, or the name of a method (`unrender methods` lists them): both bring
-            their optimizer along.
-        optimizer: what becomes of them; None for the method's. The default method chooses both to suit the problem.
+        estimator: Computes gradients; or a `methods.plan.Plan` or a method's name (`unrender methods`), which bring an optimizer along.
+        optimizer: Computes steps from gradients; None for the method's.
         steps: how many steps at most, >= 1.
         seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
         seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
@@ -83,9 +82,8 @@ def optimize(
         annotations: what else the run folder should say.
         progress: whether to show a bar; None does so in notebooks.
 
-    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. SIGTERM ends a run that
-    has a run folder likewise, without final pictures, and then the process, unless the program handles it itself. Both are left to
-    their handlers outside of the main thread.
+    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. SIGTERM ends a run with a
+    run folder, without final pictures, and then the process, unless the program handles it. Both work in the main thread alone.
 
     A step whose loss or gradient is not finite is not applied, nor remembered by the estimator, and neither is one that the optimizer
     makes not finite; it is counted in `Result.skipped`, and a warning says what was not finite. After twenty in a row the run is given
