@@ -19,6 +19,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
 
@@ -117,7 +118,9 @@ def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable
     total, done = np.zeros((height, width, 3)), 0
     while done < spp:
         seed = _REFERENCE.fold(sensor).fold(done).uint32()
-        samples = film.camera_samples(camera, sampler, mi.UInt32(seed), take, None, width * height)
+        samples = film.camera_samples(
+            camera, sampler, mi.UInt32(seed), take, None, width * height, filters=PixelFilters.of([camera])
+        )
         ray, weight = film.rays(samples)
         radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
         radiance *= weight

@@ -15,6 +15,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
 from unrender.rendering.renderer import SampleRequest
@@ -42,6 +43,8 @@ def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
 def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes know no media"
+    if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
+        return "path gradients of moving shapes do not support sample_border: leave it out of the film"
     if shape is None:
         return "path gradients do not move instances"
     if not shape.is_mesh():

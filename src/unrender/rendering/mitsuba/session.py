@@ -39,7 +39,7 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
-from unrender.rendering.mitsuba.recordable import is_recordable
+from unrender.rendering.mitsuba.recordable import are_recordable
 from unrender.rendering.mitsuba.rendered_paths import Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -162,7 +162,7 @@ class MitsubaSession:
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render. Unbiased; box filter."""
+        """Render. Unbiased."""
         if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
@@ -204,7 +204,7 @@ class MitsubaSession:
         return film.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
+        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased."""
         self._set_parameters(current)
         # A call through a pointer reaches both scenes' objects, and its adjoint would accumulate gradients in all that are attached.
         self._set_parameters(previous, previous=True, attach=request.both_gradients)
@@ -361,7 +361,7 @@ class MitsubaSession:
         pair = self._pair
         size = LaunchSize(request.sensor, request.spp, self._count(request))
         several = request.sensors is not None
-        outside = self._rays_outside(request)
+        outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
         pixels = request.pixels is None, several, request.positions is None
@@ -372,23 +372,16 @@ class MitsubaSession:
             self._functions[key] = FrozenFunction(traced, self._recordable)
         share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
-        sensors = (pair.films(), request.sensors) if several else None
+        films = pair.films(request)
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
-        rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
+        rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
-
-    def _rays_outside(self, request: SampleRequest) -> bool:
-        """Whether the camera rays are made outside of the recording, since it cannot hold the sensor."""
-        # A call through a pointer sees every sensor of the process.
-        found = [sensor for loaded in loaded_scenes() for sensor in loaded.scene.sensors()]
-        seen = [self._pair.current.sensors()[request.sensor]] if request.sensors is None else found
-        return not all(map(is_recordable, seen))
+        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel
