@@ -99,12 +99,13 @@ class Options:
         }
 
 
-def open_scene(scene: Any, keys: Any, max_depth: int) -> tuple[RendererPort, tuple[str, ...]]:
+def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPort, tuple[str, ...]]:
     """The renderer port of a scene, and the keys as a tuple. Raises `InputError` where either makes no sense."""
     names = (keys,) if isinstance(keys, str) else keys
     if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
         raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
-    checks.integer("Renderer", "max_depth", max_depth, at_least=1)
+    if max_depth is not None:
+        checks.integer("Renderer", "max_depth", max_depth, at_least=1)
     keys = [name for name in names if isinstance(name, str)]
     return open_renderer(scene, max_depth, keys), tuple(names)
 

@@ -44,6 +44,7 @@ from unrender.problem.validation import (
     check_resolutions,
     check_sequence,
     check_truth,
+    longest_path,
     mesh_topology,
     open_renderer,
     renderer_notices,
@@ -71,7 +72,8 @@ class Problem(ViewLosses):
         loss: per pixel and channel; None is L2(). Or a function of an image (H, W, 3), or of an image and its reference, to a scalar, in
             Dr.Jit or PyTorch: see `losses.FunctionLoss`. The total is the sum over views of weight * mean over pixels and
             channels of mask * loss.
-        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light).
+        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light); None for that of the scene's own
+            integrator: 64 where that has no limit, 6 where there is none.
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
         name: for people; None takes the scene file's.
@@ -118,13 +120,13 @@ class Problem(ViewLosses):
         parameters: Sequence[Parameter],
         views: Sequence[View],
         loss: Loss | Callable[..., Any] | None = None,
-        max_depth: int = 6,
+        max_depth: int | None = None,
         *,
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
         surfaces: Mapping[str, Surface] | None = None,
     ):
-        self.max_depth = check_max_depth(max_depth)
+        check_max_depth(max_depth)
         self.loss = check_loss(L2() if loss is None else loss)
         self.parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         self.given_views: tuple[View, ...] = check_sequence(views, View, "views")
@@ -132,6 +134,7 @@ class Problem(ViewLosses):
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
         keys = [parameter.key for parameter in self.parameters if isinstance(parameter.key, str)]
         self.renderer: Renderer = open_renderer(scene, max_depth, keys)
+        self.max_depth: int = max_depth or longest_path(self.renderer)
         sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
         try:
             self.renderer = with_photographs(self.renderer, keys, sensors)

@@ -200,11 +200,33 @@ def camera_samples_of_many(
     return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp, weight)
 
 
-def rays(samples: CameraSamples) -> tuple[Any, Any]:
-    """`mi.RayDifferential3f` and its weight per lane."""
+def rays(samples: CameraSamples, hiding: Any = None) -> tuple[Any, Any]:
+    """`mi.RayDifferential3f` and its weight per lane; `hiding`: the scene whose emitters are left out, or None."""
     ray, weight = samples.sensor.sample_ray_differential(samples.time, 0.5, samples.position, samples.aperture)
     ray.scale_differential(samples.spp**-0.5)
-    return ray, weight if samples.weight is None else weight * samples.weight
+    weight = weight if samples.weight is None else weight * samples.weight
+    return (ray, weight) if hiding is None else _past_emitters(hiding, ray, weight)
+
+
+def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
+    """Camera rays from behind the emitters that they meet first, and their weights, 0 where they then meet nothing: `hide_emitters`."""
+
+    def passing(o: Any, active: Any, meets: Any) -> Any:
+        return active
+
+    def step(o: Any, active: Any, meets: Any) -> tuple[Any, Any, Any]:
+        onward = mi.Ray3f(ray)
+        onward.o = o
+        pi = scene.ray_intersect_preliminary(onward, coherent=True, active=active)
+        meets = dr.select(active, pi.is_valid(), meets)
+        active = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (of each lane)
+        si = pi.compute_surface_interaction(onward, mi.RayFlags.Minimal, active)
+        return dr.select(active, si.spawn_ray(onward.d).o, o), active, meets
+
+    state = mi.Point3f(ray.o), dr.full(mi.Bool, True, dr.width(ray.d)), mi.Bool(False)
+    o, _, meets = dr.while_loop(state, passing, step, label="past emitters")
+    ray.o = o
+    return ray, dr.select(meets, weight, 0)
 
 
 def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:

@@ -45,11 +45,13 @@ class LaunchSize:
         sensor: its index; of no account where each pixel has its own.
         spp: samples per pixel.
         pixels: how many.
+        hiding: whether emitters are left out where the camera sees them.
     """
 
     sensor: int
     spp: int
     pixels: int
+    hiding: bool = False
 
 
 class Pass(ABC):
@@ -81,7 +83,8 @@ class Pass(ABC):
         with dr.suspend_grad():
             for scene in self.states(pair):
                 numbers = self.numbers(sampler, size, positions)
-                ray, weight = film.rays(_camera_samples(scene, numbers, size, seed, pixels, films))
+                samples = _camera_samples(scene, numbers, size, seed, pixels, films)
+                ray, weight = film.rays(samples, scene if size.hiding else None)
                 found.append((mi.Ray3f(ray), weight))
         return found
 
@@ -116,7 +119,8 @@ class Pass(ABC):
             with dr.suspend_grad():
                 # Also where the rays are given: paths go on with the numbers after these.
                 samples = _camera_samples(scene, numbers, size, seed, pixels, films)
-                ray, ray_weight = film.rays(samples) if rays is None else (mi.Ray3f(rays[0][0]), rays[0][1])
+                made = film.rays(samples, scene if size.hiding else None) if rays is None else rays[0]
+                ray, ray_weight = mi.Ray3f(made[0]) if rays else made[0], made[1]
                 if assembly is not None:
                     ray = _posed_rays(assembly, ray, size, films)
                 if films is not None and films.which is not None and "camera" in tables:
@@ -363,19 +367,11 @@ def _camera_samples(
 
 
 def _samples_of_one(
-    cameras: Any,
-    sampler: Any,
-    size: LaunchSize,
-    seed: mi.UInt32,
-    pixels: mi.UInt32 | None,
-    films: film.Films | None,
-    copies: int = 1,
+    cameras: Any, sampler: Any, size: LaunchSize, seed: Any, pixels: Any, films: film.Films | None, copies: int = 1
 ) -> film.CameraSamples:
     timed, filters = film.open_at_different_times(cameras), None if films is None else films.filters
-    chosen = cameras[size.sensor]
-    return film.camera_samples(
-        chosen, sampler, seed, size.spp, pixels, size.pixels, copies, timed, filters, size.sensor
-    )
+    of_sensor = cameras[size.sensor], sampler, seed, size.spp, pixels, size.pixels
+    return film.camera_samples(*of_sensor, copies, timed, filters, size.sensor)
 
 
 def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tuple[Any, Any]:

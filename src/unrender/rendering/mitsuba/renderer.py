@@ -13,9 +13,10 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.camera_poses import Camera
-from unrender.rendering.mitsuba import ignored, poses
+from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
+from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -33,7 +34,7 @@ class MitsubaRenderer:
     Args:
         description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, of which there is one state
             only: no pairs.
-        max_depth: longest path in segments, >= 1.
+        max_depth: longest path in segments, >= 1; None for that of the scene's integrator (`LightPaths`).
         keys: parameters that will be asked for, if known. Spheres that these move become meshes, so that path gradients reach them.
         replaced: {id of a shape: `ReplacedMesh`}, what its mesh is to be in place of the description's.
 
@@ -43,6 +44,8 @@ class MitsubaRenderer:
     shapes that are no meshes have no path gradient.
 
     Attributes:
+        light_paths: settings of the light paths.
+        max_depth: longest path in segments.
         notices: one line for each setting of the scene that is not used.
 
     Raises `InputError` where Mitsuba refuses the description.
@@ -51,14 +54,17 @@ class MitsubaRenderer:
     def __init__(
         self,
         description: SceneDescription,
-        max_depth: int = 6,
+        max_depth: int | None = None,
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self.max_depth = max_depth
+        self._given_depth = max_depth
         self.pair = ScenePair(description, moving_targets(keys), replaced)
+        source, volumetric = self.pair.loaded().source, self.pair.volumetric
+        self.light_paths = LightPaths.of(self.pair.current, source, volumetric, max_depth)
+        self.max_depth = self.light_paths.max_depth
         self.notices = (
-            *ignored.notices(self.pair.current, self.pair.loaded().source, max_depth),
+            *self.light_paths.notices,
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         # Posed shapes live in scenes of their own, which media do not reach.
@@ -122,13 +128,13 @@ class MitsubaRenderer:
             chosen = {key: self._poses[key] for key in keys if key in self._poses}
             rest = [key for key in keys if key not in self._poses]
             self._sessions[names, wanted] = MitsubaSession(
-                self.pair, rest, chosen, wanted, self.max_depth, self._sampler, self._differential_bsdf
+                self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
         return self._sessions[names, wanted]
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
         """See `Remeshable`."""
-        return MitsubaRenderer(self.pair.description, self.max_depth, keys, self.pair.replaced | dict(meshes))
+        return MitsubaRenderer(self.pair.description, self._given_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """See `DifferentialBsdfRenderer`. Of the same scenes."""
@@ -144,7 +150,7 @@ class MitsubaRenderer:
         if self.pair.replaced:
             raise InputError("method stock: a mesh has other triangles than the scene's own")
         if self._stock is None:
-            self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.max_depth)
+            self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.light_paths)
         return self._stock
 
     def _obstacles(self, targets: set[str]) -> dict[str, str]:
@@ -171,6 +177,8 @@ class MitsubaRenderer:
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         target = moved_sensor(self.pair.loaded(), key) or moved_shape(self.pair.loaded(), key)
+        if self.light_paths.hide_emitters and (target or key in self._poses):
+            raise InputError(f"parameter {key}: the scene's hide_emitters does not go with what moves: leave it out")
         if derivatives and target and key not in self._poses and (why := self._obstacles({target})[target]):
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
         if not info.perturbable:

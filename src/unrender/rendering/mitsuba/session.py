@@ -24,6 +24,7 @@ from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
@@ -64,7 +65,7 @@ class MitsubaSession:
         poses: {key: what it stands for} of those that are poses.
         derivatives: the parameters that are leaves of the derivative graph: for all of a session or never, since recorded kernels
             would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
-        max_depth: longest path in segments.
+        paths: settings of the light paths.
         sampler: is cloned.
         differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
 
@@ -78,7 +79,7 @@ class MitsubaSession:
         keys: list[str],
         poses: dict[str, PoseKey],
         derivatives: AbstractSet[str],
-        max_depth: int,
+        paths: LightPaths,
         sampler: mi.Sampler,
         differential_bsdf: bool = False,
     ):
@@ -107,8 +108,8 @@ class MitsubaSession:
                     f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
                 )
             shapes = {moved[key] for key in everything if key not in cameras} - {""}
-            self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
-            self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
+            self._boundary = BoundaryTerm(pair, shapes, paths.max_depth) if shapes else None
+            self._camera = CameraTerm(pair, cameras, paths.max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
             self._replays = len(cameras) < len(everything)
             keys = [*keys, *(key for key in poses if key in derivatives)]
@@ -121,7 +122,7 @@ class MitsubaSession:
             share_addresses(self._posed.scenes())
         self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
-        self._max_depth, self._sampler = max_depth, sampler
+        self._light, self._sampler = paths, sampler
         self._traits = [of for key, of in traits.items() if key in derivatives]
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
@@ -135,11 +136,14 @@ class MitsubaSession:
         """The path tracer for these parameters' derivatives."""
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
-            return PathPair(self._max_depth, changing_delta=delta, differential=self._rough.differential)
+            return PathPair(
+                self._light.max_depth, self._light.rr_depth, changing_delta=delta, differential=self._rough.differential
+            )
         media = any(traits.medium for traits in self._traits)
         emission, field = self._pair.emissive, self._pair.radiance_field
         return VolumePair(
-            self._max_depth,
+            self._light.max_depth,
+            self._light.rr_depth,
             changing_delta=delta,
             differentiate_media=media,
             emission=emission,
@@ -148,16 +152,16 @@ class MitsubaSession:
 
     @cached_property
     def _geometry_kernel(self) -> Kernel:
-        return PrbKernel(self._max_depth)
+        return PrbKernel(self._light.max_depth, self._light.rr_depth)
 
     @cached_property
     def _moved_kernel(self) -> MovedPair:
-        return MovedPair(self._max_depth, shared=self._only_meshes)
+        return MovedPair(self._light.max_depth, self._light.rr_depth, shared=self._only_meshes)
 
     @cached_property
     def _unrelated_kernel(self) -> MovedPair:
         """Of equal random numbers: nothing is carried along."""
-        return MovedPair(self._max_depth, share=0.0, shared=self._only_meshes)
+        return MovedPair(self._light.max_depth, self._light.rr_depth, share=0.0, shared=self._only_meshes)
 
     # ------------------------------------------------------------------ rendering
 
@@ -296,7 +300,7 @@ class MitsubaSession:
         scene = self._pair.loaded()
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
-        task = ConnectionsPass(max(1, self._max_depth - 1))
+        task = ConnectionsPass(max(1, self._light.max_depth - 1))
         found = self._run(task, paths.request, paths.radiance, weights, noise)
         dr.eval(found)
         return connection_moments(scene.scene, *found)
@@ -359,7 +363,7 @@ class MitsubaSession:
     def _run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
         """Launch the kernel for requests of this form: traced once, replayed at each step."""
         pair = self._pair
-        size = LaunchSize(request.sensor, request.spp, self._count(request))
+        size = LaunchSize(request.sensor, request.spp, self._count(request), self._light.hide_emitters)
         several = request.sensors is not None
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
