@@ -23,6 +23,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.validation import open_renderer
 from unrender.problem.view import View
 from unrender.rendering.renderer import Renderer as RendererPort
+from unrender.rendering.renderer import format_of
 
 __all__ = ["Options", "open_scene", "problem_of"]
 
@@ -118,8 +119,12 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
         if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
             raise InputError(f"Renderer: sensor must be {have}, got {sensor!r}")
+
+    def channels(sensor: int) -> int:
+        return 1 if format_of(renderer, sensor).colour == "luminance" else 3
+
     views = [
-        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], 3), np.float32), sensor)
+        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], channels(sensor)), np.float32), sensor)
         for sensor in sensors
     ]
     name = Path(scene).stem if isinstance(scene, (str, Path)) else "scene"

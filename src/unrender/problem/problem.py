@@ -53,7 +53,7 @@ from unrender.problem.view import View
 from unrender.problem.view_checks import check_views
 from unrender.problem.view_losses import ViewLosses
 from unrender.rendering.photographs import with_photographs
-from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
+from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh, format_of
 
 __all__ = ["Bounds", "Problem"]
 
@@ -162,7 +162,7 @@ class Problem(ViewLosses):
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
-        self.views, notices = check_views(self.given_views, self.renderer.resolutions(), self.loss)
+        self.views, notices = check_views(self.given_views, self.renderer, self.loss)
         self.notices += notices
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth = self._checked_truth(truth or {})
@@ -287,8 +287,11 @@ class Problem(ViewLosses):
         shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
         renderer = self.renderer.with_meshes(shapes, [p.key for p in given])
         truth = {key: value for key, value in self.truth.items() if key not in meshes}
+        # Checked views are RGB, which films of other formats would take for theirs.
+        plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in self.views)
+        views = self.views if plain else self.given_views
         made = Problem(
-            renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
+            renderer, given, views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
         )
         made.origin, made.gatherer, made._as_given = self.origin, self.gatherer, self.as_given
         made.remeshed_from = self.remeshed_from or self

@@ -166,7 +166,7 @@ def _positions(
     u = sampler.next_2d()
     x, weight = filters.sample(u.x, pixel.x, size[0], film)
     y, of_row = filters.sample(u.y, pixel.y, size[1], film)
-    return mi.Point2f(pixel) + 0.5 + mi.Vector2f(x, y), weight * of_row
+    return mi.Point2f(pixel.x + 0.5 + x, pixel.y + 0.5 + y), weight * of_row
 
 
 def open_at_different_times(sensors: Any) -> bool:
@@ -224,8 +224,8 @@ def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
         return dr.select(active, si.spawn_ray(onward.d).o, o), active, meets
 
     state = mi.Point3f(ray.o), dr.full(mi.Bool, True, dr.width(ray.d)), mi.Bool(False)
-    o, _, meets = dr.while_loop(state, passing, step, label="past emitters")
-    ray.o = o
+    loop: Any = dr.while_loop
+    ray.o, _, meets = loop(state, passing, step, label="past emitters")
     return ray, dr.select(meets, weight, 0)
 
 

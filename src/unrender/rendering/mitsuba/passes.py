@@ -258,14 +258,17 @@ class AdjointPairPass(Pass):
 
 @dataclass(frozen=True)
 class TangentPass(Pass):
-    """Path replay forward: the squared derivative of each lane's radiance along the tangents."""
+    """Path replay forward: the squared derivative of each lane's radiance along the tangents, of each channel or of their sum by the
+    weights `combined`."""
 
+    combined: tuple[float, ...] | None = None
     needs_tangents: ClassVar[bool] = True
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """`own`: the radiance that the primal pass returned."""
         (radiance,) = own
-        return dr.square(paths.forward(radiance))
+        found = paths.forward(radiance)
+        return dr.square(found if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), found)))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["FilterSlopes", "FilterStencil", "PixelFilters", "is_box", "name"]
+__all__ = ["FilterSlopes", "FilterStencil", "PixelFilters", "has_negative_lobes", "is_box"]
 
 _BINS = 4096
 """Of equal probability, for each distance from the borders of the crop window."""
@@ -32,9 +32,11 @@ def is_box(film: Any) -> bool:
     return bool(film.rfilter().is_box_filter())
 
 
-def name(film: Any) -> str:
-    """The name of the reconstruction filter's plugin class, such as "gaussian"."""
-    return str(film.rfilter()).partition("[")[0].strip().removesuffix("Filter").lower()
+def has_negative_lobes(film: Any) -> bool:
+    """Whether pixels may be below 0."""
+    rfilter = film.rfilter()
+    radius = float(rfilter.radius())
+    return bool((_values(rfilter, -radius, radius)[1] < 0).any())
 
 
 _Kind = tuple[str, bytes, bool]

@@ -17,13 +17,14 @@ from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
 from unrender.rendering.mitsuba.light_paths import LightPaths
+from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, Space, differentiated
+from unrender.rendering.renderer import ParameterInfo, PictureFormat, ReplacedMesh, Space, differentiated
 
 __all__ = ["MitsubaRenderer"]
 
@@ -67,6 +68,7 @@ class MitsubaRenderer:
             *self.light_paths.notices,
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
+        self._formats = formats(self.pair.current.sensors())
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
@@ -76,7 +78,7 @@ class MitsubaRenderer:
             key: poses.info(pose, found[pose.target], sensors.get(pose.target)) for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
-        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}
+        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession | LuminanceSession] = {}
         self._stock: StockSession | None = None
         self._differential_bsdf, self._differential = False, None
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
@@ -96,6 +98,10 @@ class MitsubaRenderer:
         """(height, width) of each sensor's film, after cropping."""
         return self.pair.resolutions
 
+    def formats(self) -> list[PictureFormat]:
+        """See `WithFormats.formats`."""
+        return self._formats
+
     def cameras(self) -> Mapping[int, Camera]:
         """See `WithCameras.cameras`."""
         found = {}
@@ -112,7 +118,7 @@ class MitsubaRenderer:
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> MitsubaSession:
+    ) -> MitsubaSession | LuminanceSession:
         """The session for these parameters: see `Renderer.prepare`. Sessions are kept, so that asking again costs nothing.
 
         Poses and other parameters that move geometry cannot be prepared together: the scenes that posed shapes live in are not rebuilt.
@@ -127,9 +133,11 @@ class MitsubaRenderer:
         if (names, wanted) not in self._sessions:
             chosen = {key: self._poses[key] for key in keys if key in self._poses}
             rest = [key for key in keys if key not in self._poses]
-            self._sessions[names, wanted] = MitsubaSession(
+            session = MitsubaSession(
                 self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
+            grey = self._formats[0].colour == "luminance"
+            self._sessions[names, wanted] = LuminanceSession(session) if grey else session
         return self._sessions[names, wanted]
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
@@ -149,6 +157,10 @@ class MitsubaRenderer:
         """See `StockRenderer.stock`."""
         if self.pair.replaced:
             raise InputError("method stock: a mesh has other triangles than the scene's own")
+        if any(form.colour == "xyz" for form in self._formats):
+            raise InputError(
+                "method stock: a film has the pixel_format xyz, which it would compare with RGB: give it rgb"
+            )
         if self._stock is None:
             self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.light_paths)
         return self._stock

@@ -265,9 +265,12 @@ class MitsubaSession:
         self._run(AdjointPairPass(), request, *states)
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
-    def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
+    def tangent_moment(
+        self, parameters: Tree, paths: Paths, tangents: Tree, combined: tuple[float, ...] | None = None
+    ) -> mi.TensorXf:
         """Path replay in forward mode: the squared derivative of each path along the tangents, and where shapes move the squared boundary
-        derivative of its pixel. See `RenderSession.tangent_moment`."""
+        derivative of its pixel. See `RenderSession.tangent_moment`; `combined`: weights of the channels in a sum to square, None for each.
+        """
         self._check_keys(parameters)
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
@@ -275,12 +278,12 @@ class MitsubaSession:
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded().set_tangents(rest, tangents, self._attached)
         self._set_poses(parameters)
-        squares = self._run(TangentPass(), paths.request, paths.radiance)
+        squares = self._run(TangentPass(combined), paths.request, paths.radiance)
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
         if self._boundary is not None:
             moments += mi.TensorXf(
-                self._boundary.tangent_moment(self._pair.loaded(), paths.request).array, moments.shape[1:]
+                self._boundary.tangent_moment(self._pair.loaded(), paths.request, combined).array, moments.shape[1:]
             )
         return moments if paths.request.groups > 1 else moments[0]
 
@@ -308,9 +311,8 @@ class MitsubaSession:
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """See `CountingSession.vertices`."""
         self._set_parameters(parameters)
-        found = self._run(VerticesPass(), replace(request, groups=1))
-        dr.eval(found)
-        return self._develop(found, replace(request, groups=1))[0]
+        request = replace(request, groups=1)
+        return self._develop(self._run(VerticesPass(), request), request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""

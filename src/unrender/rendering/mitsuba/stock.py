@@ -58,6 +58,8 @@ class StockSession:
         channels = image.shape[2]
         if channels in (2, 4):  # a film with alpha, which references have not
             image = image[:, :, : channels - 1]
+        if channels <= 2:  # of luminance, in all three channels
+            image = image * dr.ones(mi.TensorXf, (1, 1, 3))
         seen = mi.TensorXf(dr.detach(image))
         dr.backward(dr.sum(image * weigh(seen), axis=None))
         gradient = scene.take_gradients()
