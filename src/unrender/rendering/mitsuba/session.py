@@ -312,7 +312,9 @@ class MitsubaSession:
         """See `CountingSession.vertices`."""
         self._set_parameters(parameters)
         request = replace(request, groups=1)
-        return self._develop(self._run(VerticesPass(), request), request)[0]
+        found = self._run(VerticesPass(), request)
+        dr.eval(found)
+        return self._develop(found, request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
