@@ -16,6 +16,7 @@ from unrender.rendering.camera_poses import Camera
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle
+from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
@@ -59,13 +60,14 @@ class MitsubaRenderer:
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self._given_depth = max_depth
+        self._given_depth, keys = max_depth, tuple(keys)
         self.pair = ScenePair(description, moving_targets(keys), replaced)
         source, volumetric = self.pair.loaded().source, self.pair.volumetric
         self.light_paths = LightPaths.of(self.pair.current, source, volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
         self.notices = (
             *self.light_paths.notices,
+            *merge_notices(keys, self.pair.loaded().equal),
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         self._formats = formats(self.pair.current.sensors())
