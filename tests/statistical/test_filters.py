@@ -26,12 +26,12 @@ WIDTH, HEIGHT = 8, 6
 
 
 def wall(rfilter: dict[str, Any], **film: Any) -> Callable[[], dict[str, Any]]:
-    """A chequered wall under an even sky, which the picture's borders cut."""
+    """A painted wall under an even sky, which the picture's borders cut: no pixel is nearly without noise."""
 
     def described() -> dict[str, Any]:
-        picture = np.random.default_rng(1).random((7, 9, 3)).astype(np.float32) ** 2
+        picture = np.random.default_rng(1).random((17, 19, 3)).astype(np.float32) ** 2
         texture = {
-            "type": "bitmap", "filter_type": "nearest", "raw": True, "format": "variant", "data": mi.TensorXf(picture),
+            "type": "bitmap", "raw": True, "format": "variant", "data": mi.TensorXf(picture),
         }  # fmt: skip
         place = mi.ScalarTransform4f().look_at(origin=[0.3, 0, 4], target=[0.3, 0, 0], up=[0, 1, 0])
         size = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT}
@@ -40,7 +40,11 @@ def wall(rfilter: dict[str, Any], **film: Any) -> Callable[[], dict[str, Any]]:
             "integrator": {"type": "path", "max_depth": DEPTH},
             "sensor": {"type": "perspective", "fov": 35, "to_world": place, "film": size | film | {"rfilter": rfilter}},
             "sky": {"type": "constant"},
-            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}},
+            "wall": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(3),
+                "bsdf": {"type": "diffuse", "reflectance": texture},
+            },
         }
 
     return described
