@@ -95,7 +95,9 @@ def build_problem(name: str, specification: Specification) -> Problem:
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
     """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    The film's reconstruction filter. `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
+    By the film's reconstruction filter.
+
+    `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
     in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:

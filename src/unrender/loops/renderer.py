@@ -47,8 +47,8 @@ class Renderer:
         gradient = renderer.backward(derivative)
 
     `parameters` is {key: array}: a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`; or the array itself where there is one key.
-    Images are linear RGB with the film's reconstruction filter; gradients have the types of the parameters. What a step renders is a function of the
-    parameters and of `seed`, and each step draws anew.
+    Images are linear RGB with the film's reconstruction filter; gradients have the types of the parameters. What a step renders is a
+    function of the parameters and of `seed`, and each step draws anew.
 
     Image and adjoint come from independent samples. With `groups=1` the image is (H, W, 3), and the adjoint has paths of its own: three
     traces a step, as in `mi.render`. With `groups` of 2 or more the image is (groups, H, W, 3), each from the samples of all *other*
