@@ -81,9 +81,9 @@ def export(
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
-    integrator is `path`, or `volpath` where there are participating media, with the problem's depth; every film keeps its
-    reconstruction filter. Sensors come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not have, only the
-    recovered values are written.
+    integrator is `path`, or `volpath` where there are participating media, with the problem's depth; every film keeps its reconstruction
+    filter. Sensors come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not
+    have, only the recovered values are written.
 
     The other formats take meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
     the cameras; what they cannot take is a notice.
