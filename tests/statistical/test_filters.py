@@ -69,7 +69,7 @@ def theirs(described: Callable[[], dict[str, Any]], shift: Any = None) -> np.nda
     """(RUNS, H, W, 3) by `mi.render`; `shift` is added to the texture."""
     scene = mi.load_dict(described())
     if shift is not None:
-        parameters = mi.traverse(scene)
+        parameters: Any = mi.traverse(scene)
         parameters[KEY] = mi.TensorXf(parameters[KEY] + mi.TensorXf(shift.astype(np.float32)))
         parameters.update()
     return np.array([np.array(mi.render(scene, spp=SPP, seed=run)) for run in range(RUNS)], float)
