@@ -1,4 +1,4 @@
-"""Settings of a scene that are not used are told, and only those."""
+"""Settings of a scene are used; those that are not are told, and only those."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ BOX = '<rfilter type="box"/>'
 KEY = "lamp.emitter.radiance.value"
 
 
-def notices(scene: Any, max_depth: int = 6) -> list[str]:
-    view = ur.View(np.full((4, 4, 3), 0.5, np.float32))
-    return ur.Problem(scene, [ur.Parameter(KEY)], [view], max_depth=max_depth).notices
+def problem(scene: Any, max_depth: int | None = 6) -> ur.Problem:
+    return ur.Problem(scene, [ur.Parameter(KEY)], [ur.View(np.full((4, 4, 3), 0.5, np.float32))], max_depth=max_depth)
+
+
+def notices(scene: Any, max_depth: int | None = 6) -> list[str]:
+    return problem(scene, max_depth).notices
 
 
 def xml(folder: Path, integrator: str = "", film: str = BOX) -> Path:
@@ -45,13 +48,10 @@ def test_nothing_is_said_of_a_scene_whose_settings_are_used(tmp_path: Path) -> N
             '<integrator type="path"/>',
             "integrator (PathIntegrator, max_depth unlimited) is not used: paths have up to 6",
         ),
-        ('<integrator type="direct"/>', "integrator (DirectIntegrator"),
+        ('<integrator type="direct"/>', "integrator (DirectIntegrator, max_depth 2) is not used"),
+        ('<integrator type="depth"/>', "integrator (DepthIntegrator) is not used"),
+        ('<integrator type="ptracer"/>', "integrator (ParticleTracerIntegrator, max_depth unlimited) is not used"),
         ('<integrator type="path"><integer name="max_depth" value="3"/></integrator>', "max_depth 3) is not used"),
-        (
-            '<integrator type="path"><integer name="max_depth" value="6"/>'
-            '<boolean name="hide_emitters" value="true"/></integrator>',
-            "hide_emitters is not used",
-        ),
     ],
 )
 def test_an_integrator_that_is_not_used_is_told(tmp_path: Path, integrator: str, words: str) -> None:
@@ -60,24 +60,71 @@ def test_an_integrator_that_is_not_used_is_told(tmp_path: Path, integrator: str,
     assert "\n" not in line
 
 
-def test_a_reconstruction_filter_is_told_also_the_default_one(tmp_path: Path) -> None:
-    for film in ("", '<rfilter type="gaussian"/>'):
-        (line,) = notices(xml(tmp_path, film=film))
-        assert "reconstruction filter (gaussian) is not used" in line
+@pytest.mark.parametrize(
+    ("integrator", "depth"),
+    [
+        ("", 6),
+        ('<integrator type="direct"/>', 2),
+        ('<integrator type="direct_projective"/>', 2),
+        ('<integrator type="prb_basic"/>', 6),
+        ('<integrator type="prb_projective"><integer name="max_depth" value="3"/></integrator>', 3),
+        ('<integrator type="volpath"><integer name="max_depth" value="9"/></integrator>', 9),
+        ('<integrator type="volpathmis"><integer name="max_depth" value="9"/></integrator>', 9),
+        ('<integrator type="prbvolpath"><integer name="max_depth" value="5"/></integrator>', 5),
+        (
+            '<integrator type="aov"><string name="aovs" value="d:depth"/>'
+            '<integrator type="path"><integer name="max_depth" value="4"/></integrator></integrator>',
+            4,
+        ),
+    ],
+)
+def test_the_scene_s_integrator_decides_the_depth_where_none_is_given(
+    tmp_path: Path, integrator: str, depth: int
+) -> None:
+    made = problem(xml(tmp_path, integrator), None)
+    assert made.max_depth == depth
+    assert made.notices == []
 
 
-def test_a_dictionary_tells_the_same() -> None:
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+def test_a_path_without_a_limit_has_a_documented_one(tmp_path: Path) -> None:
+    made = problem(xml(tmp_path, '<integrator type="path"/>'), None)
+    assert made.max_depth == 64
+    (line,) = made.notices
+    assert "no limit of depth: paths have up to 64 segments" in line
+
+
+def test_reconstruction_filters_and_hidden_emitters_are_used(tmp_path: Path) -> None:
+    for film in ("", '<rfilter type="gaussian"/>', '<rfilter type="lanczos"/>'):
+        assert notices(xml(tmp_path, film=film)) == []
+    hidden = '<integrator type="path"><integer name="max_depth" value="6"/><boolean name="hide_emitters" value="true"/></integrator>'
+    made = problem(xml(tmp_path, hidden))
+    assert made.notices == []
+    assert not ur.render(made, spp=4).any()
+
+
+def test_hidden_emitters_beside_what_moves_are_refused() -> None:
     scene = {
         "type": "scene",
-        "camera": {"type": "perspective", "film": film},
+        "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "integrator": {"type": "path", "hide_emitters": True},
+        "wall": {"type": "rectangle"},
         "lamp": {"type": "sphere", "emitter": {"type": "area"}},
-        "integrator": {"type": "path", "max_depth": 6, "hide_emitters": True},
     }
-    (line,) = notices(scene)
-    assert "hide_emitters is not used" in line
-    scene["integrator"]["hide_emitters"] = False
-    assert notices(scene) == []
+    made = ur.Problem(scene, [ur.Parameter("wall.translation")], [ur.View(np.zeros((4, 4, 3)))])
+    with pytest.raises(ur.InputError, match="hide_emitters does not go with what moves"):
+        ur.estimate(made, ur.PathGradient())
+
+
+def test_hidden_emitters_beside_media_are_refused() -> None:
+    scene = {
+        "type": "scene",
+        "camera": {"type": "perspective"},
+        "integrator": {"type": "volpath", "hide_emitters": True},
+        "fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
+        "lamp": {"type": "sphere", "emitter": {"type": "area"}},
+    }
+    with pytest.raises(ur.InputError, match="hide_emitters does not go with participating media"):
+        notices(scene)
 
 
 def test_an_object_without_an_id_in_a_file_is_named_as_such(tmp_path: Path) -> None:

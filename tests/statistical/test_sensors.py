@@ -189,7 +189,7 @@ def test_sensors_that_no_recording_may_hold(name: str, monkeypatch: pytest.Monke
     weight = renderer.array(np.random.default_rng(1).uniform(0.5, 1.5, theirs[:1].shape))
     recorded = session.adjoint(current, session.image(current, request).paths, weight)[KEY]
     assert not warned
-    monkeypatch.setattr("unrender.rendering.mitsuba.session.is_recordable", lambda sensor: True)
+    monkeypatch.setattr("unrender.rendering.mitsuba.session.are_recordable", lambda *given: True)
     traced = MitsubaRenderer(scene, DEPTH).prepare([KEY], None)
     traced._recordable = False
     expected = traced.adjoint(current, traced.image(current, request).paths, weight)[KEY]

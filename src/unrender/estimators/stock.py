@@ -36,7 +36,7 @@ class StockGradient:
     """The gradient of a stock Mitsuba loop: `mi.render` of each view, the loss, `dr.backward`; image and adjoint from independent
     samples. With `optimizers.Adam`, whose steps are those of `mi.ad.Adam`, it is the loop of Mitsuba's tutorials.
 
-    The scene's film has its own reconstruction filter here, where all else in `unrender` has a box filter. Renderers other than
+    Neighbouring pixels share samples here, as in Mitsuba's film; everywhere else in `unrender` each has its own. Renderers other than
     Mitsuba's answer with `PathGradient(spp=spp, adjoint_spp=spp)`, which estimates the same from the same number of samples.
 
     Unbiased for a loss whose derivative is linear in the image; otherwise biased by the image's noise.

@@ -99,10 +99,18 @@ class SceneGraph:
 
     def child(self, parent: int, kind: Any, plugin: str) -> Any:
         """The properties of the child of that kind of object, emptied, of that plugin; a new one where there is none."""
-        index = next((i for i in self.children(parent).values() if self.nodes[i].type == kind), None)
+        index = self.descendant(parent, kind)
         if index is None:
             return self.nodes[self.add(parent, plugin, kind, plugin)].props
         return self.replace(index, plugin)
+
+    def descendant(self, parent: int, *kinds: Any) -> int | None:
+        """The child of a kind of object, its child of the next kind, and so on; None where one is missing."""
+        found: int | None = parent
+        for kind in kinds:
+            if found is not None:
+                found = next((i for i in self.children(found).values() if self.nodes[i].type == kind), None)
+        return found
 
     def of(self, kind: Any) -> list[int]:
         """The children of the scene that are of a kind of object."""

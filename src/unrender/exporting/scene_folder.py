@@ -82,9 +82,9 @@ def export(
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
-    integrator is `path`, or `volpath` where there are participating media, with the problem's depth, every film has a box filter. Sensors
-    come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not have, only the
-    recovered values are written.
+    integrator is `path`, or `volpath` where there are participating media, with the problem's depth; every film keeps its reconstruction
+    filter. Sensors come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not
+    have, only the recovered values are written.
 
     The other formats take meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
     the cameras; what they cannot take is a notice.
@@ -189,7 +189,7 @@ def _fill(
         except InputError as error:
             raise InputError(f"parameter {key} cannot be exported: {error}") from error
     posed = [_move(graph, target, matrix) for target, matrix in poses.matrices(scene, moved).items()]
-    _set_up_rendering(graph, "volpath" if renderer.pair.volumetric else "path", max_depth, spp)
+    _set_up_rendering(graph, renderer, max_depth, spp)
     _gather_files(graph, folder)
     path = folder / SCENE
     path.write_bytes(graph.xml())
@@ -217,13 +217,17 @@ def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
     return index
 
 
-def _set_up_rendering(graph: SceneGraph, integrator: str, max_depth: int, spp: int) -> None:
-    """What the run's pictures were rendered with: paths of that depth, independent samples, pixels without a filter."""
-    graph.child(0, mi.ObjectType.Integrator, integrator)["max_depth"] = max_depth
+def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: int, spp: int) -> None:
+    """What the run's pictures were rendered with: paths of that depth, independent samples, the films' own filters."""
+    integrator = graph.child(0, mi.ObjectType.Integrator, "volpath" if renderer.pair.volumetric else "path")
+    integrator["max_depth"], integrator["rr_depth"] = max_depth, renderer.light_paths.rr_depth
+    if renderer.light_paths.hide_emitters:
+        integrator["hide_emitters"] = True
     films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
     for index in graph.of(mi.ObjectType.Sensor):
         graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
         film = films[f"n{index}"]
+        rfilter = graph.descendant(index, mi.ObjectType.Film, mi.ObjectType.ReconstructionFilter)
         props = graph.child(index, mi.ObjectType.Film, "hdrfilm")
         for axis, (size, part, offset) in enumerate(
             (("width", "crop_width", "crop_offset_x"), ("height", "crop_height", "crop_offset_y"))
@@ -232,8 +236,9 @@ def _set_up_rendering(graph: SceneGraph, integrator: str, max_depth: int, spp: i
             if tuple(film.size()) != tuple(film.crop_size()):
                 props[part], props[offset] = int(film.crop_size()[axis]), int(film.crop_offset()[axis])
         props["pixel_format"], props["component_format"] = "rgb", "float32"
-        node = next(i for i in graph.children(index).values() if graph.nodes[i].type == mi.ObjectType.Film)
-        graph.child(node, mi.ObjectType.ReconstructionFilter, "box")
+        props["sample_border"] = bool(film.sample_border())
+        if rfilter is not None:
+            props["rfilter"] = mi.Properties.ResolvedReference(rfilter)
 
 
 def _gather_files(graph: SceneGraph, folder: Path) -> None:

@@ -23,6 +23,7 @@ from unrender.backend import cache
 from unrender.backend.variant import current, llvm_version
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
+from unrender.rendering.mitsuba.pixel_filter import is_box
 
 __all__ = ["digest", "recall"]
 
@@ -69,6 +70,7 @@ def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
         spp,
         max_depth,
         _SAMPLER.sub("", _ADDRESS.sub("", str(scene))),
+        *(["filtered"] if not is_box(scene.sensors()[sensor].film()) else []),
     ]
     state.update("\n".join(map(str, facts)).encode())
     parameters = mi.traverse(scene)

@@ -19,6 +19,7 @@ from unrender.problem.parameter import Parameter
 from unrender.problem.problem import Problem
 from unrender.problem.view import View
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
 
@@ -94,7 +95,9 @@ def build_problem(name: str, specification: Specification) -> Problem:
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
     """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
 
-    Box filter. `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
+    By the film's reconstruction filter.
+
+    `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
     in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:
@@ -117,7 +120,9 @@ def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable
     total, done = np.zeros((height, width, 3)), 0
     while done < spp:
         seed = _REFERENCE.fold(sensor).fold(done).uint32()
-        samples = film.camera_samples(camera, sampler, mi.UInt32(seed), take, None, width * height)
+        samples = film.camera_samples(
+            camera, sampler, mi.UInt32(seed), take, None, width * height, filters=PixelFilters.of([camera])
+        )
         ray, weight = film.rays(samples)
         radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
         radiance *= weight

@@ -35,7 +35,7 @@ class Denoised:
     Image and adjoint stay independent: for each sample group, the image of all *other* groups is denoised by itself, so that no adjoint
     is weighted by an image of its own samples. Each is a call of the denoiser, so there are fewer groups than elsewhere.
 
-    Every film of `unrender` has a box filter, which denoisers need: with a wider one neighbouring pixels share samples, and their
+    Every pixel of `unrender` has samples of its own, which denoisers need: where neighbouring pixels share samples, their
     correlated noise is taken for texture.
 
     Args:

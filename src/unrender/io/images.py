@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size
 
-__all__ = ["READABLE", "Picture", "luminance", "read", "resize", "srgb_to_linear"]
+__all__ = ["READABLE", "Picture", "luminance", "read", "resize", "srgb_to_linear", "xyz_to_rgb"]
 
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name endings that `read` knows."""
@@ -26,19 +26,23 @@ class Picture:
     Attributes:
         values: (H, W, C) float32, C in {1, 3}.
         notice: one line on what was done to the values, "" if they were taken as they are.
+        alpha: (H, W) float32 in [0, 1], of integer values that are not opaque everywhere, where it was asked for; else None.
     """
 
     values: np.ndarray
     notice: str = ""
+    alpha: np.ndarray | None = None
 
 
-def read(source: Any, linearise: bool = True) -> Picture:
+def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tuple[int, ...] = (1, 3, 4)) -> Picture:
     """The picture in a file or an array.
 
     Args:
-        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Alpha is dropped.
+        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). The alpha of floating-point values is dropped.
             Floating-point values are linear; 8- and 16-bit integers are taken as sRGB in [0, 1].
         linearise: whether to undo the sRGB curve of 8- and 16-bit values; masks want them as they are.
+        alpha: whether to keep the alpha of 8- and 16-bit values.
+        channels: numbers of channels that arrays may have; of 2 the second is alpha.
 
     Raises:
         InputError: no such file, unreadable, of another shape, or not finite.
@@ -51,16 +55,19 @@ def read(source: Any, linearise: bool = True) -> Picture:
             raise InputError(f"{path}: unknown kind of picture, expected one of {', '.join(READABLE)}")
         try:
             numpy_file = path.suffix.lower() == ".npy"
-            picture = _from_array(bounded_files.read_array(path), linearise) if numpy_file else _read(path, linearise)
+            if numpy_file:
+                picture = _from_array(bounded_files.read_array(path), linearise, alpha, channels)
+            else:
+                picture = _read(path, linearise, alpha)
             _check_finite(picture.values)
         except InputError as error:
             raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-        return Picture(picture.values, f"{path.name}: {picture.notice}" if picture.notice else "")
+        return replace(picture, notice=f"{path.name}: {picture.notice}" if picture.notice else "")
     try:
         array = np.asarray(source)
     except (TypeError, ValueError) as error:
         raise InputError(f"expected a file or an array, got {type(source).__name__}") from error
-    picture = _from_array(array, linearise)
+    picture = _from_array(array, linearise, alpha, channels)
     _check_finite(picture.values)
     return picture
 
@@ -94,7 +101,13 @@ def luminance(values: np.ndarray) -> np.ndarray:
     return (values @ np.array([0.212671, 0.715160, 0.072169], np.float32))[..., None]
 
 
-def _read(path: Path, linearise: bool) -> Picture:
+def xyz_to_rgb(values: np.ndarray) -> np.ndarray:
+    """(..., 3) CIE XYZ to linear sRGB, by the matrix that Mitsuba has."""
+    matrix = [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
+    return values @ np.array(matrix, np.float32).T
+
+
+def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
     image_size.check(path)
     variant.ensure()
     import mitsuba as mi
@@ -121,7 +134,14 @@ def _read(path: Path, linearise: bool) -> Picture:
     values = values.reshape(*values.shape[:2], -1)
     if not told:
         return Picture(values)
-    return Picture(values, f"{bits}-bit sRGB, linearised{', its alpha left out' if transparent else ''}")
+    coverage = _coverage(stored[..., -1]) if transparent and alpha else None
+    told = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
+    return Picture(values, f"{bits}-bit sRGB, linearised{told}", coverage)
+
+
+def _coverage(stored: np.ndarray) -> np.ndarray:
+    """Of integer alpha, in [0, 1]."""
+    return (stored / np.float32(np.iinfo(stored.dtype).max)).astype(np.float32)
 
 
 def _colour_channels(bitmap: Any) -> np.ndarray:
@@ -132,22 +152,26 @@ def _colour_channels(bitmap: Any) -> np.ndarray:
     return np.array(bitmap)[..., [names.index(name) for name in "RGB"]].astype(np.float32)
 
 
-def _from_array(array: np.ndarray, linearise: bool) -> Picture:
+def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple[int, ...]) -> Picture:
     if array.dtype == object or not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
         raise InputError(f"expected an array of numbers, got {array.dtype}")
     if np.iscomplexobj(array):
         raise InputError("expected an array of real numbers, got complex ones")
     if array.ndim == 2:
         array = array[..., None]
-    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or 0 in array.shape:
-        raise InputError(f"expected an array of shape (H, W, 3), got {array.shape}")
-    values = array[..., :3]
+    if array.ndim != 3 or array.shape[2] not in channels or 0 in array.shape:
+        kind = "(H, W, 3)" if 3 in channels else "(H, W) or (H, W, 1)"
+        raise InputError(f"expected an array of shape {kind}, got {array.shape}")
+    values = array[..., : 1 if array.shape[2] == 2 else 3]
     if array.dtype in (np.uint8, np.uint16):
         bits = 8 * array.dtype.itemsize
         values = values.astype(np.float64) / (2**bits - 1)
         if not linearise:
             return Picture(values.astype(np.float32))
-        return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised")
+        transparent = array.shape[2] in (2, 4) and bool((array[..., -1] < 2**bits - 1).any())
+        coverage = _coverage(array[..., -1]) if alpha and transparent else None
+        told = ", its alpha taken as mask" if coverage is not None else ""
+        return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{told}", coverage)
     with np.errstate(over="ignore"):
         return Picture(np.ascontiguousarray(values, dtype=np.float32))
 

@@ -23,6 +23,7 @@ from unrender.problem.problem import Problem
 from unrender.problem.validation import open_renderer
 from unrender.problem.view import View
 from unrender.rendering.renderer import Renderer as RendererPort
+from unrender.rendering.renderer import format_of
 
 __all__ = ["Options", "open_scene", "problem_of"]
 
@@ -99,12 +100,13 @@ class Options:
         }
 
 
-def open_scene(scene: Any, keys: Any, max_depth: int) -> tuple[RendererPort, tuple[str, ...]]:
+def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPort, tuple[str, ...]]:
     """The renderer port of a scene, and the keys as a tuple. Raises `InputError` where either makes no sense."""
     names = (keys,) if isinstance(keys, str) else keys
     if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
         raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
-    checks.integer("Renderer", "max_depth", max_depth, at_least=1)
+    if max_depth is not None:
+        checks.integer("Renderer", "max_depth", max_depth, at_least=1)
     keys = [name for name in names if isinstance(name, str)]
     return open_renderer(scene, max_depth, keys), tuple(names)
 
@@ -117,8 +119,12 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
         if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
             raise InputError(f"Renderer: sensor must be {have}, got {sensor!r}")
+
+    def channels(sensor: int) -> int:
+        return 1 if format_of(renderer, sensor).colour == "luminance" else 3
+
     views = [
-        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], 3), np.float32), sensor)
+        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], channels(sensor)), np.float32), sensor)
         for sensor in sensors
     ]
     name = Path(scene).stem if isinstance(scene, (str, Path)) else "scene"

@@ -26,6 +26,7 @@ from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.problem.problem import Problem
 from unrender.problem.render import render as render_view
+from unrender.problem.validation import longest_path
 
 __all__ = ["Renderer"]
 
@@ -47,8 +48,8 @@ class Renderer:
         gradient = renderer.backward(derivative)
 
     `parameters` is {key: array}: a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`; or the array itself where there is one key.
-    Images are linear RGB with a box filter; gradients have the types of the parameters. What a step renders is a function of the
-    parameters and of `seed`, and each step draws anew.
+    Images are linear RGB with the film's reconstruction filter; gradients have the types of the parameters. What a step renders is a
+    function of the parameters and of `seed`, and each step draws anew.
 
     Image and adjoint come from independent samples. With `groups=1` the image is (H, W, 3), and the adjoint has paths of its own: three
     traces a step, as in `mi.render`. With `groups` of 2 or more the image is (groups, H, W, 3), each from the samples of all *other*
@@ -77,7 +78,7 @@ class Renderer:
         sensor: index of the scene's sensor, whose image a call returns; or several, for a tuple of images.
         references: for guided mini-batches alone: the image that the sensor should see, file or (H, W, 3); of several sensors, a list.
         loss: for guided mini-batches alone: one of `unrender.losses`, near to the loop's own; None is L2. Neither biases the gradient.
-        max_depth: longest light path in segments, >= 1.
+        max_depth: longest light path in segments, >= 1; None for that of the scene's own integrator.
         seed: of all random numbers, >= 0.
 
     Attributes:
@@ -101,7 +102,7 @@ class Renderer:
         sensor: int | Sequence[int] = 0,
         references: Any = None,
         loss: Loss | None = None,
-        max_depth: int = 6,
+        max_depth: int | None = None,
         seed: int = 0,
     ):
         port, names = open_scene(scene, keys, max_depth)
@@ -112,8 +113,8 @@ class Renderer:
             raise InputError(
                 f"Renderer: expected different sensors, each with a reference if any has one, got {sensor!r}"
             )
-        options = (image or Plain(), pixels or All(), spp, adjoint_spp, groups, coupled, sensors, single, max_depth)
-        self._options = Options(names, *options, seed, given, loss)
+        options = (image or Plain(), pixels or All(), spp, adjoint_spp, groups, coupled, sensors, single)
+        self._options = Options(names, *options, max_depth or longest_path(port), seed, given, loss)
         self._port, self._scene = port, scene
         self._streams: dict[str, Stream] = {}
         self._step = 0

@@ -44,6 +44,7 @@ from unrender.problem.validation import (
     check_resolutions,
     check_sequence,
     check_truth,
+    longest_path,
     mesh_topology,
     open_renderer,
     renderer_notices,
@@ -52,7 +53,7 @@ from unrender.problem.view import View
 from unrender.problem.view_checks import check_views
 from unrender.problem.view_losses import ViewLosses
 from unrender.rendering.photographs import with_photographs
-from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh
+from unrender.rendering.renderer import Remeshable, Renderer, ReplacedMesh, format_of
 
 __all__ = ["Bounds", "Problem"]
 
@@ -71,7 +72,8 @@ class Problem(ViewLosses):
         loss: per pixel and channel; None is L2(). Or a function of an image (H, W, 3), or of an image and its reference, to a scalar, in
             Dr.Jit or PyTorch: see `losses.FunctionLoss`. The total is the sum over views of weight * mean over pixels and
             channels of mask * loss.
-        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light).
+        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light); None for that of the scene's own
+            integrator: 64 where that has no limit, 6 where there is none.
         truth: {key: value} of parameters whose true value is known, to measure the error; values as for
             `Parameter.initial`.
         name: for people; None takes the scene file's.
@@ -120,13 +122,13 @@ class Problem(ViewLosses):
         parameters: Sequence[Parameter],
         views: Sequence[View],
         loss: Loss | Callable[..., Any] | None = None,
-        max_depth: int = 6,
+        max_depth: int | None = None,
         *,
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
         surfaces: Mapping[str, Surface] | None = None,
     ):
-        self.max_depth = check_max_depth(max_depth)
+        check_max_depth(max_depth)
         self.loss = check_loss(L2() if loss is None else loss)
         self.parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         self.given_views: tuple[View, ...] = check_sequence(views, View, "views")
@@ -134,6 +136,7 @@ class Problem(ViewLosses):
         self.name = name or (Path(scene).stem if isinstance(scene, (str, Path)) else "problem")
         keys = [parameter.key for parameter in self.parameters if isinstance(parameter.key, str)]
         self.renderer: Renderer = open_renderer(scene, max_depth, keys)
+        self.max_depth: int = max_depth or longest_path(self.renderer)
         sensors = [view.sensor for view in self.given_views if isinstance(view.sensor, int)]
         try:
             self.renderer = with_photographs(self.renderer, keys, sensors)
@@ -162,7 +165,7 @@ class Problem(ViewLosses):
         self.notices = list(renderer_notices(self.renderer))
         self.notices += [notice for found in checked.values() for notice in found.notices]
         self.notices += [line for key, mesh in meshes.items() for line in mesh_notices(key, *mesh)]
-        self.views, notices = check_views(self.given_views, self.renderer.resolutions(), self.loss)
+        self.views, notices = check_views(self.given_views, self.renderer, self.loss)
         self.notices += notices
         check_loss_function(self.loss, np.asarray(self.views[0].reference))
         self.truth = self._checked_truth(truth or {})
@@ -266,8 +269,11 @@ class Problem(ViewLosses):
         shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
         renderer = self.renderer.with_meshes(shapes, [p.key for p in given])
         truth = {key: value for key, value in self.truth.items() if key not in meshes}
+        # Checked views are RGB, which films of other formats would take for theirs.
+        plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in self.views)
+        views = self.views if plain else self.given_views
         made = Problem(
-            renderer, given, self.views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
+            renderer, given, views, self.loss, self.max_depth, truth=truth, name=self.name, surfaces=self.surfaces
         )
         made.origin, made.executor = self.origin, self.executor
         made.remeshed_from = self.remeshed_from or self

@@ -30,7 +30,7 @@ def render(
     spp: int = 64,
     seed: int = 0,
 ) -> np.ndarray:
-    """Render one view, in as many passes as memory requires. Unbiased; box filter.
+    """Render one view, in as many passes as memory requires. Unbiased, with the film's reconstruction filter.
 
     Args:
         problem: whose scene.
@@ -83,7 +83,7 @@ def render_pair(
     spp: int,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both images of view 0, on one set of paths traced in the current state. Each unbiased; box filter.
+    """Both images of view 0, on one set of paths traced in the current state. Each unbiased.
 
     Args:
         problem: whose scene; its parameters must share paths (`ParameterInfo.shares_paths`).

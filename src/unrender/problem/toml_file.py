@@ -2,7 +2,7 @@
 
     name = "wall"
     scene = "room.xml"
-    max_depth = 6
+    max_depth = 6                              # left out: that of the scene's integrator
     loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors" }
 
     [[parameters]]
@@ -91,7 +91,7 @@ class _Problem(Table):
     parameters: list[_Parameter] = Field(description="at least one [[parameters]] table", min_length=1)
     views: list[_View] = Field(description="at least one [[views]] table", min_length=1)
     name: StrictStr | None = Field(None, description="a string of at most 200 characters", max_length=200)
-    max_depth: StrictInt = Field(6, description="a whole number of at least 1")
+    max_depth: StrictInt | None = Field(None, description="a whole number of at least 1")
     loss: StrictStr | dict[str, Any] = Field(
         "L2", description='a name such as "L1", or a table such as { type = "Huber", delta = 0.1 }'
     )

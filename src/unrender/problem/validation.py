@@ -28,6 +28,7 @@ from unrender.problem.key_hints import instead_of, near_key
 from unrender.problem.mesh_checks import check_regularizer
 from unrender.problem.mesh_regularizer import MeshRegularizer
 from unrender.problem.parameter import Parameter
+from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
 __all__ = [
@@ -103,15 +104,21 @@ class CheckedParameter:
     notices: tuple[str, ...]
 
 
-def check_max_depth(max_depth: Any) -> int:
-    """Raise `FieldError` for what is no longest path length."""
+def check_max_depth(max_depth: Any) -> None:
+    """Raise `FieldError` for what is neither a longest path length nor None."""
+    if max_depth is None:
+        return
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-        hint = "; Mitsuba's -1, no limit, is a number that light hardly reaches, such as 32" if max_depth == -1 else ""
+        hint = "; Mitsuba's -1, no limit, is a number that light hardly reaches, such as 64" if max_depth == -1 else ""
         given = shorten(repr(max_depth), 60)
         raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {given}{hint}")
     if max_depth > _DEEPEST:
         raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(max_depth), 60)}")
-    return max_depth
+
+
+def longest_path(renderer: Renderer) -> int:
+    """The longest light path of a renderer in segments; 6 of one that does not tell."""
+    return int(getattr(scene_renderer(renderer), "max_depth", 6))
 
 
 def check_loss(loss: Any) -> Loss:
@@ -316,7 +323,7 @@ def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tup
         raise FieldError(("truth", key), str(error)) from error
 
 
-def open_renderer(scene: Any, max_depth: int, keys: Iterable[str] = ()) -> Renderer:
+def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
     """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. `keys`:
     parameters that will be asked for. Raises `FieldError`."""
     if isinstance(scene, _Renderer) and not isinstance(scene, type):

@@ -13,9 +13,12 @@ from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.losses import Censored, Loss
 from unrender.problem.errors import FieldError
+from unrender.problem.reference_formats import read_reference
 from unrender.problem.references import ON_DEVICE
 from unrender.problem.validation import is_number
 from unrender.problem.view import View
+from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.renderer import Renderer, format_of
 
 __all__ = ["check_views"]
 
@@ -23,28 +26,27 @@ _WHITE = 0.001
 """Share of saturated pixels that is told."""
 
 
-def check_views(
-    given: Sequence[View], resolutions: Sequence[tuple[int, int]], loss: Loss
-) -> tuple[tuple[View, ...], list[str]]:
+def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
     """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
 
     Args:
         given: as the problem was given them.
-        resolutions: (height, width) of each sensor's film.
+        renderer: of the scene, whose films tell sizes and formats.
         loss: one that knows of saturated pixels needs no notice of them.
     """
-    found, notices = [], []
+    found, notices, resolutions = [], [], renderer.resolutions()
+    films = scene_renderer(renderer)
     known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(given):
-        view, notes = _check_view(number, one, resolutions, not isinstance(loss, Censored))
+        view, notes = _check_view(number, one, resolutions, films, not isinstance(loss, Censored))
         found.append(view if store is None else _stored(view, store))
         notices += notes
     return tuple(found), notices
 
 
 def _check_view(
-    index: int, view: View, resolutions: Sequence[tuple[int, int]], tell_saturated: bool
+    index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
 ) -> tuple[View, list[str]]:
     """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
 
@@ -52,6 +54,7 @@ def _check_view(
         index: of the view in the problem, for messages.
         view: as given.
         resolutions: (height, width) of each sensor's film.
+        films: the renderer that may tell their formats.
         tell_saturated: whether a reference with saturated pixels is worth a notice.
     """
     owner = f"view {index}"
@@ -66,21 +69,17 @@ def _check_view(
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
-    limited = None  # in values, to a white
+    limited, alpha = None, None  # in values, to a white
     try:
         if isinstance(view.reference, StoredPicture):
             _check_size(view.reference, height, width, view.sensor)
             reference = view.reference
         else:
-            image = images.read(view.reference)
-            _check_size(image.values, height, width, view.sensor)
-            notices += [f"{owner}: reference {image.notice}"] if image.notice else []
-            if image.values.shape[2] == 1:
-                notices.append(
-                    f"{owner}: reference of one channel, which red, green and blue of the image are each compared with"
-                )
-            reference = np.array(np.broadcast_to(image.values, (height, width, 3)))
-            limited = reference if image.notice else None
+            read = read_reference(view.reference, format_of(films, view.sensor))
+            reference, alpha = read.values, read.alpha
+            _check_size(reference, height, width, view.sensor)
+            notices += [f"{owner}: reference {notice}" for notice in read.notices]
+            limited = reference if read.limited else None
     except InputError as error:
         raise wrong("reference", error) from error
     mask = view.mask
@@ -95,6 +94,10 @@ def _check_view(
                 raise InputError("it is 0 everywhere: no pixel would count")
         except InputError as error:
             raise wrong("mask", error) from error
+    if alpha is not None:
+        mask = alpha if mask is None else np.asarray(mask) * alpha
+        if not mask.any():
+            raise wrong("reference", "its alpha, with the mask, is 0 everywhere: no pixel would count")
     counted = None if mask is None else np.asarray(mask) > 0
     if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
         notices.append(

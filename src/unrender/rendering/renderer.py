@@ -6,7 +6,7 @@ own (`mi.TensorXf`, `np.ndarray`); parameters are dictionaries {key: array} and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -26,6 +26,7 @@ __all__ = [
     "EmitterSession",
     "LossWeights",
     "ParameterInfo",
+    "PictureFormat",
     "Remeshable",
     "RenderSession",
     "Renderer",
@@ -35,9 +36,11 @@ __all__ = [
     "Space",
     "StockLoop",
     "StockRenderer",
+    "WithFormats",
     "counted_vertices",
     "differentiated",
     "drawing_emitters",
+    "format_of",
     "with_differential_bsdf",
 ]
 
@@ -330,6 +333,33 @@ class ReplacedMesh:
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class PictureFormat:
+    """What a film stores of its pixels.
+
+    Attributes:
+        colour: "rgb" (linear), "luminance" or "xyz". Images of the renderer are RGB; with "luminance" all three channels are the luminance.
+        signed: whether its filter has negative lobes, so that pixels may be below 0.
+    """
+
+    colour: Literal["rgb", "luminance", "xyz"] = "rgb"
+    signed: bool = False
+
+
+@runtime_checkable
+class WithFormats(Protocol):
+    """A renderer whose films have formats of their own."""
+
+    def formats(self) -> Sequence[PictureFormat]:
+        """The format of each sensor's film."""
+        ...
+
+
+def format_of(renderer: Any, sensor: int) -> PictureFormat:
+    """The format of a sensor's film; RGB where the renderer tells none."""
+    return renderer.formats()[sensor] if isinstance(renderer, WithFormats) else PictureFormat()
 
 
 @runtime_checkable

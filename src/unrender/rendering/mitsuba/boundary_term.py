@@ -15,6 +15,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
@@ -43,6 +44,8 @@ def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
 def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes know no media"
+    if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
+        return "path gradients of moving shapes do not support sample_border: leave it out of the film"
     if shape is None:
         return "path gradients do not move instances"
     if has_instances(pair.current):
@@ -93,7 +96,9 @@ class BoundaryTerm:
             if dr.grad_enabled(found):
                 dr.backward(found, dr.ADFlag.ClearInterior)
 
-    def tangent_moment(self, scene: LoadedScene, request: SampleRequest) -> mi.TensorXf:
+    def tangent_moment(
+        self, scene: LoadedScene, request: SampleRequest, combined: tuple[float, ...] | None = None
+    ) -> mi.TensorXf:
         """The squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3).
 
         Of as many samples as `accumulate` takes: their noise is part of the second moment, as it is of the gradient.
@@ -101,6 +106,7 @@ class BoundaryTerm:
         Args:
             scene: its parameters are set, and have tangents.
             request: of the rendering.
+            combined: weights of the channels in a sum that is squared in their place; None to square each.
         """
         count = math.prod(self._resolutions[request.sensor]) if request.pixels is None else dr.width(request.pixels)
         found = dr.zeros(mi.Float, 3 * count)
@@ -112,7 +118,12 @@ class BoundaryTerm:
             channel = element % 3
             of_pixel = dr.gather(mi.UInt32, view.pixels, element // 3) * 3 + channel
             into = dr.gather(mi.UInt32, view.rows, element // 3) * 3 + channel
-            dr.scatter(found, dr.square(dr.gather(mi.Float, image.array, of_pixel)), into)
+            if combined is None:
+                derivative = dr.gather(mi.Float, image.array, of_pixel)
+            else:
+                parts = [w * dr.gather(mi.Float, image.array, of_pixel - channel + c) for c, w in enumerate(combined)]
+                derivative = sum(parts[1:], parts[0])
+            dr.scatter(found, dr.square(derivative), into)
         return mi.TensorXf(found, (count, 3))
 
     @staticmethod

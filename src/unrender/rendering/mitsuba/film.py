@@ -1,7 +1,7 @@
-"""From pixels to camera rays, from path radiance back to pixels: one box filter, independent samples.
+"""From pixels to camera rays, from path radiance back to pixels: each pixel has samples of its own, drawn by the film's filter.
 
-The film's own reconstruction filter is not used. Per-pixel statistics need pixels whose samples are their own, so every
-pixel is the plain mean over its square (a box filter of one pixel).
+Per-pixel statistics need pixels whose samples are their own, so a pixel is the mean of samples that lie where its reconstruction filter
+puts them (`pixel_filter.py`); with a box filter, in its square.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 
 __all__ = [
     "CameraSamples",
@@ -93,9 +94,10 @@ class CameraSamples:
     Attributes:
         sensor: `mitsuba.Sensor`, or `mitsuba.SensorPtr` where each pixel has its own.
         time: `mi.Float`.
-        position: `mi.Point2f` on the film, in [0, 1).
+        position: `mi.Point2f` on the film, from 0 to 1; beyond where the film samples its border.
         aperture: `mi.Point2f` in [0, 1).
         spp: rays per pixel.
+        weight: `mi.Float`, of the reconstruction filter; None where all are 1.
     """
 
     sensor: Any
@@ -103,10 +105,20 @@ class CameraSamples:
     position: Any
     aperture: Any
     spp: int
+    weight: Any = None
 
 
 def camera_samples(
-    sensor: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int, copies: int = 1, timed: bool = False
+    sensor: Any,
+    sampler: Any,
+    seed: Any,
+    spp: int,
+    pixels: Any,
+    count: int,
+    copies: int = 1,
+    timed: bool = False,
+    filters: PixelFilters | None = None,
+    number: int = 0,
 ) -> CameraSamples:
     """Samples of one sensor's film; copies * count * spp lanes.
 
@@ -120,6 +132,8 @@ def camera_samples(
         copies: of the whole image, one behind the other.
         timed: whether sensors open at different times (`open_at_different_times`): the time is then an input of the kernel, which all of
             them share, and no constant in it.
+        filters: with this sensor's among them; None for a box filter.
+        number: of this sensor's in `filters`.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
@@ -131,13 +145,28 @@ def camera_samples(
     if pixels is not None:
         index = dr.gather(mi.UInt32, pixels, index)
     y = index // width
-    position = mi.Point2f(index - y * width, y) + sampler.next_2d()
+    position, weight = _positions(
+        mi.Point2u(index - y * width, y), sampler, (width, height), filters, mi.UInt32(number)
+    )
     opening = float(sensor.shutter_open())
     time = (dr.opaque(mi.Float, opening) if timed else opening) + (
         sampler.next_1d() * sensor.shutter_open_time() if sensor.shutter_open_time() > 0 else 0
     )
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    return CameraSamples(sensor, mi.Float(time), mi.Point2f(position.x / width, position.y / height), aperture, spp)
+    position = mi.Point2f(position.x / width, position.y / height)
+    return CameraSamples(sensor, mi.Float(time), position, aperture, spp, weight)
+
+
+def _positions(
+    pixel: Any, sampler: Any, size: tuple[Any, Any], filters: PixelFilters | None, film: Any
+) -> tuple[Any, Any]:
+    """Positions in pixels, of samples of pixels by column and row, and the filter's weights, None for ones."""
+    if filters is None:
+        return mi.Point2f(pixel) + sampler.next_2d(), None
+    u = sampler.next_2d()
+    x, weight = filters.sample(u.x, pixel.x, size[0], film)
+    y, of_row = filters.sample(u.y, pixel.y, size[1], film)
+    return mi.Point2f(pixel.x + 0.5 + x, pixel.y + 0.5 + y), weight * of_row
 
 
 def open_at_different_times(sensors: Any) -> bool:
@@ -146,37 +175,58 @@ def open_at_different_times(sensors: Any) -> bool:
 
 
 def camera_samples_of_many(
-    sensors: Any, settings: Films, which: Any, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
+    sensors: Any, films: Films, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
 ) -> CameraSamples:
     """Samples of pixels that belong to different sensors; count * spp lanes.
 
     Args:
         sensors: `mitsuba.SensorPtr`, all of the scene's.
-        settings: of all of them.
-        which: `mi.UInt32`, the index of each pixel's sensor.
+        films: of all of them, with the index of each pixel's sensor.
         sampler, seed, spp, pixels, count: see `camera_samples`.
     """
     lanes = count * spp
     _seed(sampler, seed, lanes)
-    pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, which))
-    width, height = dr.gather(mi.UInt32, settings.widths, which), dr.gather(mi.UInt32, settings.heights, which)
+    pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, films.which))
+    width, height = dr.gather(mi.UInt32, films.widths, which), dr.gather(mi.UInt32, films.heights, which)
     # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.
     y = pixel // dr.maximum(width, 1)
-    position = mi.Point2f(pixel - y * width, y) + sampler.next_2d()
+    position, weight = _positions(mi.Point2u(pixel - y * width, y), sampler, (width, height), films.filters, which)
     time = mi.Float(0)
-    if settings.shutters is not None:
-        opening, open_time = settings.shutters
+    if films.shutters is not None:
+        opening, open_time = films.shutters
         time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
-    aperture = sampler.next_2d() if settings.aperture else mi.Point2f(0.5)
+    aperture = sampler.next_2d() if films.aperture else mi.Point2f(0.5)
     position = mi.Point2f(position.x / width, position.y / height)
-    return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp)
+    return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp, weight)
 
 
-def rays(samples: CameraSamples) -> tuple[Any, Any]:
-    """`mi.RayDifferential3f` and its weight per lane."""
+def rays(samples: CameraSamples, hiding: Any = None) -> tuple[Any, Any]:
+    """`mi.RayDifferential3f` and its weight per lane; `hiding`: the scene whose emitters are left out, or None."""
     ray, weight = samples.sensor.sample_ray_differential(samples.time, 0.5, samples.position, samples.aperture)
     ray.scale_differential(samples.spp**-0.5)
-    return ray, weight
+    weight = weight if samples.weight is None else weight * samples.weight
+    return (ray, weight) if hiding is None else _past_emitters(hiding, ray, weight)
+
+
+def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
+    """Camera rays from behind the emitters that they meet first, and their weights, 0 where they then meet nothing: `hide_emitters`."""
+
+    def passing(o: Any, active: Any, meets: Any) -> Any:
+        return active
+
+    def step(o: Any, active: Any, meets: Any) -> tuple[Any, Any, Any]:
+        onward = mi.Ray3f(ray)
+        onward.o = o
+        pi = scene.ray_intersect_preliminary(onward, coherent=True, active=active)
+        meets = dr.select(active, pi.is_valid(), meets)
+        active = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (of each lane)
+        si = pi.compute_surface_interaction(onward, mi.RayFlags.Minimal, active)
+        return dr.select(active, si.spawn_ray(onward.d).o, o), active, meets
+
+    state = mi.Point3f(ray.o), dr.full(mi.Bool, True, dr.width(ray.d)), mi.Bool(False)
+    loop: Any = dr.while_loop
+    ray.o, _, meets = loop(state, passing, step, label="past emitters")
+    return ray, dr.select(meets, weight, 0)
 
 
 def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:
@@ -203,12 +253,16 @@ class Films:
         widths, heights: of the films in pixels, `mi.UInt32`.
         aperture: whether any needs an aperture sample.
         shutters: opening times and durations, `mi.Float`; None where all are 0.
+        filters: reconstruction filters; None where all are box filters.
+        which: `mi.UInt32`, the index of each pixel's sensor; None where all pixels are one sensor's.
     """
 
     widths: Any
     heights: Any
     aperture: bool
     shutters: tuple[Any, Any] | None
+    filters: PixelFilters | None = None
+    which: Any = None
 
     @classmethod
     def of(cls, sensors: Any) -> Films:
@@ -224,6 +278,7 @@ class Films:
             mi.UInt32([int(size[1]) for size in sizes]),
             any(sensor.needs_aperture_sample() for sensor in sensors),
             shutters,
+            PixelFilters.of(sensors),
         )
 
 

@@ -136,6 +136,7 @@ class LoadedScene:
     Attributes:
         scene: as Mitsuba has it.
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps that it holds.
+        equal: names of objects that are equal (`equal_objects`).
         meshed: ids of spheres that have become meshes.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
@@ -147,7 +148,7 @@ class LoadedScene:
         moving: AbstractSet[str] = frozenset(),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self.scene, self.source = load_resolved(description)
+        self.scene, self.source, self.equal = load_resolved(description)
         self._shared = is_loaded(description)
         self.meshed: list[str] = []
         if moving and not self._shared:

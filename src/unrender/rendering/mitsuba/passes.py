@@ -45,11 +45,13 @@ class LaunchSize:
         sensor: its index; of no account where each pixel has its own.
         spp: samples per pixel.
         pixels: how many.
+        hiding: whether emitters are left out where the camera sees them.
     """
 
     sensor: int
     spp: int
     pixels: int
+    hiding: bool = False
 
 
 class Pass(ABC):
@@ -73,7 +75,7 @@ class Pass(ABC):
         return sampler.clone() if positions is None else film.sampler_at(positions, size.spp, size.pixels)
 
     def camera_rays(
-        self, pair: ScenePair, sampler: mi.Sampler, size: LaunchSize, seeds: Any, pixels: Any, sensors: Any
+        self, pair: ScenePair, sampler: mi.Sampler, size: LaunchSize, seeds: Any, pixels: Any, films: Any
     ) -> Rays:
         """The camera rays that `function` takes, made outside of it. Arguments: see `function`."""
         seed, positions = seeds
@@ -81,7 +83,8 @@ class Pass(ABC):
         with dr.suspend_grad():
             for scene in self.states(pair):
                 numbers = self.numbers(sampler, size, positions)
-                ray, weight = film.rays(_camera_samples(scene, numbers, size, seed, pixels, sensors))
+                samples = _camera_samples(scene, numbers, size, seed, pixels, films)
+                ray, weight = film.rays(samples, scene if size.hiding else None)
                 found.append((mi.Ray3f(ray), weight))
         return found
 
@@ -99,12 +102,12 @@ class Pass(ABC):
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
         """What is recorded: of the scene, all loaded scenes, tables, the seed with each pixel's position or None, pixels or None, the
-        films and each pixel's sensor or None, `camera_rays` or None to make them, and the pass's own arrays.
+        films (None for one sensor with a box filter), `camera_rays` or None to make them, and the pass's own arrays.
 
         With `posed`, what is handed as the scene is its `scenes()` and its `numbers()` of one pose, raveled.
         """
 
-        def launch(scene, loaded, tables, seeds, pixels, sensors, rays, *own):
+        def launch(scene, loaded, tables, seeds, pixels, films, rays, *own):
             del loaded  # read through pointers, if at all
             assembly = None
             if posed is not None:
@@ -115,12 +118,13 @@ class Pass(ABC):
             numbers = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
                 # Also where the rays are given: paths go on with the numbers after these.
-                samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
-                ray, ray_weight = film.rays(samples) if rays is None else (mi.Ray3f(rays[0][0]), rays[0][1])
+                samples = _camera_samples(scene, numbers, size, seed, pixels, films)
+                made = film.rays(samples, scene if size.hiding else None) if rays is None else rays[0]
+                ray, ray_weight = mi.Ray3f(made[0]) if rays else made[0], made[1]
                 if assembly is not None:
-                    ray = _posed_rays(assembly, ray, size, sensors)
-                if sensors is not None and "camera" in tables:
-                    of_lane = film.per_sample(sensors[1], size.spp, size.pixels)
+                    ray = _posed_rays(assembly, ray, size, films)
+                if films is not None and films.which is not None and "camera" in tables:
+                    of_lane = film.per_sample(films.which, size.spp, size.pixels)
                     tables = {**tables, "camera": dr.gather(mi.UInt32, tables["camera"], of_lane)}
                 paths = CameraPaths(kernel, scene, tables, numbers, ray, ray_weight, self.pair, assembly)
                 return self.trace(paths, size, *own)
@@ -198,14 +202,14 @@ class MovedPairPass(Pass):
         """See `Pass.function`. Each state has the rays of its own sensors; the kernel is its own."""
         del kernel, posed
 
-        def launch(scenes, loaded, tables, seeds, pixels, sensors, rays):
+        def launch(scenes, loaded, tables, seeds, pixels, films, rays):
             del loaded
             seed, positions = seeds
             with dr.suspend_grad():
                 made: list[tuple[Any, Any]] = []
                 for state, scene in enumerate(scenes[: 1 if self.still_sensors else 2]):  # equal numbers
                     numbers: Any = self.numbers(sampler, size, positions)
-                    samples = _camera_samples(scene, numbers, size, seed, pixels, sensors)
+                    samples = _camera_samples(scene, numbers, size, seed, pixels, films)
                     made.append(film.rays(samples) if rays is None else rays[state])
                 choices = film.independent(numbers, size.pixels * size.spp)
                 found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[-1][0]))
@@ -254,14 +258,17 @@ class AdjointPairPass(Pass):
 
 @dataclass(frozen=True)
 class TangentPass(Pass):
-    """Path replay forward: the squared derivative of each lane's radiance along the tangents."""
+    """Path replay forward: the squared derivative of each lane's radiance along the tangents, of each channel or of their sum by the
+    weights `combined`."""
 
+    combined: tuple[float, ...] | None = None
     needs_tangents: ClassVar[bool] = True
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
         """`own`: the radiance that the primal pass returned."""
         (radiance,) = own
-        return dr.square(paths.forward(radiance))
+        found = paths.forward(radiance)
+        return dr.square(found if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), found)))
 
 
 @dataclass(frozen=True)
@@ -330,8 +337,8 @@ class PosesPass(Pass):
         """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled. `posed` is its own."""
         del posed
 
-        def launch(scenes, loaded, tables, seeds, pixels, sensors, rays, numbers):
-            del loaded, tables, sensors
+        def launch(scenes, loaded, tables, seeds, pixels, films, rays, numbers):
+            del loaded, tables
             seed, positions = seeds
             lanes = size.pixels * size.spp
             batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes
@@ -339,10 +346,8 @@ class PosesPass(Pass):
             repeating = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
                 cameras = assembly.static.sensors()
-                camera, timed = cameras[size.sensor], film.open_at_different_times(cameras)
-                samples = film.camera_samples(
-                    camera, repeating, seed, size.spp, pixels, size.pixels, self.copies, timed
-                )
+                camera = cameras[size.sensor]
+                samples = _samples_of_one(cameras, repeating, size, seed, pixels, films, self.copies)
                 ray, ray_weight = film.rays(samples) if rays is None else _repeated(rays[0], lanes, self.copies)
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
@@ -357,19 +362,19 @@ class PosesPass(Pass):
 
 
 def _camera_samples(
-    scene: mi.Scene,
-    sampler: Any,
-    size: LaunchSize,
-    seed: mi.UInt32,
-    pixels: mi.UInt32 | None,
-    sensors: tuple[film.Films, mi.UInt32] | None,
+    scene: mi.Scene, sampler: Any, size: LaunchSize, seed: mi.UInt32, pixels: mi.UInt32 | None, films: film.Films | None
 ) -> film.CameraSamples:
-    if sensors is None:
-        cameras = scene.sensors()
-        timed = film.open_at_different_times(cameras)
-        return film.camera_samples(cameras[size.sensor], sampler, seed, size.spp, pixels, size.pixels, timed=timed)
-    films, which = sensors
-    return film.camera_samples_of_many(scene.sensors_dr(), films, which, sampler, seed, size.spp, pixels, size.pixels)
+    if films is None or films.which is None:
+        return _samples_of_one(scene.sensors(), sampler, size, seed, pixels, films)
+    return film.camera_samples_of_many(scene.sensors_dr(), films, sampler, seed, size.spp, pixels, size.pixels)
+
+
+def _samples_of_one(
+    cameras: Any, sampler: Any, size: LaunchSize, seed: Any, pixels: Any, films: film.Films | None, copies: int = 1
+) -> film.CameraSamples:
+    timed, filters = film.open_at_different_times(cameras), None if films is None else films.filters
+    of_sensor = cameras[size.sensor], sampler, seed, size.spp, pixels, size.pixels
+    return film.camera_samples(*of_sensor, copies, timed, filters, size.sensor)
 
 
 def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tuple[Any, Any]:
@@ -378,14 +383,15 @@ def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tu
     return dr.gather(mi.Ray3f, rays[0], lane), dr.gather(mi.Spectrum, rays[1], lane)
 
 
-def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, sensors: tuple[film.Films, mi.UInt32] | None) -> Any:
+def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, films: film.Films | None) -> Any:
     """The rays of posed sensors where these stand; all others as they are."""
+    which = None if films is None else films.which
     for index, sensor in enumerate(assembly.static.sensors()):
-        if sensor.id() not in assembly.poses or (sensors is None and index != size.sensor):
+        if sensor.id() not in assembly.poses or (which is None and index != size.sensor):
             continue
         moved = assembly.poses[sensor.id()].ray_outside(ray)
-        if sensors is None:
+        if which is None:
             return moved
-        mine = film.per_sample(sensors[1], size.spp, size.pixels) == index
+        mine = film.per_sample(which, size.spp, size.pixels) == index
         ray.o, ray.d = dr.select(mine, moved.o, ray.o), dr.select(mine, moved.d, ray.d)
     return ray

@@ -13,16 +13,19 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.camera_poses import Camera
-from unrender.rendering.mitsuba import ignored, poses
+from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
+from unrender.rendering.mitsuba.equal_objects import merge_notices
+from unrender.rendering.mitsuba.light_paths import LightPaths
+from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.stock import StockSession
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, Space, differentiated
+from unrender.rendering.renderer import ParameterInfo, PictureFormat, ReplacedMesh, Space, differentiated
 
 __all__ = ["MitsubaRenderer"]
 
@@ -33,7 +36,7 @@ class MitsubaRenderer:
     Args:
         description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, of which there is one state
             only: no pairs.
-        max_depth: longest path in segments, >= 1.
+        max_depth: longest path in segments, >= 1; None for that of the scene's integrator (`LightPaths`).
         keys: parameters that will be asked for, if known. Spheres that these move become meshes, so that path gradients reach them.
         replaced: {id of a shape: `ReplacedMesh`}, what its mesh is to be in place of the description's.
 
@@ -43,6 +46,8 @@ class MitsubaRenderer:
     shapes that are no meshes have no path gradient.
 
     Attributes:
+        light_paths: settings of the light paths.
+        max_depth: longest path in segments.
         notices: one line for each setting of the scene that is not used.
 
     Raises `InputError` where Mitsuba refuses the description.
@@ -51,16 +56,21 @@ class MitsubaRenderer:
     def __init__(
         self,
         description: SceneDescription,
-        max_depth: int = 6,
+        max_depth: int | None = None,
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self.max_depth = max_depth
+        self._given_depth, keys = max_depth, tuple(keys)
         self.pair = ScenePair(description, moving_targets(keys), replaced)
+        source, volumetric = self.pair.loaded().source, self.pair.volumetric
+        self.light_paths = LightPaths.of(self.pair.current, source, volumetric, max_depth)
+        self.max_depth = self.light_paths.max_depth
         self.notices = (
-            *ignored.notices(self.pair.current, self.pair.loaded().source, max_depth),
+            *self.light_paths.notices,
+            *merge_notices(keys, self.pair.loaded().equal),
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
+        self._formats = formats(self.pair.current.sensors())
         # Posed shapes live in scenes of their own, which media do not reach.
         self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
@@ -71,7 +81,7 @@ class MitsubaRenderer:
             for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
-        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession] = {}
+        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession | LuminanceSession] = {}
         self._stock: StockSession | None = None
         self._differential_bsdf, self._differential = False, None
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
@@ -91,6 +101,10 @@ class MitsubaRenderer:
         """(height, width) of each sensor's film, after cropping."""
         return self.pair.resolutions
 
+    def formats(self) -> list[PictureFormat]:
+        """See `WithFormats.formats`."""
+        return self._formats
+
     def cameras(self) -> Mapping[int, Camera]:
         """See `WithCameras.cameras`."""
         found = {}
@@ -107,7 +121,7 @@ class MitsubaRenderer:
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> MitsubaSession:
+    ) -> MitsubaSession | LuminanceSession:
         """The session for these parameters: see `Renderer.prepare`. Sessions are kept, so that asking again costs nothing.
 
         Poses and other parameters that move geometry cannot be prepared together: the scenes that posed shapes live in are not rebuilt.
@@ -122,14 +136,16 @@ class MitsubaRenderer:
         if (names, wanted) not in self._sessions:
             chosen = {key: self._poses[key] for key in keys if key in self._poses}
             rest = [key for key in keys if key not in self._poses]
-            self._sessions[names, wanted] = MitsubaSession(
-                self.pair, rest, chosen, wanted, self.max_depth, self._sampler, self._differential_bsdf
+            session = MitsubaSession(
+                self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
+            grey = self._formats[0].colour == "luminance"
+            self._sessions[names, wanted] = LuminanceSession(session) if grey else session
         return self._sessions[names, wanted]
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
         """See `Remeshable`."""
-        return MitsubaRenderer(self.pair.description, self.max_depth, keys, self.pair.replaced | dict(meshes))
+        return MitsubaRenderer(self.pair.description, self._given_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """See `DifferentialBsdfRenderer`. Of the same scenes."""
@@ -144,8 +160,12 @@ class MitsubaRenderer:
         """See `StockRenderer.stock`."""
         if self.pair.replaced:
             raise InputError("method stock: a mesh has other triangles than the scene's own")
+        if any(form.colour == "xyz" for form in self._formats):
+            raise InputError(
+                "method stock: a film has the pixel_format xyz, which it would compare with RGB: give it rgb"
+            )
         if self._stock is None:
-            self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.max_depth)
+            self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.light_paths)
         return self._stock
 
     def _translates(self, pose: poses.PoseKey) -> str:
@@ -177,6 +197,8 @@ class MitsubaRenderer:
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         target = moved_sensor(self.pair.loaded(), key) or moved_shape(self.pair.loaded(), key)
+        if self.light_paths.hide_emitters and (target or key in self._poses):
+            raise InputError(f"parameter {key}: the scene's hide_emitters does not go with what moves: leave it out")
         if derivatives and target and key not in self._poses and (why := self._obstacles({target})[target]):
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
         if not info.perturbable:

@@ -16,6 +16,7 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files
 from unrender.rendering.mitsuba import description as loading
 from unrender.rendering.mitsuba import emissive, turntable_light
+from unrender.rendering.mitsuba.equal_objects import equal_objects
 from unrender.rendering.mitsuba.grid_transforms import attached_media
 
 __all__ = ["SceneDescription", "is_loaded", "load", "load_resolved", "media"]
@@ -38,14 +39,14 @@ def is_loaded(description: SceneDescription) -> bool:
     return type(description).__module__.partition(".")[0] == "mitsuba" and type(description).__name__ == "Scene"
 
 
-def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]:
+def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict, tuple[tuple[str, ...], ...]]:
     """As `load`, and what was loaded: the file's path, or the dictionary without data (`_outline`); nothing in it for a scene that was
-    loaded before."""
+    loaded before. And the names of its `equal_objects`."""
     variant.ensure()
     emissive.register()
     turntable_light.register()
     if is_loaded(description):
-        return _loaded_before(description), {}
+        return _loaded_before(description), {}, ()
     if callable(description):
         description = description()
     name = str(description) if isinstance(description, (str, Path)) else "dictionary"
@@ -54,11 +55,13 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
             path = Path(description)
             if bounded_files.kind(path) != "file":
                 raise InputError(f"scene {path}: {bounded_files.no_file(path)}")
-            scene = loading.load(path)
+            parsed = loading.parse(path)
         elif isinstance(description, dict):
-            scene = loading.load(description)
+            parsed = loading.parse(description)
         else:
             raise InputError(f"scene: expected an .xml path or a Mitsuba dictionary, got {type(description).__name__}")
+        equal = equal_objects(parsed.state.nodes)
+        scene = parsed.instantiate()
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith("scene") else f"scene {name}: {text}") from error
@@ -67,7 +70,7 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict]
     if not isinstance(scene, mi.Scene):
         raise InputError(f"scene: the description makes a {type(scene).__name__}, not a scene")
     outline = _outline(description) if isinstance(description, dict) else Path(description)
-    return _with_sensor(scene), outline
+    return _with_sensor(scene), outline, equal
 
 
 def _outline(description: dict[str, Any]) -> dict[str, Any]:

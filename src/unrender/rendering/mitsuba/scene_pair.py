@@ -34,10 +34,11 @@ from unrender.rendering.mitsuba.parameters import (
     physical_range,
     role,
 )
+from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.scene_graph import object_ids
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
-from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
+from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleRequest
 
 __all__ = ["SINGLE", "ScenePair"]
 
@@ -130,11 +131,13 @@ class ScenePair:
         if self._previous is not None:
             self._previous.clear_gradients()
 
-    def films(self) -> film.Films:
-        """Of all sensors."""
+    def films(self, request: SampleRequest) -> film.Films | None:
+        """What the rays of a request need to know of the films; None where one sensor, with a box filter, has all pixels."""
         if self._films is None:
             self._films = film.Films.of(self.current.sensors())
-        return self._films
+        if request.sensors is None and is_box(self.current.sensors()[request.sensor].film()):
+            return None
+        return replace(self._films, which=request.sensors)
 
     def check_separate(self, keys: list[str]) -> None:
         """Raise `InputError` where there are no two loads, or where they share the object that holds a parameter."""

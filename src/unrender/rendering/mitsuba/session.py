@@ -23,6 +23,7 @@ from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
+from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses
 from unrender.rendering.mitsuba.passes import (
     AdjointPairPass,
@@ -38,7 +39,7 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
-from unrender.rendering.mitsuba.recordable import is_recordable
+from unrender.rendering.mitsuba.recordable import are_recordable
 from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -63,7 +64,7 @@ class MitsubaSession:
         poses: {key: what it stands for} of those that are poses.
         derivatives: the parameters that are leaves of the derivative graph: for all of a session or never, since recorded kernels
             would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
-        max_depth: longest path in segments.
+        paths: settings of the light paths.
         sampler: is cloned.
         differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
 
@@ -80,7 +81,7 @@ class MitsubaSession:
         keys: list[str],
         poses: dict[str, PoseKey],
         derivatives: AbstractSet[str],
-        max_depth: int,
+        paths: LightPaths,
         sampler: mi.Sampler,
         differential_bsdf: bool = False,
     ):
@@ -109,8 +110,8 @@ class MitsubaSession:
                     f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
                 )
             shapes = {moved[key] for key in everything if key not in cameras} - {""}
-            self._boundary = BoundaryTerm(pair, shapes, max_depth) if shapes else None
-            self._camera = CameraTerm(pair, cameras, max_depth, not shapes) if cameras else None
+            self._boundary = BoundaryTerm(pair, shapes, paths.max_depth) if shapes else None
+            self._camera = CameraTerm(pair, cameras, paths.max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
             self._replays = len(cameras) < len(everything)
             keys = [*keys, *(key for key in poses if key in derivatives)]
@@ -123,7 +124,7 @@ class MitsubaSession:
             share_addresses(self._posed.scenes())
         self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
-        self._max_depth, self._sampler = max_depth, sampler
+        self._light, self._sampler = paths, sampler
         self._traits = [of for key, of in traits.items() if key in derivatives]
         # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
         self._recordable = not any(of.phase for of in traits.values())
@@ -138,11 +139,14 @@ class MitsubaSession:
         """The path tracer for these parameters' derivatives."""
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
-            return PathPair(self._max_depth, changing_delta=delta, differential=self._rough.differential)
+            return PathPair(
+                self._light.max_depth, self._light.rr_depth, changing_delta=delta, differential=self._rough.differential
+            )
         media = any(traits.medium for traits in self._traits)
         emission, field = self._pair.emissive, self._pair.radiance_field
         return VolumePair(
-            self._max_depth,
+            self._light.max_depth,
+            self._light.rr_depth,
             changing_delta=delta,
             differentiate_media=media,
             emission=emission,
@@ -151,21 +155,21 @@ class MitsubaSession:
 
     @cached_property
     def _geometry_kernel(self) -> Kernel:
-        return PrbKernel(self._max_depth)
+        return PrbKernel(self._light.max_depth, self._light.rr_depth)
 
     @cached_property
     def _moved_kernel(self) -> MovedPair:
-        return MovedPair(self._max_depth, shared=self._only_meshes)
+        return MovedPair(self._light.max_depth, self._light.rr_depth, shared=self._only_meshes)
 
     @cached_property
     def _unrelated_kernel(self) -> MovedPair:
         """Of equal random numbers: nothing is carried along."""
-        return MovedPair(self._max_depth, share=0.0, shared=self._only_meshes)
+        return MovedPair(self._light.max_depth, self._light.rr_depth, share=0.0, shared=self._only_meshes)
 
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render. Unbiased; box filter."""
+        """Render. Unbiased."""
         if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
@@ -207,7 +211,7 @@ class MitsubaSession:
         return self.dropped.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased; box filter."""
+        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased."""
         self._set_parameters(current)
         # A call through a pointer reaches both scenes' objects, and its adjoint would accumulate gradients in all that are attached.
         self._set_parameters(previous, previous=True, attach=request.both_gradients)
@@ -265,9 +269,12 @@ class MitsubaSession:
         self.dropped.read()
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
-    def tangent_moment(self, parameters: Tree, paths: Paths, tangents: Tree) -> mi.TensorXf:
-        """Path replay in forward mode: the squared derivative of each path along the tangents, and where shapes move the squared boundary
-        derivative of its pixel. See `RenderSession.tangent_moment`."""
+    def tangent_moment(
+        self, parameters: Tree, paths: Paths, tangents: Tree, combined: tuple[float, ...] | None = None
+    ) -> mi.TensorXf:
+        """Return the squared derivative of each path along the tangents (path replay in forward mode), and of moving edges.
+
+        `combined` holds weights of the channels in a sum to square; None for each channel. See `RenderSession.tangent_moment`."""
         self._check_keys(parameters)
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
@@ -275,12 +282,12 @@ class MitsubaSession:
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded().set_tangents(rest, tangents, self._attached)
         self._set_poses(parameters)
-        squares = self._run(TangentPass(), paths.request, paths.radiance)
+        squares = self._run(TangentPass(combined), paths.request, paths.radiance)
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
         if self._boundary is not None:
             moments += mi.TensorXf(
-                self._boundary.tangent_moment(self._pair.loaded(), paths.request).array, moments.shape[1:]
+                self._boundary.tangent_moment(self._pair.loaded(), paths.request, combined).array, moments.shape[1:]
             )
         return moments if paths.request.groups > 1 else moments[0]
 
@@ -300,7 +307,7 @@ class MitsubaSession:
         scene = self._pair.loaded()
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
-        task = ConnectionsPass(max(1, self._max_depth - 1))
+        task = ConnectionsPass(max(1, self._light.max_depth - 1))
         found = self._run(task, paths.request, paths.radiance, weights, noise)
         dr.eval(found)
         return connection_moments(scene.scene, *found)
@@ -308,9 +315,10 @@ class MitsubaSession:
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """See `CountingSession.vertices`."""
         self._set_parameters(parameters)
-        found = self._run(VerticesPass(), replace(request, groups=1))
+        request = replace(request, groups=1)
+        found = self._run(VerticesPass(), request)
         dr.eval(found)
-        return self._develop(found, replace(request, groups=1))[0]
+        return self._develop(found, request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
@@ -365,9 +373,9 @@ class MitsubaSession:
     def _run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
         """Launch the kernel for requests of this form: traced once, replayed at each step."""
         pair = self._pair
-        size = LaunchSize(request.sensor, request.spp, self._count(request))
+        size = LaunchSize(request.sensor, request.spp, self._count(request), self._light.hide_emitters)
         several = request.sensors is not None
-        outside = self._rays_outside(request)
+        outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
         shapes = pair.loaded().shapes()
         pixels = request.pixels is None, several, request.positions is None
@@ -378,23 +386,16 @@ class MitsubaSession:
             self._functions[key] = FrozenFunction(traced, self._recordable)
         share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
-        sensors = (pair.films(), request.sensors) if several else None
+        films = pair.films(request)
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
         # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
         seeds = dr.opaque(mi.UInt32, request.seed), request.positions
-        rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
+        rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
-
-    def _rays_outside(self, request: SampleRequest) -> bool:
-        """Whether the camera rays are made outside of the recording, since it cannot hold the sensor."""
-        # A call through a pointer sees every sensor of the process.
-        found = [sensor for loaded in loaded_scenes() for sensor in loaded.scene.sensors()]
-        seen = [self._pair.current.sensors()[request.sensor]] if request.sensors is None else found
-        return not all(map(is_recordable, seen))
+        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

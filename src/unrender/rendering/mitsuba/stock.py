@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.renderer import LossWeights
@@ -23,13 +24,20 @@ class StockSession:
         description: what to load.
         moving: ids of shapes that move; the spheres among them become meshes.
         volumetric: whether there is a participating medium, which takes `prbvolpath` in place of `prb`.
-        max_depth: longest path in segments, >= 1.
+        paths: settings of the light paths.
     """
 
-    def __init__(self, description: SceneDescription, moving: AbstractSet[str], volumetric: bool, max_depth: int):
+    def __init__(self, description: SceneDescription, moving: AbstractSet[str], volumetric: bool, paths: LightPaths):
         self._loaded = LoadedScene(description, moving)
         kind = "prbvolpath" if volumetric else "prb"
-        self._integrator: Any = mi.load_dict({"type": kind, "max_depth": max_depth})
+        self._integrator: Any = mi.load_dict(
+            {
+                "type": kind,
+                "max_depth": paths.max_depth,
+                "rr_depth": paths.rr_depth,
+                "hide_emitters": paths.hide_emitters,
+            }
+        )
 
     def gradient(
         self, parameters: Tree, sensor: int, spp: int, seeds: tuple[int, int], weigh: LossWeights
@@ -50,6 +58,8 @@ class StockSession:
         channels = image.shape[2]
         if channels in (2, 4):  # a film with alpha, which references have not
             image = image[:, :, : channels - 1]
+        if channels <= 2:  # of luminance, in all three channels
+            image = image * dr.ones(mi.TensorXf, (1, 1, 3))
         seen = mi.TensorXf(dr.detach(image))
         dr.backward(dr.sum(image * weigh(seen), axis=None))
         gradient = scene.take_gradients()

@@ -68,7 +68,7 @@ class BoundaryIntegrator:
 
         Args:
             scene, sensor: of Mitsuba; the sensor is perspective.
-            weights: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; box filter.
+            weights: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image.
             seed: in [0, 2**32).
             samples: of each of the three parts.
         """
@@ -120,7 +120,7 @@ class BoundaryIntegrator:
             along = picture.project_motion(point, uv, edge.end - edge.start)
             length = dr.norm(along)
             normal = mi.Vector2f(-along.y, along.x) / dr.maximum(length, 1e-20)
-            active = (pmf > 0) & (length > 1e-12) & (depth > 0) & dr.all((uv >= 0) & (uv < 1))
+            active = (pmf > 0) & (length > 1e-12) & (depth > 0) & picture.stencil.is_sampled(uv)
             towards = mi.Point3f(dr.detach(point)) - camera
             ray = mi.Ray3f(camera, dr.normalize(towards))
             ray.maxt = dr.norm(towards) * (1 - _NEAR)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgePoints
+from unrender.rendering.mitsuba.pixel_filter import FilterStencil
 
 __all__ = ["OFFSET", "BoundarySegment", "EyePath", "Picture", "TangentPicture", "WeightedPicture"]
 
@@ -21,6 +22,7 @@ class Picture:
 
     def __init__(self, scene: Any, sensor: Any, samples: int):
         size = sensor.film().crop_size()
+        self.stencil = FilterStencil(sensor.film())
         self.scene, self.sensor, self.samples = scene, sensor, samples
         self.width, self.height = int(size[0]), int(size[1])
         self.size = mi.Vector2f(self.width, self.height)
@@ -70,12 +72,6 @@ class Picture:
         """
         raise NotImplementedError
 
-    def _element(self, position: Any) -> Any:
-        """Index of the first channel of the pixel at `position`, in pixels."""
-        x = dr.clip(mi.Int32(dr.floor(position.x)), 0, self.width - 1)
-        y = dr.clip(mi.Int32(dr.floor(position.y)), 0, self.height - 1)
-        return mi.UInt32(y * self.width + x) * 3
-
 
 class WeightedPicture(Picture):
     """Of which the weighted sum of all pixels is wanted, for backward mode.
@@ -89,10 +85,15 @@ class WeightedPicture(Picture):
         self._weights = weights.array
 
     def weighted(self, value: Any, position: Any, active: Any) -> Any:
-        """Σ over channels of value times weight of the pixel at `position`, in pixels."""
-        first = self._element(position)
-        parts = [value[c] * dr.gather(mi.Float, self._weights, first + c, active) for c in range(3)]
-        return parts[0] + parts[1] + parts[2]
+        """Σ over pixels and channels of value times filter times weight, of samples at `position`, in pixels."""
+        weights = mi.Color3f(0)
+
+        def add(pixel: Any, factor: Any, inside: Any) -> None:
+            for c in range(3):
+                weights[c] += factor * dr.gather(mi.Float, self._weights, pixel * 3 + c, active & inside)
+
+        self.stencil.add(position, add)
+        return dr.dot(mi.Color3f(value), weights)
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
         """See `Picture.collect`: the samples' part of Σ weights · image."""
@@ -115,9 +116,13 @@ class TangentPicture(Picture):
             dr.forward_to(motion, flags=dr.ADFlag.ClearInterior)
             speed = dr.grad(motion) * self.scale
             with dr.suspend_grad():
-                first = self._element(position)
-                for c in range(3):
-                    dr.scatter_add(self._sums, value[c] * speed, first + c, active & dr.isfinite(speed))
+                counts = active & dr.isfinite(speed)
+
+                def add(pixel: Any, factor: Any, inside: Any) -> None:
+                    for c in range(3):
+                        dr.scatter_add(self._sums, value[c] * speed * factor, pixel * 3 + c, counts & inside)
+
+                self.stencil.add(position, add)
         return mi.Float(0)
 
     def image(self) -> Any:

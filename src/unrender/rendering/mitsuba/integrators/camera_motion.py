@@ -3,13 +3,14 @@
 A point that the sensor sees is at P(x; θ) on the film, where θ are the sensor's pose and field of view. Where the picture f is followed
 along the flow v = ∂P/∂θ of what it shows, it changes only with the direction from which that is seen. So (Reynolds' transport theorem)
 
-    d/dθ ∫_pixel f du = −∮ f v·n ds + ∫ f div v du + ∫ Df du + Σ over silhouettes ∫ [f (v − s)·n] ds
+    d/dθ ∫ k f du = ∫ f v·∇k du + ∫ k f div v du + ∫ k Df du + Σ over silhouettes ∫ k [f (v − s)·n] ds
 
-with the border of the pixel, the divergence of the flow, the change Df of f at fixed points, and curves at which the flow jumps, which
-move by s and have f, v on either side. Shadows, textures and all else that light does on surfaces are part of f, and need no edges of
-their own. Where a sensor turns or zooms, the flow depends on u alone: Df and the silhouettes vanish, whatever the scene holds.
+with the reconstruction filter k of the pixel (∇k lies on the pixel's border where that is a box), the divergence of the flow, the
+change Df of f at fixed points, and curves at which the flow jumps, which move by s and have f, v on either side. Shadows, textures and
+all else that light does on surfaces are part of f, and need no edges of their own. Where a sensor turns or zooms, the flow depends on u
+alone: Df and the silhouettes vanish, whatever the scene holds.
 
-The radiance at opposite borders of a pixel, and within, is estimated with the same random numbers, so that noise cancels between them.
+The radiance where a filter rises, where it falls, and within, is estimated with the same random numbers, so noise cancels between them.
 In flat mirrors the flow is that of the mirrored point's virtual image.
 """
 
@@ -26,12 +27,13 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import WeightedCho
 from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, MirroredView
 from unrender.rendering.mitsuba.integrators.glossy_directions import glossy_radiance, is_glossy
 from unrender.rendering.mitsuba.integrators.silhouette_curves import SilhouetteCurves
+from unrender.rendering.mitsuba.pixel_filter import FilterSlopes, PixelFilters, is_box
 from unrender.rendering.mitsuba.view_weights import ViewWeights
 
 __all__ = ["CameraMotion"]
 
 _POINTS = 5
-"""Of a sample: two pairs on opposite borders of its pixel, and one within."""
+"""Of a sample: where its pixel's filter rises and falls along each coordinate (opposite borders of a box), and one within."""
 
 
 class _Seen:
@@ -40,6 +42,13 @@ class _Seen:
 
     def __init__(self, L: Any, point: Any, across: tuple[Any, Any]):
         self.L, self.point, self.across = L, point, across
+
+
+class _Points:
+    """Places in pixels from a pixel's corner, and the derivatives and the value of the pixel's filter there, over their densities."""
+
+    def __init__(self, at: Any, slope: Any, within: Any):
+        self.at, self.slope, self.within = at, slope, within
 
 
 class _FilmMap:
@@ -98,6 +107,7 @@ class CameraMotion:
         self._table, self._max_depth, self._still = table, max_depth, still
         self._mirrors: Any = None
         self._curves: Any = None
+        self._filters: Any = None
         self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
 
     def weighted_image(self, scene: Any, sensor: Any, view: ViewWeights, seed: int) -> Any:
@@ -132,28 +142,39 @@ class CameraMotion:
             index = lane // view.spp
             pixel = dr.gather(mi.UInt32, view.pixels, index)
             row = pixel // picture.width
-            corner = mi.Vector2f(pixel - row * picture.width, row)
-            inside = lane_sampler(seed, count, _POINTS * count).next_2d()
-            # x = 0, x = 1, y = 0, y = 1, within.
-            at = mi.Vector2f(
-                dr.select(kind == 0, 0, dr.select(kind == 1, 1, inside.x)),
-                dr.select(kind == 2, 0, dr.select(kind == 3, 1, inside.y)),
-            )
-            uv = (corner + at) / picture.size
+            corner = mi.Point2u(pixel - row * picture.width, row)
+            points = self._points(picture, corner, kind, lane_sampler(seed, count, _POINTS * count).next_2d())
+            uv = (mi.Vector2f(corner) + points.at) / picture.size
             seen = self._look(picture, film, uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
             weighted = mi.Float(0)
             for c in range(3):
                 weighted += seen.L[c] * dr.gather(mi.Float, view.values, index * 3 + c)
             dr.eval(weighted)
-            outward: Any = mi.Vector2f(
-                dr.select(kind == 0, -1, dr.select(kind == 1, 1, 0)),
-                dr.select(kind == 2, -1, dr.select(kind == 3, 1, 0)),
-            )
-            border: Any = mi.Vector2f(*(-weighted * outward[axis] * picture.size[axis] for axis in range(2)))
-            within = dr.select(kind == _POINTS - 1, weighted, 0)
+            border: Any = mi.Vector2f(*(weighted * points.slope[axis] * picture.size[axis] for axis in range(2)))
+            within = weighted * points.within
         with dr.resume_grad():
             total = dr.sum(dr.dot(border, film.place(seen.point)) + within * film.stretch(seen))
             return total * dr.opaque(mi.Float, 1 / view.spp)
+
+    def _points(self, picture: WeightedPicture, pixel: Any, kind: Any, u: Any) -> _Points:
+        """The five points of a sample: where the filter of its pixel rises and falls along x, likewise along y, and one within."""
+        one = dr.select(kind == _POINTS - 1, 1.0, 0.0)
+        signs = [dr.select(kind == axis * 2, 1.0, dr.select(kind == axis * 2 + 1, -1.0, 0.0)) for axis in range(2)]
+        if is_box(picture.sensor.film()):
+            places = [dr.select(signs[axis] == 0, u[axis], 0.5 - 0.5 * signs[axis]) for axis in range(2)]
+            return _Points(mi.Vector2f(*places), mi.Vector2f(*signs), one)
+        if self._filters is None:
+            self._filters = PixelFilters.of([picture.sensor]), FilterSlopes(picture.sensor.film())
+        filters, slopes = self._filters
+        places, weights, masses = [], [], []
+        for axis, size in enumerate((picture.width, picture.height)):
+            place, weight = filters.sample(u[axis], pixel[axis], size, mi.UInt32(0))
+            rise, fall, mass = slopes.sample(u[axis], pixel[axis], size)
+            places.append(dr.select(signs[axis] > 0, rise, dr.select(signs[axis] < 0, fall, place)) + 0.5)
+            weights.append(weight)
+            masses.append(mass)
+        slope = [signs[axis] * masses[axis] * weights[1 - axis] for axis in range(2)]
+        return _Points(mi.Vector2f(*places), mi.Vector2f(*slope), one * weights[0] * weights[1])
 
     def _look(self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
         """What is seen at `uv`; lanes a period apart share random numbers."""
@@ -189,10 +210,12 @@ class CameraMotion:
             index = dr.arange(mi.UInt32, count) // view.spp
             pixel = dr.gather(mi.UInt32, view.pixels, index)
             row = pixel // picture.width
-            uv = (mi.Vector2f(pixel - row * picture.width, row) + sampler.next_2d()) / picture.size  # pyright: ignore[reportOperatorIssue]
+            corner = mi.Point2u(pixel - row * picture.width, row)
+            within = self._points(picture, corner, mi.UInt32(_POINTS - 1), sampler.next_2d())
+            uv = (mi.Vector2f(corner) + within.at) / picture.size
             ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), True)
             si = scene.ray_intersect(ray)
-            weight *= mi.Spectrum(*(dr.gather(mi.Float, view.values, index * 3 + c) for c in range(3)))
+            weight *= within.within * mi.Spectrum(*(dr.gather(mi.Float, view.values, index * 3 + c) for c in range(3)))
             active = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Glossy)
         with dr.resume_grad():
             viewpoint = sensor.world_transform() @ mi.Point3f(0)
@@ -227,7 +250,7 @@ class CameraMotion:
             along = picture.project_motion(point, uv, along)
             length = dr.norm(along)
             normal = mi.Vector2f(-along.y, along.x) / dr.maximum(length, 1e-20)
-            active = (pmf > 0) & jumps & (length > 1e-12) & (depth > 0) & dr.all((uv >= 0) & (uv < 1))
+            active = (pmf > 0) & jumps & (length > 1e-12) & (depth > 0) & picture.stencil.is_sampled(uv)
             active &= self._mirrors.sees(scene, film.origin, real, point, mirror, active)
             factor = dr.select(active, length / pmf * picture.scale, 0)
             # The two sides.

@@ -19,9 +19,9 @@ class PrbKernel:
     """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.
     Visibility is left out; `BoundaryIntegrator` has it, of meshes."""
 
-    def __init__(self, max_depth: int):
-        self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth})
-        self._max_depth = max_depth
+    def __init__(self, max_depth: int, rr_depth: int = 5):
+        self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth, "rr_depth": rr_depth})
+        self._depths = max_depth, rr_depth
 
     def sample(
         self,
@@ -51,4 +51,4 @@ class PrbKernel:
         geometry: Any = None,
     ) -> Float:
         """See `PathKernel.vertices`: of paths of the same distribution."""
-        return PathPair(self._max_depth).vertices(scene, tables, sampler, ray, geometry)
+        return PathPair(*self._depths).vertices(scene, tables, sampler, ray, geometry)

@@ -1,0 +1,168 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+
+"""References as films store them: every pixel format of Mitsuba's, alpha, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.io import images
+
+KEY = "wall.bsdf.reflectance.value"
+TRUTH = [0.7, 0.4, 0.2]
+FORMATS = ("rgb", "rgba", "xyz", "xyza", "luminance", "luminance_alpha")
+
+
+def scene(pixel_format: str, rfilter: str = "gaussian") -> dict[str, Any]:
+    film = {"type": "hdrfilm", "width": 6, "height": 6, "pixel_format": pixel_format, "rfilter": {"type": rfilter}}
+    place = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {"type": "perspective", "to_world": place, "film": film},
+        "sky": {"type": "constant"},
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": TRUTH}}},
+    }
+
+
+def problem(pixel_format: str, reference: Any, rfilter: str = "gaussian", **view: Any) -> ur.Problem:
+    start = ur.Parameter(KEY, initial=TRUTH)
+    return ur.Problem(lambda: scene(pixel_format, rfilter), [start], [ur.View(reference, **view)])
+
+
+def rendered(pixel_format: str) -> np.ndarray:
+    return np.array(mi.render(mi.load_dict(scene(pixel_format)), spp=2048))
+
+
+@pytest.mark.parametrize("pixel_format", FORMATS)
+@pytest.mark.parametrize("kind", ["array", "exr", "npy"])
+def test_the_truth_s_image_is_the_reference(pixel_format: str, kind: str, tmp_path: Path) -> None:
+    given: Any = rendered(pixel_format)
+    if kind == "exr":
+        image = mi.load_dict(scene(pixel_format))
+        mi.render(image, spp=2048)
+        image.sensors()[0].film().bitmap().write(str(tmp_path / "reference.exr"))
+        given = tmp_path / "reference.exr"
+    elif kind == "npy":
+        np.save(tmp_path / "reference.npy", given)
+        given = tmp_path / "reference.npy"
+    made = problem(pixel_format, given)
+    reference = np.asarray(made.views[0].reference)
+    assert made.views[0].mask is None
+    np.testing.assert_allclose(ur.render(made, spp=2048), reference, atol=0.02)
+    if pixel_format.startswith("luminance"):
+        assert np.ptp(reference, axis=2).max() == 0
+    else:
+        np.testing.assert_allclose(reference, rendered("rgb"), atol=0.01)
+
+
+def test_gradients_of_luminance_are_those_of_the_weighted_channels() -> None:
+    numbers = np.random.default_rng(0)
+    grey, colour = problem("luminance", np.zeros((6, 6))), problem("rgb", np.zeros((6, 6, 3)))
+    weights = numbers.uniform(0.5, 1.5, (1, 6, 6, 3)).astype(np.float32)
+    of_rgb = weights.sum(axis=3, keepdims=True) * np.array([0.212671, 0.715160, 0.072169])
+    request = ur.protocols.SampleRequest(0, 16, 3)
+    found = []
+    for made, weight in ((grey, weights), (colour, of_rgb)):
+        session, values = made.renderer.prepare([KEY], "path"), made.initial()
+        paths = session.image(values, request).paths
+        one = session.adjoint(values, paths, made.renderer.array(weight))[KEY]
+        pair = session.image_pair(values, values, request, "path")
+        array = made.renderer.array(weight)
+        both = session.adjoint_pair(values, values, pair.paths, array, array)
+        tangents = {KEY: made.renderer.array(np.ones(3))}
+        found.append([np.array(x) for x in (one, both[0][KEY], both[1][KEY])])
+        moment = np.array(session.tangent_moment(values, paths, tangents))
+        assert moment.shape == (6, 6, 3)
+        assert np.isfinite(moment).all()
+        if made is grey:
+            assert np.ptp(moment, axis=2).max() == 0
+            assert moment.max() > 0
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "shape", "words"),
+    [
+        ("rgb", (6, 6, 2), r"expected an array of shape \(H, W, 3\), got \(6, 6, 2\)"),
+        ("rgb", (6, 6, 5), r"got \(6, 6, 5\)"),
+        ("rgba", (6, 6, 7), r"got \(6, 6, 7\)"),
+        ("xyz", (6, 6, 1), r"expected an array of shape \(H, W, 3\), got \(6, 6, 1\): the film's pixel_format is xyz"),
+        ("luminance", (6, 6, 3), r"expected an array of shape \(H, W\) or \(H, W, 1\).*pixel_format is luminance"),
+        ("luminance_alpha", (6, 6, 4), r"pixel_format is luminance"),
+        ("luminance", (5, 6, 1), r"6x5 pixels .* but the film of sensor 0 is 6x6"),
+    ],
+)
+def test_other_channels_and_sizes_are_refused_in_one_line(
+    pixel_format: str, shape: tuple[int, ...], words: str
+) -> None:
+    with pytest.raises(ur.InputError, match=words) as caught:
+        problem(pixel_format, np.zeros(shape))
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("view 0: reference")
+
+
+def test_values_that_are_no_radiance_are_refused_in_one_line() -> None:
+    for pixel_format, shape in (("rgb", (6, 6, 3)), ("xyz", (6, 6, 3)), ("luminance", (6, 6))):
+        for bad, words in (
+            (np.nan, "1 pixels are NaN or infinite"),
+            (-0.5, "1 pixels are negative, the first in row 2"),
+        ):
+            reference = np.ones(shape)
+            reference[2, 3] = bad
+            with pytest.raises(ur.InputError, match=words):
+                problem(pixel_format, reference)
+            if bad < 0:
+                problem(pixel_format, reference, "lanczos")
+
+
+def test_a_colour_picture_is_no_reference_of_luminance(tmp_path: Path) -> None:
+    mi.Bitmap(np.ones((6, 6, 3), np.float32)).write(str(tmp_path / "colour.exr"))
+    with pytest.raises(ur.InputError, match="three channels and the film's pixel_format is luminance"):
+        problem("luminance", tmp_path / "colour.exr")
+
+
+def test_alpha_of_eight_bits_is_a_mask_and_that_of_floats_is_left_out(tmp_path: Path) -> None:
+    picture = np.full((6, 6, 4), 200, np.uint8)
+    picture[:, :3, 3] = 0
+    picture[:, 3, 3] = 51
+    mi.Bitmap(picture).write(str(tmp_path / "cut.png"))
+    own = np.ones((6, 6), np.float32)
+    own[0] = 0
+    for given in (picture, tmp_path / "cut.png"):
+        made = problem("rgb", given)
+        mask = np.asarray(made.views[0].mask)
+        np.testing.assert_allclose(mask[2], [0, 0, 0, 0.2, 200 / 255, 200 / 255], atol=1e-6)
+        assert "its alpha taken as mask" in made.notices[0]
+        both = np.asarray(problem("rgb", given, mask=own).views[0].mask)
+        np.testing.assert_allclose(both, mask * own)
+    assert problem("rgb", picture.astype(np.float32)).views[0].mask is None
+    picture[..., 3] = 0
+    with pytest.raises(ur.InputError, match="alpha, with the mask, is 0 everywhere"):
+        problem("rgb", picture)
+
+
+def test_films_of_luminance_and_colour_in_one_scene_are_refused() -> None:
+    described = scene("rgb") | {"other": scene("luminance")["sensor"]}
+    with pytest.raises(ur.InputError, match="some films have the pixel_format luminance"):
+        ur.Problem(described, [ur.Parameter(KEY)], [ur.View(np.zeros((6, 6, 3)))])
+
+
+def test_the_matrix_is_mitsuba_s() -> None:
+    values = np.random.default_rng(0).random((5, 3)).astype(np.float32)
+    expected = np.array(mi.xyz_to_srgb(mi.Color3f(values.T))).T
+    np.testing.assert_allclose(images.xyz_to_rgb(values), expected, atol=1e-4)
+
+
+def test_a_loop_of_one_s_own_renders_luminance() -> None:
+    renderer = ur.Renderer(lambda: scene("luminance"), [KEY], spp=4)
+    image = np.array(renderer.render({KEY: np.array(TRUTH, np.float32)}))
+    assert np.ptp(image, axis=2).max() == 0
