@@ -1,4 +1,4 @@
-"""How a parameter reaches the image, read off the scene graph, and the physical range of its values."""
+"""How a parameter reaches the image, read off the scene graph."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
-__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits", "physical_range"]
+__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits"]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
 # depend on the parameter.
@@ -109,39 +108,6 @@ def _masks_delta(bsdf: Any) -> bool:
     return any(
         mi.has_flag(bsdf.flags(), kind) for kind in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
     )
-
-
-def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | None, float | None]:
-    """The range that makes physical sense, from the names Mitsuba gives to its parameters."""
-    node = parameters.properties[key][2]
-    names = key.split(".")
-    role = next((n for n in reversed(names) if n not in ("value", "data", "color0", "color1", "scale")), "")
-    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Medium)):
-        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
-    if isinstance(node, mi.Emitter):
-        if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data"):
-            return 0.0, None
-        return {"turbidity": (1.0, 10.0), "albedo": (0.0, 1.0)}.get(role, (None, None))
-    if isinstance(node, mi.Medium):
-        if role == "emission" and f"{key.rpartition('.emission')[0]}.{COEFFICIENT}1.data" in parameters:
-            return None, None
-        ranges = {"sigma_t": (0.0, None), "albedo": (0.0, 1.0), "emission": (0.0, None), "g": (-0.99, 0.99)}
-        return ranges.get(role, (None, None))
-    if not isinstance(node, mi.BSDF):
-        return None, None
-    if role in ("alpha", "alpha_u", "alpha_v", "roughness"):
-        return 0.02, 1.0
-    if role in ("eta", "k"):
-        return 0.0, None
-    if role == "normalmap":
-        return 0.0, 1.0
-    if role in (
-        "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "diffuse_transmittance",
-        "transmittance", "base_color", "metallic", "specular", "anisotropic", "spec_tint", "sheen", "sheen_tint",
-        "clearcoat", "clearcoat_gloss", "spec_trans", "flatness", "diff_trans", "opacity", "weight",
-    ):  # fmt: skip
-        return 0.0, 1.0
-    return None, None
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:

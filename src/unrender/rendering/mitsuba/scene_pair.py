@@ -26,7 +26,9 @@ from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits, physical_range
+from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits
+from unrender.rendering.mitsuba.range_table import Range
+from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
@@ -67,6 +69,7 @@ class ScenePair:
         self._current = LoadedScene(description, moving, self.replaced)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
+        self._readers = SlotReaders(self.current)
         known = self.volumetric and not self.single
         self._grid_transforms = extinction_transforms(self._current.source) if known else {}
         self._check_media()
@@ -267,7 +270,8 @@ class ScenePair:
         for key in self.current_parameters.keys():  # noqa: SIM118 (iterating gives pairs)
             if not parameter_traits(self.current_parameters, key).medium:
                 continue
-            low, high = physical_range(self.current_parameters, key)
+            physical = self.physical_range(key)
+            low, high = physical.low, physical.high
             values = self._current.value(key).numpy()
             if not np.isfinite(values).all():
                 raise InputError(f"scene: {key} holds values that are not finite")
@@ -296,6 +300,10 @@ class ScenePair:
             return replace(traits, reason="it is the opacity of a mask in a scene with media", replayable=False)
         return traits
 
+    def physical_range(self, key: str) -> Range:
+        """Return the physical range of a parameter, from the slots that read it."""
+        return self._readers.range_of(self.current_parameters, key)
+
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
         return {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
@@ -319,21 +327,24 @@ class ScenePair:
             if key.endswith(".data") and dr.is_tensor_v(value):
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
-            low, high = physical_range(self.current_parameters, key)
-            return ParameterInfo(shape, False, False, why, low, high, perturbable=able)
+            limits = self.physical_range(key)
+            return ParameterInfo(
+                shape, False, False, why, limits.low, limits.high, perturbable=able, singular=limits.singular
+            )
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
-        low, high = physical_range(self.current_parameters, key)
+        limits = self.physical_range(key)
         if not traits.replayable:
-            return ParameterInfo(shape, False, False, traits.reason, low, high)
+            return ParameterInfo(shape, False, False, traits.reason, limits.low, limits.high, singular=limits.singular)
         return ParameterInfo(
             shape,
             True,
             traits.shares_paths,
             traits.reason,
-            low,
-            high,
+            limits.low,
+            limits.high,
+            singular=limits.singular,
             resizable=self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
             welded=key.endswith(".vertex_positions"),
