@@ -42,6 +42,9 @@ from unrender.problem.bounds import project
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.mitsuba.range_table import Range
+from unrender.rendering.mitsuba.ranges import SlotReaders
+from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.response import curve
@@ -72,9 +75,11 @@ __all__ = [
     "Optimizer",
     "PixelSampler",
     "PlainState",
+    "Range",
     "RenderSession",
     "Renderer",
     "SampleRequest",
+    "SlotReaders",
     "Smoke",
     "Tree",
     "Whole",
@@ -98,6 +103,7 @@ __all__ = [
     "image_step",
     "leave_one_out_groups",
     "light_turns",
+    "load_scene",
     "loss_derivative",
     "method",
     "method_parts",

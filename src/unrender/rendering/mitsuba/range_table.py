@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-__all__ = ["CLASSES", "KINDS", "Range"]
+__all__ = ["CLASSES", "KINDS", "UNKNOWN", "Range"]
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Range:
     Attributes:
         low: smallest value; None where there is none.
         high: largest value; None where there is none.
-        unit: of the values; "1" for a pure number.
+        unit: of the values; "1" for a pure number, "" where the slot is unknown.
         singular: value between `low` and `high` at which images are singular; values stay on one side of it.
         above: another parameter of the same object, whose value in the scene is a lower limit, "" for none.
         below: another parameter of the same object, whose value in the scene is an upper limit, "" for none.
@@ -47,6 +47,9 @@ class Range:
         singular = other.singular if self.singular is None else self.singular
         return replace(self, low=low, high=high, singular=singular)
 
+
+UNKNOWN = Range(unit="")
+"""Range of a slot without an entry, such as one of a plugin that is not Mitsuba's."""
 
 _SHARE = Range(0.0, 1.0)
 _ROUGHNESS = Range(0.02, 1.0)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
-from unrender.rendering.mitsuba.range_table import CLASSES, KINDS, Range
+from unrender.rendering.mitsuba.range_table import CLASSES, KINDS, UNKNOWN, Range
 
 __all__ = ["SlotReaders", "entry"]
 
@@ -46,7 +47,7 @@ class SlotReaders:
                 self._attributes.setdefault(found[1], []).append(node)
 
     def range_of(self, parameters: mi.SceneParameters, key: str) -> Range:
-        """Return the range of the parameter `key`; an open one where no slot that reads it is known."""
+        """Return the range of the parameter `key`; `UNKNOWN` where no slot that reads it is known."""
         node, leaf = parameters.properties[key][2], key.rpartition(".")[2]
         found = self._of_slot(node, leaf)
         low, high = found.low, found.high
@@ -56,7 +57,7 @@ class SlotReaders:
                 value: Any = parameters[name]
                 limit = float(value[0])
                 low, high = (limit, high) if is_lower else (low, limit)
-        return Range(low, high, found.unit, found.singular)
+        return replace(found, low=low, high=high)
 
     def _of_slot(self, node: Any, slot: str) -> Range:
         if isinstance(node, (mi.Texture, mi.Volume)) and slot in _CARRIED:
@@ -67,7 +68,7 @@ class SlotReaders:
             return self._of_attribute(node, slot)
         if isinstance(node, mi.Medium) and slot.startswith(COEFFICIENT):
             return Range(unit="radiance")
-        return Range()
+        return UNKNOWN
 
     def _of_readers(self, node: Any) -> Range:
         """Return the range that serves all slots that hold a texture or volume."""
@@ -78,7 +79,7 @@ class SlotReaders:
             else:
                 each = self._of_slot(holder, slot)
             found = each if found is None else found.both(each)
-        return found or Range()
+        return found or UNKNOWN
 
     def _of_attribute(self, shape: Any, name: str) -> Range:
         """Return the range of a shape's attribute: of the slots whose textures read it from this shape, divided by their scale."""
@@ -90,7 +91,7 @@ class SlotReaders:
             scale = float(match[2]) if match else 1.0
             each = self._of_readers(texture).scaled(scale)
             found = each if found is None else found.both(each)
-        return found or Range()
+        return found or UNKNOWN
 
     def _shapes_of(self, node: Any) -> set[Any]:
         """Return the shapes that hold an object, directly or through others."""
