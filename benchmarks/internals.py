@@ -45,6 +45,8 @@ from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.range_table import Range
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
+from unrender.rendering.mitsuba.scene_loading import media
+from unrender.rendering.mitsuba.scene_objects import holders
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.response import curve
@@ -100,11 +102,13 @@ __all__ = [
     "gradient_of",
     "hardly_seen",
     "hardware",
+    "holders",
     "image_step",
     "leave_one_out_groups",
     "light_turns",
     "load_scene",
     "loss_derivative",
+    "media",
     "method",
     "method_parts",
     "mi",

@@ -11,7 +11,7 @@ from typing import Any
 import unrender as ur
 from benchmarks import markdown
 from benchmarks.coverage.scenes import PLUGINS, Plugin
-from benchmarks.internals import Range, SlotReaders, dr, load_scene, mi
+from benchmarks.internals import Range, SlotReaders, dr, holders, load_scene, mi
 from benchmarks.runner.catalogue import ROOT
 
 __all__ = ["PAGE", "Row", "missing", "page", "rows"]
@@ -47,7 +47,7 @@ def rows(name: str, plugin: Plugin) -> list[Row]:
             scene = load_scene(plugin.build(Path(folder)))
         except ur.InputError:
             return []
-        parameters, readers = mi.traverse(scene), SlotReaders(scene)
+        parameters, readers = mi.traverse(scene), SlotReaders(holders(scene))
         return [
             Row(name, plugin.kind, short, readers.range_of(parameters, key))
             for key, short in _own_keys(parameters, plugin.prefixes)

@@ -25,9 +25,11 @@ from unrender.core.text import reason_of
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
+from unrender.rendering.mitsuba.scene_objects import check_plugins, holders, traverse
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
@@ -136,6 +138,7 @@ class LoadedScene:
         scene: as Mitsuba has it.
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps that it holds.
         meshed: ids of spheres that have become meshes.
+        readers: which slots read the parameters' values.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
@@ -152,8 +155,11 @@ class LoadedScene:
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
+        objects = holders(self.scene)
+        check_plugins(self.scene, objects)
+        self.readers = SlotReaders(objects)
         _make_distributions(self.scene)
-        self.parameters: mi.SceneParameters = mi.traverse(self.scene)
+        self.parameters: mi.SceneParameters = traverse(self.scene)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
         for key in self.parameters.keys():  # noqa: SIM118 (iterating gives pairs)

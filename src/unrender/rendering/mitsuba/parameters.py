@@ -9,7 +9,14 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.specular import DELTA_EQUAL, DELTA_MASK, DELTA_SIMPLE
 
-__all__ = ["ParameterTraits", "is_of_vertices", "normals_key", "parameter_traits"]
+__all__ = [
+    "ParameterTraits",
+    "is_of_vertices",
+    "normals_key",
+    "parameter_traits",
+    "transform_obstacle",
+    "update_obstacle",
+]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
 # depend on the parameter.
@@ -78,6 +85,10 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
             return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
         if shapes[-1].is_sensor():
             return ParameterTraits(True, None, "it moves a shape that carries a sensor", replayable=False)
+        if leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED):
+            kind = shapes[0].class_name()
+            why = f"it changes the outline of a shape ({kind}), which path gradients follow by vertex positions only"
+            return ParameterTraits(True, None, why, replayable=False)
         return ParameterTraits(True, None, "it moves a shape")
     return ParameterTraits(True, None, "it is neither a material's nor an emitter's")
 
@@ -108,6 +119,27 @@ def _masks_delta(bsdf: Any) -> bool:
     return any(
         mi.has_flag(bsdf.flags(), kind) for kind in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
     )
+
+
+def transform_obstacle(scene: mi.Scene, parameters: mi.SceneParameters, key: str) -> str:
+    """Return why the object whose transformation is `key` has no pose, "" where it has one."""
+    node: Any = parameters.properties[key][2]
+    if isinstance(node, mi.Emitter):
+        return f"it places an emitter ({node.class_name()}), which has no pose"
+    if isinstance(node, mi.Sensor) and not any(node.id() == sensor.id() for sensor in scene.sensors()):
+        return "it places a sensor of a batch, which has no pose of its own; give the sensors to the scene one by one"
+    if isinstance(node, mi.Shape) and node.is_emitter():
+        return "it places a shape that emits light, which has no pose"
+    if isinstance(node, mi.Shape) and node.is_sensor():
+        return "it places a shape that carries a sensor, which has no pose"
+    return ""
+
+
+def update_obstacle(parameters: mi.SceneParameters, key: str) -> str:
+    """Return why a parameter cannot be given another value, "" where it can."""
+    if key.endswith(".grid") and parameters.properties[key][2].class_name() == "SDFGrid":
+        return "Mitsuba's sdfgrid corrupts memory when its distances change; recover a mesh's vertex_positions"
+    return ""
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.range_table import CLASSES, KINDS, UNKNOWN, Range
+from unrender.rendering.mitsuba.scene_objects import Holders, children, class_name
 
 __all__ = ["SlotReaders", "entry"]
 
@@ -27,24 +27,12 @@ class SlotReaders:
     counts: a texture that two BSDFs share gets the range that serves both.
     """
 
-    def __init__(self, scene: Any):
-        self._holders: dict[Any, list[tuple[Any, str]]] = {scene: []}
-        pending = [scene]
-        while pending:
-            node = pending.pop()
-            for name, child in _children(node):
-                if child not in self._holders:
-                    self._holders[child] = []
-                    pending.append(child)
-                self._holders[child].append((node, name))
+    def __init__(self, found: Holders):
+        self._holders = found
         self._attributes: dict[str, list[Any]] = {}
         for node in self._holders:
-            if (
-                isinstance(node, mi.Texture)
-                and _class(node) == "MeshAttribute"
-                and (found := _ATTRIBUTE.search(str(node)))
-            ):
-                self._attributes.setdefault(found[1], []).append(node)
+            if isinstance(node, mi.Texture) and (name := _attribute(node)[0]):
+                self._attributes.setdefault(name, []).append(node)
 
     def range_of(self, parameters: mi.SceneParameters, key: str) -> Range:
         """Return the range of the parameter `key`; `UNKNOWN` where no slot that reads it is known."""
@@ -87,9 +75,7 @@ class SlotReaders:
         for texture in self._attributes.get(name, []):
             if shape not in self._shapes_of(texture):
                 continue
-            match = _ATTRIBUTE.search(str(texture))
-            scale = float(match[2]) if match else 1.0
-            each = self._of_readers(texture).scaled(scale)
+            each = self._of_readers(texture).scaled(_attribute(texture)[1])
             found = each if found is None else found.both(each)
         return found or UNKNOWN
 
@@ -106,50 +92,20 @@ class SlotReaders:
         return found
 
 
+def _attribute(texture: Any) -> tuple[str, float]:
+    """Return the attribute that a texture reads and its scale; "" where it reads none."""
+    match = _ATTRIBUTE.search(str(texture)) if class_name(texture) == "MeshAttribute" else None
+    return ("", 1.0) if match is None else (match[1], float(match[2]))
+
+
 def entry(node: Any, slot: str) -> Range | None:
     """Return what the table says of a slot of an object, None where it has no entry."""
-    own = CLASSES.get(_class(node), {})
+    own = CLASSES.get(class_name(node), {})
     if slot in own:
         return own[slot]
     kind = next((KINDS[name] for name in _KINDS if isinstance(node, getattr(mi, name))), {})
     return kind.get(slot)
 
 
-def _class(node: Any) -> str:
-    return node.class_name().partition("[")[0]
-
-
 def _has_harmonics(medium: Any) -> bool:
-    return any(name == f"{COEFFICIENT}1" for name, _ in _children(medium))
-
-
-def _children(node: Any) -> list[tuple[str, Any]]:
-    """Return the objects that an object holds, with the names of their slots."""
-    found = _callback(mi.variant())()
-    node.traverse(found)
-    return found.objects
-
-
-@cache
-def _callback(variant: str | None) -> Any:
-    del variant  # the base class is that of the variant that is set
-
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            super().__init__()
-            self.objects: list[tuple[str, Any]] = []
-
-        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
-            del cpptype
-            if isinstance(value, mi.Object):
-                self.put_object(name, value, flags)
-
-        def put_value(self, name: str, ptr: Any, flags: Any, cpptype: Any) -> None:
-            del name, ptr, flags, cpptype
-
-        def put_object(self, name: str, obj: Any, flags: Any) -> None:
-            del flags
-            if obj is not None:
-                self.objects.append((name, obj))
-
-    return Children
+    return any(name == f"{COEFFICIENT}1" for name, _ in children(medium))

@@ -26,9 +26,14 @@ from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
-from unrender.rendering.mitsuba.parameters import ParameterTraits, is_of_vertices, parameter_traits
+from unrender.rendering.mitsuba.parameters import (
+    ParameterTraits,
+    is_of_vertices,
+    parameter_traits,
+    transform_obstacle,
+    update_obstacle,
+)
 from unrender.rendering.mitsuba.range_table import Range
-from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh
@@ -69,7 +74,6 @@ class ScenePair:
         self._current = LoadedScene(description, moving, self.replaced)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
-        self._readers = SlotReaders(self.current)
         known = self.volumetric and not self.single
         self._grid_transforms = extinction_transforms(self._current.source) if known else {}
         self._check_media()
@@ -302,7 +306,7 @@ class ScenePair:
 
     def physical_range(self, key: str) -> Range:
         """Return the physical range of a parameter, from the slots that read it."""
-        return self._readers.range_of(self.current_parameters, key)
+        return self._current.readers.range_of(self.current_parameters, key)
 
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
@@ -314,7 +318,8 @@ class ScenePair:
         try:
             shape = native_shape(value)
         except TypeError:
-            why = f"its type {type(value).__name__} has no derivatives"
+            why = transform_obstacle(self.current, self.current_parameters, key) if key.endswith("to_world") else ""
+            why = why or f"its type {type(value).__name__} has no derivatives"
             return ParameterInfo((), False, False, why, perturbable=False)
         if re.match(r"object_\d{9,}\.", key):
             why = "its object has no id in the XML, so its name changes; give it one"
@@ -322,6 +327,8 @@ class ScenePair:
         if isinstance(value, (int, float)):
             why = "it is a plain number, which Mitsuba compiles into its kernels"
             return ParameterInfo(shape, False, False, why, perturbable=False, compiled=True)
+        if why := update_obstacle(self.current_parameters, key):
+            return ParameterInfo(shape, False, False, why, perturbable=False)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             why = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):

@@ -1,0 +1,124 @@
+"""Plugins that cannot be used are refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from benchmarks.coverage.scenes import PLUGINS, colour, scene
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+
+def refusal(description: Any, key: str | None = None, derivatives: bool = True) -> str:
+    """The line that refuses a scene, or one of its parameters."""
+
+    def use() -> None:
+        if key is None:
+            MitsubaRenderer(description, 3)
+        elif derivatives:
+            ur.Problem(description, [ur.Parameter(key)], [ur.View(np.zeros((16, 16, 3)))])
+        else:
+            MitsubaRenderer(description, 3).prepare([key], None)
+
+    with pytest.raises(ur.InputError) as caught:
+        use()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def built(name: str) -> Callable[[], dict[str, Any]]:
+    folder = Path(tempfile.mkdtemp())
+    return lambda: PLUGINS[name].build(folder)
+
+
+SPECTRA = {
+    "regular": {"wavelength_min": 400.0, "wavelength_max": 700.0, "values": "1,2,3"},
+    "irregular": {"wavelengths": "400,500,700", "values": "1,2,3"},
+    "blackbody": {"temperature": 3000.0},
+}
+
+
+@pytest.mark.parametrize("kind", SPECTRA)
+@pytest.mark.parametrize("slot", ["reflectance", "index of refraction", "textured light"])
+def test_spectra_that_rgb_variants_cannot_evaluate_are_refused(kind: str, slot: str) -> None:
+    spectrum = {"type": kind, **SPECTRA[kind]}
+    ball: dict[str, Any] = {"type": "sphere"}
+    if slot == "textured light":
+        ball["emitter"] = {"type": "area", "radiance": {"type": "checkerboard", "color0": spectrum}}
+    elif slot == "reflectance":
+        ball["bsdf"] = {"type": "twosided", "b": {"type": "diffuse", "reflectance": spectrum}}
+    else:
+        ball["bsdf"] = {"type": "conductor", "eta": spectrum, "k": spectrum}
+    assert f"cannot evaluate the plugin {kind} in the variant" in refusal(scene(ball=ball))
+
+
+def test_a_timed_sky_and_a_field_of_primitives_are_refused() -> None:
+    assert "give a sunsky in its place" in refusal(scene(sky={"type": "timed_sunsky"}))
+    field = scene(ball=built("ellipsoids")()["ball"], integrator={"type": "volprim_rf_basic"})
+    assert "volprim_rf_basic renders ellipsoids as a radiance field" in refusal(field)
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "diffuse", "reflectance": {"type": "bitmap"}}, {"type": "blendbsdf"}])
+def test_objects_without_what_they_need_do_not_end_the_process(bsdf: dict[str, Any]) -> None:
+    assert "expected " in refusal(scene(ball={"type": "sphere", "bsdf": bsdf}))
+
+
+def test_hair_with_pigments_renders_and_its_pigments_change_the_picture() -> None:
+    renderer = MitsubaRenderer(built("hair"), 3)
+    assert "ball.bsdf.sigma_a" not in renderer.parameters()
+    key = "ball.bsdf.eumelanin"
+    session = renderer.prepare([key], None, False)
+    states = {key: np.array([0.1, 2.0], np.float32)}
+    light, dark = np.array(session.image_batch(states, SampleRequest(0, 16, 1)))
+    assert np.isfinite(light).all()
+    assert dark.mean() < light.mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("bsplinecurve", "control_points"), ("ellipsoids", "data"), ("ellipsoidsmesh", "data")],
+)
+def test_outlines_of_shapes_that_are_no_meshes_have_no_path_gradient(name: str, key: str) -> None:
+    line = refusal(built(name), f"ball.{key}", derivatives=False)
+    assert "path gradients follow by vertex positions only" in line
+
+
+def test_a_grid_of_distances_is_refused_where_mitsuba_would_corrupt_memory() -> None:
+    assert "corrupts memory when its distances change" in refusal(built("sdfgrid"), "ball.grid")
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("sun.to_world", "it places an emitter (DirectionalEmitter), which has no pose"),
+        ("sun.rotation", "sun.to_world: it places an emitter (DirectionalEmitter), which has no pose"),
+        ("beamer.rotation", "it places an emitter (Projector), which has no pose"),
+        ("lamp.to_world", "it places a shape that emits light, which has no pose"),
+        ("lamp.translation", "it places a shape that emits light, which has no pose"),
+        ("ball.center", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+        ("ball.radius", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+        ("ball.to_world", "its pose can be: ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+    ],
+)
+def test_what_has_no_pose_is_named(key: str, words: str) -> None:
+    sun = {"type": "directional", "direction": [0, -1, 0], "irradiance": colour(1, 1, 1)}
+    beamer = {"type": "projector", "irradiance": colour(1, 1, 1)}
+    assert words in refusal(scene(sun=sun, beamer=beamer), key)
+
+
+def test_a_sensor_of_a_batch_has_no_pose_of_its_own() -> None:
+    line = refusal(built("batch"), "camera.left.to_world")
+    assert "it places a sensor of a batch" in line
+    assert "emits light" not in line
+
+
+def test_phase_functions_load_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    MitsubaRenderer(built("sggx"), 3).prepare([], None, False).image({}, SampleRequest(0, 4, 1))
+    assert capfd.readouterr().err == ""
