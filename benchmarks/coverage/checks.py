@@ -12,6 +12,8 @@ __all__ = ["Agreement", "descended", "gradients_agree", "images_agree"]
 _TRUNCATION = 0.01
 """Share of a finite difference that its own truncation may account for."""
 _SIGMAS = 5.0
+_SQUARE_SIGMAS = 7.0
+"""Limit of single squares: rare bright paths have longer tails than a normal distribution."""
 _RESOLVED = 0.03
 """A comparison that could not see this relative difference is reported as weak."""
 
@@ -49,9 +51,10 @@ def images_agree(ours: np.ndarray, theirs: np.ndarray) -> Agreement:
     mean = float(theirs.mean())
     error = float(np.sqrt(_variance(ours.mean((1, 2, 3))) + _variance(theirs.mean((1, 2, 3)))))
     z = max(float(np.max(np.abs(total))), float(np.max(np.abs(found))))
+    differ = np.max(np.abs(total)) > _SIGMAS or np.max(np.abs(found)) > _SQUARE_SIGMAS
     if mean == 0:
         return Agreement(None, error, z, "ok" if not ours.any() else "wrong")
-    verdict = "wrong" if z > _SIGMAS else "weak" if _SIGMAS * error > _RESOLVED * abs(mean) else "ok"
+    verdict = "wrong" if differ else "weak" if _SIGMAS * error > _RESOLVED * abs(mean) else "ok"
     return Agreement(float(ours.mean()) / mean, error / abs(mean), z, verdict)
 
 

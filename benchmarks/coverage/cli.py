@@ -24,19 +24,22 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--ranges", action="store_true", help="write docs/reference/ranges.md alone")
     parser.add_argument("--page", action="store_true", help="write the pages from the record, measure nothing")
     parser.add_argument("--no-descent", action="store_true", help="leave out the descents")
+    parser.add_argument("--record", type=Path, default=RECORD, help="the record's file")
     given = parser.parse_args(arguments)
     ur.use()
     from benchmarks.coverage import coverage_page, ranges_page
-    from benchmarks.coverage.scenes import PLUGINS
+    from benchmarks.coverage.plugins import PLUGINS
 
     if not (given.ranges or given.page):
-        record = json.loads(RECORD.read_text()) if RECORD.is_file() else {}
+        record = json.loads(given.record.read_text()) if given.record.is_file() else {}
         for name in given.plugins or PLUGINS:
             record[name] = _measure_apart(name, not given.no_descent)
             print(name, json.dumps(record[name]), flush=True)
-            RECORD.write_text(json.dumps({key: record[key] for key in PLUGINS if key in record}, indent=1) + "\n")
+            given.record.write_text(json.dumps({key: record[key] for key in PLUGINS if key in record}, indent=1) + "\n")
+    if given.record != RECORD:
+        return 0
     if not given.ranges:
-        coverage_page.PAGE.write_text(coverage_page.page(json.loads(RECORD.read_text())))
+        coverage_page.PAGE.write_text(coverage_page.page(json.loads(given.record.read_text())))
         print(f"wrote {coverage_page.PAGE}")
     ranges_page.PAGE.write_text(ranges_page.page())
     print(f"wrote {ranges_page.PAGE}")

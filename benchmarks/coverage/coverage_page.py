@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks import markdown
-from benchmarks.coverage.scenes import PLUGINS
+from benchmarks.coverage.plugins import PLUGINS
 from benchmarks.runner.catalogue import ROOT
 
 __all__ = ["PAGE", "page"]

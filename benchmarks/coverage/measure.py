@@ -10,13 +10,14 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.coverage.checks import descended, gradients_agree, images_agree
-from benchmarks.coverage.scenes import PLUGINS, Plugin
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import Plugin
 from benchmarks.internals import SampleRequest, load_scene, media, mi, mitsuba_renderer
 
 __all__ = ["measure"]
 
 DEPTH = 4
-RUNS, SPP = 10, 64
+RUNS, SPP = 16, 64
 STEPS = 30
 _UNROULETTED = 1000
 _AXES = (".x", ".y", ".z")
@@ -76,7 +77,7 @@ def _weights(shape: tuple[int, ...]) -> np.ndarray:
 
 def _direction(key: str, value: np.ndarray, scale: float) -> np.ndarray:
     rng = np.random.default_rng(4)
-    if key.endswith(("vertex_positions", "control_points", ".data", "vertex_normals")) and value.ndim == 1:
+    if key.endswith(("vertex_positions", "control_points", "vertex_normals", "nested_texture.data")):
         return scale * rng.normal(size=value.shape)
     return scale * rng.uniform(0.5, 1.5, value.shape)
 

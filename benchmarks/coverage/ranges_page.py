@@ -10,7 +10,8 @@ from typing import Any
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.coverage.scenes import PLUGINS, Plugin
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import Plugin
 from benchmarks.internals import Range, SlotReaders, dr, holders, load_scene, mi
 from benchmarks.runner.catalogue import ROOT
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from benchmarks.internals import mi
 
-__all__ = ["PLUGINS", "Plugin", "wheel"]
-
 SIZE = 16
 Description = dict[str, Any]
 Build = Callable[[Path], Description]
@@ -53,10 +51,10 @@ def bitmap(seed: int = 2, channels: int = 3, low: float = 0.2, high: float = 0.8
 
 def grid(channels: int = 1, low: float = 0.2, high: float = 0.8) -> Description:
     values = np.random.default_rng(3).uniform(low, high, (3, 3, 3, channels)).astype(np.float32)
-    return {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True, "to_world": _unit_cube()}
+    return {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True, "to_world": unit_cube()}
 
 
-def _unit_cube() -> Any:
+def unit_cube() -> Any:
     return mi.ScalarTransform4f().translate([-0.7, -0.7, -0.7]).scale(1.4)
 
 
@@ -117,15 +115,15 @@ def _copy(description: Description) -> Description:
     }
 
 
-def _bsdf(kind: str, **own: Any) -> Plugin:
+def bsdf(kind: str, **own: Any) -> Plugin:
     return Plugin("BSDF", material({"type": kind, **own}), ("ball.bsdf",))
 
 
-def _texture(kind: str, make: Callable[[], Description] | None = None, **own: Any) -> Plugin:
+def textured(kind: str, make: Callable[[], Description] | None = None, **own: Any) -> Plugin:
     return Plugin("texture", texture(make or (lambda: {"type": kind, **own})), ("ball.bsdf.reflectance",))
 
 
-def _emitter(kind: str, place: Callable[[], Any] | None = None, **own: Any) -> Plugin:
+def emitting(kind: str, place: Callable[[], Any] | None = None, **own: Any) -> Plugin:
     def build(folder: Path) -> Description:
         given = _copy({"type": kind, **own})
         if place is not None:
@@ -135,7 +133,7 @@ def _emitter(kind: str, place: Callable[[], Any] | None = None, **own: Any) -> P
     return Plugin("emitter", build, ("light",))
 
 
-def _area(kind: str, **own: Any) -> Plugin:
+def area(kind: str, **own: Any) -> Plugin:
     def build(folder: Path) -> Description:
         found = scene(sky=None)
         found["lamp"]["emitter"] = _copy({"type": kind, **own})
@@ -144,7 +142,7 @@ def _area(kind: str, **own: Any) -> Plugin:
     return Plugin("emitter", build, ("lamp.emitter",))
 
 
-def _shape(kind: str, aborts: bool = False, **own: Any) -> Plugin:
+def shaped(kind: str, aborts: bool = False, **own: Any) -> Plugin:
     def build(folder: Path) -> Description:
         bsdf = {"type": "diffuse", "reflectance": colour(0.6, 0.4, 0.3)}
         given = {key: value(folder) if callable(value) else value for key, value in own.items()}
@@ -153,7 +151,7 @@ def _shape(kind: str, aborts: bool = False, **own: Any) -> Plugin:
     return Plugin("shape", build, ("ball",), aborts)
 
 
-def _mesh_file(ending: str) -> Callable[[Path], str]:
+def mesh_file(ending: str) -> Callable[[Path], str]:
     def write(folder: Path) -> str:
         path = folder / f"mesh.{ending}"
         mesh: Any = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5)})
@@ -171,7 +169,7 @@ def _mesh_file(ending: str) -> Callable[[Path], str]:
     return write
 
 
-def _serialized(folder: Path) -> str:
+def serialized(folder: Path) -> str:
     """A file of Mitsuba's binary format, version 4, with one mesh."""
     import struct
     import zlib
@@ -186,29 +184,29 @@ def _serialized(folder: Path) -> str:
     return str(path)
 
 
-def _curve(folder: Path) -> str:
+def curve_file(folder: Path) -> str:
     points = [(-1.0, 0.2), (-0.6, -0.3), (-0.2, 0.3), (0.2, -0.3), (0.6, 0.3), (1.0, -0.2)]
     path = folder / "curve.txt"
     path.write_text("\n".join(f"{x} {y} 0 0.2" for x, y in points) + "\n")
     return str(path)
 
 
-def _ellipsoids(folder: Path) -> Any:
+def ellipsoids(folder: Path) -> Any:
     row = [0, 0, 0, 0.6, 0.4, 0.5, 0, 0, 0, 1], [0.6, 0.3, 0, 0.2, 0.3, 0.2, 0, 0, 0, 1]
     return mi.TensorXf(np.array(row, np.float32))
 
 
-def _distance(folder: Path) -> Any:
+def distances(folder: Path) -> Any:
     axis = np.linspace(-0.5, 0.5, 6)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     return mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.35).astype(np.float32)[..., None])
 
 
-def _centred(folder: Path) -> Any:
-    return _unit_cube()
+def centred(folder: Path) -> Any:
+    return unit_cube()
 
 
-def _attribute(folder: Path) -> Description:
+def attribute(folder: Path) -> Description:
     def mesh() -> Any:
         bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
         made: Any = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5), "bsdf": bsdf})
@@ -219,7 +217,7 @@ def _attribute(folder: Path) -> Description:
     return scene(ball=mesh())
 
 
-def _group(folder: Path) -> Description:
+def group(folder: Path) -> Description:
     to = mi.ScalarTransform4f
     group = {
         "type": "shapegroup",
@@ -232,7 +230,7 @@ def _group(folder: Path) -> Description:
     return scene(ball=None, group=group, **places)
 
 
-def _merge(folder: Path) -> Description:
+def merge(folder: Path) -> Description:
     part = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.4), "bsdf": {"type": "diffuse"}}
     return scene(
         ball={
@@ -243,7 +241,7 @@ def _merge(folder: Path) -> Description:
     )
 
 
-def _measured(polarized: bool) -> Build:
+def measured(polarized: bool) -> Build:
     def build(folder: Path) -> Description:
         path = folder / "measured.bsdf"
         path.write_bytes(b"tensor_file\0\1\0" + b"\0" * 8)
@@ -257,16 +255,16 @@ def _measured(polarized: bool) -> Build:
     return build
 
 
-def _medium(kind: str, **own: Any) -> Plugin:
+def filled(kind: str, **own: Any) -> Plugin:
     return Plugin("medium", _fog({"type": kind, **own}), ("ball.interior_medium",))
 
 
-def _phase(kind: str, **own: Any) -> Plugin:
+def phase(kind: str, **own: Any) -> Plugin:
     medium = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.5, "phase": {"type": kind, **own}}
     return Plugin("phase function", _fog(medium), ("ball.interior_medium.phase_function",))
 
 
-def _volume(make: Callable[[], Description]) -> Plugin:
+def density(make: Callable[[], Description]) -> Plugin:
     medium = {"type": "heterogeneous", "albedo": 0.8, "sigma_t": make, "scale": 2.0}
     return Plugin("volume", _fog(medium), ("ball.interior_medium.sigma_t",))
 
@@ -282,11 +280,11 @@ def _fog(medium: Description) -> Build:
     )
 
 
-def _sensor(kind: str, **own: Any) -> Plugin:
+def seen_by(kind: str, **own: Any) -> Plugin:
     return Plugin("sensor", lambda folder: scene(camera=sensor(kind, **_copy(own))), ("camera",))
 
 
-def _meter(kind: str, **own: Any) -> Plugin:
+def metered(kind: str, **own: Any) -> Plugin:
     def build(folder: Path) -> Description:
         place = {} if "direction" in own else {"to_world": view()}
         return scene(camera={"type": kind, "film": film(width=1, height=1), **place, **own})
@@ -294,7 +292,7 @@ def _meter(kind: str, **own: Any) -> Plugin:
     return Plugin("sensor", build, ("camera",))
 
 
-def _irradiance(folder: Path) -> Description:
+def irradiance(folder: Path) -> Description:
     plate = {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().translate([0, 0, 2]),
@@ -303,146 +301,28 @@ def _irradiance(folder: Path) -> Description:
     return scene(camera=None, plate=plate)
 
 
-def _batch(folder: Path) -> Description:
+def batch(folder: Path) -> Description:
     left = sensor(to_world=view() @ mi.ScalarTransform4f().translate([0.3, 0, 0]))
     return scene(camera={"type": "batch", "left": left, "right": sensor(), "film": film(width=2 * SIZE)})
 
 
-def _filter(kind: str) -> Plugin:
+def filtered(kind: str) -> Plugin:
     return Plugin("filter", lambda folder: scene(camera=sensor(film=film(rfilter={"type": kind}))), ("floor.bsdf",))
 
 
-def _sampler(kind: str) -> Plugin:
+def sampled(kind: str) -> Plugin:
     return Plugin(
         "sampler", lambda folder: scene(camera=sensor(sampler={"type": kind, "sample_count": 16})), ("floor.bsdf",)
     )
 
 
-def _integrator(kind: str, **own: Any) -> Plugin:
+def integrated(kind: str, **own: Any) -> Plugin:
     return Plugin("integrator", lambda folder: scene(integrator=_copy({"type": kind, **own})), ("floor.bsdf",))
 
 
-def _pointing() -> Any:
+def pointing() -> Any:
     return mi.ScalarTransform4f().look_at([1.5, 2.5, 3], [0, 0, 0], [0, 1, 0])
 
 
-def _sky(seed: int = 5) -> Any:
+def sky_map(seed: int = 5) -> Any:
     return mi.Bitmap(np.random.default_rng(seed).uniform(0.2, 1.5, (4, 8, 3)).astype(np.float32))
-
-
-_PATH = {"type": "path", "max_depth": 6}
-_SGGX = np.tile(np.array([0.3, 0.4, 0.5, 0, 0, 0], np.float32), (2, 2, 2, 1))
-
-PLUGINS: dict[str, Plugin] = {
-    "aov": _integrator("aov", aovs="depth:depth", image=_PATH),
-    "area": _area("area", radiance=colour(6.0, 5.0, 4.0)),
-    "batch": Plugin("sensor", _batch, ("camera",)),
-    "bitmap": _texture("bitmap", bitmap),
-    "blackbody": _texture("blackbody", temperature=3000.0),
-    "blendbsdf": _bsdf("blendbsdf", weight=0.4, a={"type": "diffuse"}, b={"type": "roughconductor", "alpha": 0.3}),
-    "blender": Plugin("shape", lambda folder: scene(ball={"type": "blender"}), ("ball",), True),
-    "blendphase": _phase("blendphase", weight=0.4, a={"type": "isotropic"}, b={"type": "hg", "g": 0.4}),
-    "box": _filter("box"),
-    "bsplinecurve": _shape("bsplinecurve", filename=_curve, aborts=True),
-    "bumpmap": _bsdf("bumpmap", t=lambda: bitmap(3, 1), b={"type": "diffuse"}, scale=0.1),
-    "catmullrom": _filter("catmullrom"),
-    "checkerboard": _texture("checkerboard", color0=colour(0.2, 0.3, 0.4), color1=colour(0.8, 0.6, 0.5)),
-    "circular": _bsdf("circular"),
-    "conductor": _bsdf("conductor", specular_reflectance=colour(0.8, 0.7, 0.6)),
-    "constant": _emitter("constant", radiance=colour(0.8, 0.9, 1.0)),
-    "constvolume": _volume(lambda: {"type": "constvolume", "value": 0.7}),
-    "cube": _shape("cube", to_world=_centred),
-    "cylinder": _shape("cylinder", radius=0.5, p0=[-0.6, 0, 0], p1=[0.6, 0, 0]),
-    "d65": _area("area", radiance={"type": "d65", "scale": 5.0}),
-    "depth": _integrator("depth"),
-    "dielectric": _bsdf("dielectric", specular_transmittance=colour(0.9, 0.8, 0.7)),
-    "diffuse": _bsdf("diffuse", reflectance=bitmap),
-    "direct": _integrator("direct"),
-    "directional": _emitter("directional", _pointing, irradiance=colour(2.0, 1.5, 1.0)),
-    "directionalarea": _area("directionalarea", radiance=colour(6.0, 5.0, 4.0)),
-    "disk": _shape("disk", to_world=_centred),
-    "distant": _meter("distant", direction=[0, -1, 0]),
-    "ellipsoids": _shape("ellipsoids", data=_ellipsoids, aborts=True),
-    "ellipsoidsmesh": _shape("ellipsoidsmesh", data=_ellipsoids, aborts=True),
-    "envmap": Plugin("emitter", lambda folder: scene(lamp=None, sky={"type": "envmap", "bitmap": _sky()}), ("sky",)),
-    "gaussian": _filter("gaussian"),
-    "gridvolume": _volume(grid),
-    "hair": _bsdf("hair", eumelanin=0.3, pheomelanin=0.2),
-    "hair, absorption": _bsdf("hair", sigma_a=colour(0.2, 0.3, 0.4)),
-    "hdrfilm": Plugin("film", lambda folder: scene(), ("floor.bsdf",)),
-    "heterogeneous": _medium("heterogeneous", albedo=lambda: grid(3), sigma_t=grid, scale=2.0),
-    "hg": _phase("hg", g=0.4),
-    "homogeneous": _medium("homogeneous", albedo=colour(0.8, 0.7, 0.6), sigma_t=1.5),
-    "independent": _sampler("independent"),
-    "instance": Plugin("shape", _group, ("group", "copy_0", "copy_1")),
-    "irradiancemeter": Plugin("sensor", _irradiance, ("plate", "camera")),
-    "irregular": _texture("irregular", wavelengths="400,500,700", values="0.2,0.4,0.6"),
-    "isotropic": _phase("isotropic"),
-    "lanczos": _filter("lanczos"),
-    "ldsampler": _sampler("ldsampler"),
-    "linearcurve": _shape("linearcurve", filename=_curve, aborts=True),
-    "mask": _bsdf("mask", opacity=0.6, b={"type": "diffuse"}),
-    "measured": Plugin("BSDF", _measured(False), ("ball.bsdf",)),
-    "measured_polarized": Plugin("BSDF", _measured(True), ("ball.bsdf",)),
-    "merge": Plugin("shape", _merge, ("ball",)),
-    "mesh_attribute": Plugin("texture", _attribute, ("ball",)),
-    "mitchell": _filter("mitchell"),
-    "moment": _integrator("moment", image=_PATH),
-    "multijitter": _sampler("multijitter"),
-    "normalmap": _bsdf("normalmap", normalmap=lambda: bitmap(4, 3, 0.45, 0.55), b={"type": "roughconductor", "alpha": 0.3}),
-    "null": _bsdf("null"),
-    "obj": _shape("obj", filename=_mesh_file("obj")),
-    "orthogonal": _sampler("orthogonal"),
-    "orthographic": _sensor("orthographic"),
-    "path": _integrator("path", max_depth=6),
-    "perspective": _sensor("perspective"),
-    "plastic": _bsdf("plastic", diffuse_reflectance=colour(0.6, 0.4, 0.3), specular_reflectance=colour(0.8, 0.9, 1.0)),
-    "ply": _shape("ply", filename=_mesh_file("ply")),
-    "point": _emitter("point", position=[1.0, 2.0, 2.0], intensity=colour(9.0, 8.0, 6.0)),
-    "polarizer": _bsdf("polarizer"),
-    "pplastic": _bsdf("pplastic", diffuse_reflectance=colour(0.6, 0.4, 0.3), alpha=0.3),
-    "principled": _bsdf(
-        "principled", base_color=bitmap, roughness=0.4, metallic=0.3, anisotropic=0.2, eta=1.5, spec_tint=0.2, sheen=0.3,
-        sheen_tint=0.3, clearcoat=0.4, clearcoat_gloss=0.5, flatness=0.2, spec_trans=0.3,
-    ),
-    "principled, specular": _bsdf("principled", base_color=bitmap, specular=0.4, roughness=0.4),
-    "principledthin": _bsdf(
-        "principledthin", base_color=bitmap, roughness=0.4, anisotropic=0.2, eta=1.5, spec_tint=0.2, sheen=0.3,
-        sheen_tint=0.3, flatness=0.2, spec_trans=0.3, diff_trans=0.6,
-    ),
-    "projector": _emitter("projector", _pointing, irradiance=bitmap, scale=9.0, fov=50.0),
-    "ptracer": _integrator("ptracer"),
-    "radiancemeter": _meter("radiancemeter"),
-    "rawconstant": _texture("rawconstant", value=[0.5, 0.4, 0.3]),
-    "rayleigh": _phase("rayleigh"),
-    "rectangle": _shape("rectangle", to_world=_centred),
-    "regular": _texture("regular", wavelength_min=400.0, wavelength_max=700.0, values="0.2,0.4,0.6"),
-    "retarder": _bsdf("retarder"),
-    "roughconductor": _bsdf("roughconductor", alpha_u=0.3, alpha_v=0.2, specular_reflectance=colour(0.8, 0.7, 0.6)),
-    "roughdielectric": _bsdf("roughdielectric", alpha=0.3, specular_transmittance=colour(0.9, 0.8, 0.7)),
-    "roughdielectric, anisotropic": _bsdf("roughdielectric", alpha_u=0.3, alpha_v=0.2, int_ior=1.0, ext_ior=1.4),
-    "roughplastic": _bsdf("roughplastic", alpha=0.3, diffuse_reflectance=colour(0.6, 0.4, 0.3)),
-    "sdfgrid": _shape("sdfgrid", grid=_distance, to_world=_centred, aborts=True),
-    "serialized": _shape("serialized", filename=_serialized),
-    "sggx": _phase("sggx", S=lambda: {"type": "gridvolume", "grid": mi.VolumeGrid(_SGGX), "raw": True, "to_world": _unit_cube()}),
-    "shapegroup": Plugin("shape", _group, ("group",)),
-    "specfilm": Plugin("film", lambda folder: scene(camera=sensor(film=film(type="specfilm"))), ("floor.bsdf",)),
-    "sphere": _shape("sphere", radius=0.7),
-    "spot": _emitter("spot", _pointing, intensity=colour(20.0, 16.0, 12.0), cutoff_angle=30.0, beam_width=15.0),
-    "srgb": _texture("rgb", value=[0.5, 0.4, 0.3]),
-    "stokes": _integrator("stokes", image=_PATH),
-    "stratified": _sampler("stratified"),
-    "sunsky": _emitter("sunsky", turbidity=4.0),
-    "sunsky, direction": _emitter("sunsky", turbidity=4.0, sun_direction=[0.3, 0.8, 0.5]),
-    "tabphase": _phase("tabphase", values="0.5, 1.0, 1.5"),
-    "tent": _filter("tent"),
-    "thindielectric": _bsdf("thindielectric", specular_transmittance=colour(0.9, 0.8, 0.7)),
-    "thinlens": _sensor("thinlens", aperture_radius=0.2, focus_distance=4.0),
-    "timed_sunsky": _emitter("timed_sunsky", turbidity=4.0),
-    "twosided": _bsdf("twosided", b={"type": "diffuse", "reflectance": bitmap}),
-    "uniform": _texture("uniform", value=0.4),
-    "volpath": _integrator("volpath", max_depth=6),
-    "volpathmis": _integrator("volpathmis", max_depth=6),
-    "volume": _texture("volume", lambda: {"type": "volume", "volume": grid()}),
-}  # fmt: skip
-"""{name: its scene}, all plugins of the wheel of Mitsuba 3.9.1. After a comma, a name says how the plugin differs from its first scene."""

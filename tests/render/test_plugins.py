@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.coverage.scenes import PLUGINS, colour, scene
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import colour, scene
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -122,3 +123,18 @@ def test_a_sensor_of_a_batch_has_no_pose_of_its_own() -> None:
 def test_phase_functions_load_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
     MitsubaRenderer(built("sggx"), 3).prepare([], None, False).image({}, SampleRequest(0, 4, 1))
     assert capfd.readouterr().err == ""
+
+
+def test_a_weight_and_a_light_without_a_derivative_are_refused_by_name() -> None:
+    weight = "ball.interior_medium.phase_function.weight.value.value"
+    assert "blendphase passes no derivative to its weight" in refusal(built("blendphase"), weight, derivatives=False)
+    key = "lamp.emitter.radiance.value"
+    renderer = MitsubaRenderer(built("directionalarea"), 3)
+    session, values = renderer.prepare([key], None), renderer.values([key])
+    paths = session.image(values, SampleRequest(0, 4, 1)).paths
+    with pytest.raises(ur.InputError, match=rf"parameter {key}: the picture depends on it through nothing"):
+        session.adjoint(values, paths, renderer.array(np.ones((1, 16, 16, 3), np.float32)))
+
+
+def test_a_mesh_of_ellipsoids_moves_in_perturbed_renders_only() -> None:
+    assert "is no mesh (EllipsoidsMesh)" in refusal(built("ellipsoidsmesh"), "ball.translation", derivatives=False)

@@ -11,7 +11,8 @@ import pytest
 
 import unrender as ur
 from benchmarks.coverage import ranges_page
-from benchmarks.coverage.scenes import PLUGINS, scene, wheel
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import scene, wheel
 from unrender.rendering.mitsuba.range_table import CLASSES, KINDS
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 

@@ -44,7 +44,8 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
         return "path gradients of moving shapes know no media"
     if shape is None:
         return "path gradients do not move instances"
-    if not shape.is_mesh():
+    known = pair.current_parameters
+    if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in ("vertex_positions", "to_world")):
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():
         return "path gradients do not move emitters"

@@ -29,7 +29,7 @@ from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
-from unrender.rendering.mitsuba.scene_objects import check_plugins, holders, traverse
+from unrender.rendering.mitsuba.scene_objects import holders, refusal, traverse
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
@@ -156,7 +156,10 @@ class LoadedScene:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
         objects = holders(self.scene)
-        check_plugins(self.scene, objects)
+        if why := refusal(self.scene, objects):
+            del self.scene, objects
+            gc.collect()  # what lives on would be called from other scenes' kernels
+            raise InputError(f"scene: {why}")
         self.readers = SlotReaders(objects)
         _make_distributions(self.scene)
         self.parameters: mi.SceneParameters = traverse(self.scene)

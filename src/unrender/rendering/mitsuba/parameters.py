@@ -75,6 +75,9 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
             return ParameterTraits(True, None, "it moves an emitter")
         return ParameterTraits(False, None, "")
     if any(isinstance(n, mi.Medium) for n in chain):
+        if any(n.class_name() == "BlendPhaseFunction" for n in chain) and ".weight." in key:
+            why = "Mitsuba's blendphase passes no derivative to its weight"
+            return ParameterTraits(False, None, why, replayable=False, phase=True)
         volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
         return ParameterTraits(False, None, "", medium=volume, phase=phase)
     if any(isinstance(n, mi.Sensor) for n in chain):

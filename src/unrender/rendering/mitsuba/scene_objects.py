@@ -8,9 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from unrender.core.errors import InputError
-
-__all__ = ["Holders", "check_plugins", "children", "class_name", "holders", "traverse"]
+__all__ = ["Holders", "children", "class_name", "holders", "refusal", "traverse"]
 
 Holders = Mapping[Any, list[tuple[Any, str]]]
 """{object: (object that holds it, name of the slot)}, a pair for every way to it."""
@@ -25,20 +23,23 @@ _SPECTRAL_ONLY = {
 _PRIMITIVE_FIELD = "BasicVolumetricPrimitiveRadianceFieldIntegrator"
 
 
-def check_plugins(scene: Any, objects: Iterable[Any]) -> None:
-    """Raise `InputError` where a scene has a plugin that cannot be rendered, or not as its author means it."""
-    if not str(mi.variant()).endswith("_spectral"):
-        for node in objects:
-            if (plugin := _SPECTRAL_ONLY.get(class_name(node))) is not None:
-                instead = "a sunsky" if plugin == "timed_sunsky" else "an rgb colour"
-                raise InputError(
-                    f"scene: Mitsuba cannot evaluate the plugin {plugin} in the variant {mi.variant()}; give {instead} in its place"
-                )
+def refusal(scene: Any, objects: Iterable[Any]) -> str:
+    """Return why a scene has a plugin that cannot be rendered, or not as its author means it; "" where it has none.
+
+    Nothing is raised here: an error would keep the scene alive, and calls through pointers reach all living objects.
+    """
+    names = {class_name(node) for node in objects}
+    found = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
+    if found:
+        plugin = _SPECTRAL_ONLY[found]
+        instead = "a sunsky" if plugin == "timed_sunsky" else "an rgb colour"
+        return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {mi.variant()}; give {instead} in its place"
     if type(scene.integrator()).__name__ == _PRIMITIVE_FIELD:
-        raise InputError(
-            "scene: the integrator volprim_rf_basic renders ellipsoids as a radiance field, and paths see surfaces there; "
+        return (
+            "the integrator volprim_rf_basic renders ellipsoids as a radiance field, and paths see surfaces there; "
             "give the field as a medium of type emissive"
         )
+    return ""
 
 
 def traverse(scene: Any) -> mi.SceneParameters:

@@ -19,7 +19,7 @@ from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
-from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -381,7 +381,8 @@ class MitsubaSession:
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, sensors) if outside else None
         before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
+        with naming(self._attached):
+            return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, sensors, rays, *own)
 
     def _rays_outside(self, request: SampleRequest) -> bool:
         """Whether the camera rays are made outside of the recording, since it cannot hold the sensor."""
