@@ -25,6 +25,15 @@ _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
 
+_OUTLINES = {
+    "BSplineCurve": ("control_points",),
+    "LinearCurve": ("control_points",),
+    "Ellipsoids": ("data",),
+    "EllipsoidsMesh": ("data",),
+    "SDFGrid": ("grid",),
+}
+"""{class of a shape: parameters that change its outline}."""
+
 
 @dataclass(frozen=True)
 class ParameterTraits:
@@ -88,10 +97,6 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
             return ParameterTraits(False, None, "")  # a mesh attribute, read through the shape pointer
         if shapes[-1].is_sensor():
             return ParameterTraits(True, None, "it moves a shape that carries a sensor", replayable=False)
-        if leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED):
-            kind = shapes[0].class_name()
-            why = f"it changes the outline of a shape ({kind}), which path gradients follow by vertex positions only"
-            return ParameterTraits(True, None, why, replayable=False)
         return ParameterTraits(True, None, "it moves a shape")
     return ParameterTraits(True, None, "it is neither a material's nor an emitter's")
 
@@ -140,9 +145,13 @@ def transform_obstacle(scene: mi.Scene, parameters: mi.SceneParameters, key: str
 
 def update_obstacle(parameters: mi.SceneParameters, key: str) -> str:
     """Return why a parameter cannot be given another value, "" where it can."""
-    if key.endswith(".grid") and parameters.properties[key][2].class_name() == "SDFGrid":
-        return "Mitsuba's sdfgrid corrupts memory when its distances change; recover a mesh's vertex_positions"
-    return ""
+    node, leaf = parameters.properties[key][2], key.rpartition(".")[2]
+    if leaf not in _OUTLINES.get(node.class_name(), ()):
+        return ""
+    why = "it changes the outline of a shape that is no mesh, whose derivative has not been shown to be right"
+    if leaf == "grid":
+        why = "Mitsuba corrupts memory when the distances of an sdfgrid change"
+    return f"{why}; recover a mesh's vertex_positions instead"
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:
