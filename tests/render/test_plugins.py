@@ -141,3 +141,10 @@ def test_a_weight_and_a_light_without_a_derivative_are_refused_by_name() -> None
 
 def test_a_mesh_of_ellipsoids_moves_in_perturbed_renders_only() -> None:
     assert "is no mesh (EllipsoidsMesh)" in refusal(built("ellipsoidsmesh"), "ball.translation", derivatives=False)
+
+
+@pytest.mark.parametrize("leaf", ["alpha", "eta"])
+def test_what_roughplastic_tabulates_has_no_path_gradient(leaf: str) -> None:
+    """Finite differences: path gradients were .2 (alpha) and -15 (eta) times what they should be."""
+    line = refusal(built("roughplastic"), f"ball.bsdf.{leaf}", derivatives=False)
+    assert "tabulates its transmittance from it without a derivative" in line

@@ -78,6 +78,9 @@ def parameter_traits(parameters: mi.SceneParameters, key: str) -> ParameterTrait
         node = parameters.hierarchy[node][0]
     bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
     if bsdfs:
+        if bsdfs[0].class_name() == "RoughPlastic" and leaf in ("alpha", "eta"):
+            why = "Mitsuba's roughplastic tabulates its transmittance from it without a derivative"
+            return ParameterTraits(False, bsdfs[-1], why, replayable=False)
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
