@@ -148,3 +148,7 @@ def test_what_roughplastic_tabulates_has_no_path_gradient(leaf: str) -> None:
     """Finite differences: path gradients were .2 (alpha) and -15 (eta) times what they should be."""
     line = refusal(built("roughplastic"), f"ball.bsdf.{leaf}", derivatives=False)
     assert "tabulates its transmittance from it without a derivative" in line
+
+
+def test_texture_coordinates_that_a_mesh_does_not_have_are_refused() -> None:
+    assert "it holds no values" in refusal(built("obj"), "ball.vertex_texcoords")

@@ -327,7 +327,7 @@ class ScenePair:
         if isinstance(value, (int, float)):
             why = "it is a plain number, which Mitsuba compiles into its kernels"
             return ParameterInfo(shape, False, False, why, perturbable=False, compiled=True)
-        if why := update_obstacle(self.current_parameters, key):
+        if why := "it holds no values" if 0 in shape else update_obstacle(self.current_parameters, key):
             return ParameterInfo(shape, False, False, why, perturbable=False)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             why = "Mitsuba marks it as not differentiable"
