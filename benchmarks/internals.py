@@ -43,6 +43,11 @@ from unrender.problem.parameter import ParameterSettings
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.mitsuba.range_table import Range
+from unrender.rendering.mitsuba.ranges import SlotReaders
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.mitsuba.scene_loading import load as load_scene
+from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.response import curve
@@ -70,12 +75,15 @@ __all__ = [
     "ImageEstimator",
     "IndirectRoom",
     "Key",
+    "ObjectGraph",
     "Optimizer",
     "PixelSampler",
     "PlainState",
+    "Range",
     "RenderSession",
     "Renderer",
     "SampleRequest",
+    "SlotReaders",
     "Smoke",
     "Tree",
     "Whole",
@@ -99,7 +107,9 @@ __all__ = [
     "image_step",
     "leave_one_out_groups",
     "light_turns",
+    "load_scene",
     "loss_derivative",
+    "media",
     "method",
     "method_parts",
     "mi",

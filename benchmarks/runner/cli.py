@@ -3,6 +3,7 @@
 python -m benchmarks                       list them
 python -m benchmarks NAME [options]        run one; `--help` tells its options
 python -m benchmarks results               write a page per benchmark, with figures, to docs/benchmarks
+python -m benchmarks coverage [options]    every plugin of Mitsuba; writes docs/reference/coverage.md and ranges.md
 python -m benchmarks gpu                   the plan for a GPU, in slices; `--help` tells its options
 python -m benchmarks golden                compare short descents with their record; `--record` writes it
 """
@@ -44,6 +45,10 @@ def main(arguments: Sequence[str]) -> int:
         from benchmarks.golden.cli import main as golden
 
         return golden(arguments[1:])
+    if arguments[0] == "coverage":
+        from benchmarks.coverage.cli import main as coverage
+
+        return coverage(arguments[1:])
     if arguments[0] not in known:
         print(f"no benchmark {arguments[0]!r}; python -m benchmarks lists them", file=sys.stderr)
         return 2

@@ -232,7 +232,7 @@ REFUSED = {
         "ball.bsdf.reflectance.value",
         "got",
     ),
-    "plastic": ({"type": "roughplastic", "alpha": 0.1}, "ball.bsdf.alpha", "roughconductor"),
+    "plastic": ({"type": "pplastic", "alpha": 0.1}, "ball.bsdf.alpha.value", "roughconductor"),
     "principled": (
         {"type": "principled", "roughness": 0.4},
         "ball.bsdf.roughness.value",

@@ -14,6 +14,20 @@ __all__ = ["instead_of", "near_key"]
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
 """Ids that Mitsuba makes up for objects that were given none."""
 _TRANSFORM = "to_world"
+_PLACES = (
+    _TRANSFORM,
+    "translation",
+    "rotation",
+    "center",
+    "centre",
+    "origin",
+    "target",
+    "lookat",
+    "translate",
+    "rotate",
+    "radius",
+)
+"""What people call that which a pose changes."""
 _POSE = ("translation", "rotation", "scale")
 
 
@@ -31,7 +45,9 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
         if nameless and not close:
             others = "" if len(nameless) == 1 else f" ({len(nameless)} objects have none)"
             return f'; nothing has the id {owner}: give the object that holds {rest} id="{owner}"{others}'
-    if rest.startswith(_TRANSFORM):
+    if rest.partition(".")[0] in _PLACES:
+        if not _poses(owner, known) and (why := _no_pose(owner, known)):
+            return f"; {why}"
         for near in (owner, *difflib.get_close_matches(owner, {name.partition(".")[0] for name in known}, n=1)):
             if poses := _poses(near, known):
                 return f"; a pose is {poses} (--method smoothed)"
@@ -51,7 +67,13 @@ def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
         return ""
     if poses := _poses(owner, known):
         return f"; its pose can be: {poses} (--method smoothed)"
-    return "; a shape that emits light, or one beside participating media, has no pose"
+    return "" if _no_pose(owner, known) else "; beside participating media, a shape has no pose"
+
+
+def _no_pose(owner: str, known: Mapping[str, ParameterInfo]) -> str:
+    """Return why an object has no pose, as far as the reason given for its transformation tells; else ""."""
+    info = known.get(f"{owner}.{_TRANSFORM}")
+    return f"{owner}.{_TRANSFORM}: {info.reason}" if info is not None and "pose" in info.reason else ""
 
 
 def _poses(owner: str, known: Mapping[str, ParameterInfo]) -> str:

@@ -17,11 +17,11 @@ from unrender.core.suggestions import did_you_mean
 from unrender.core.text import shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
-from unrender.parameterisations.base import Parameterisation, Transform
+from unrender.parameterisations.base import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.problem import coarse_to_fine
-from unrender.problem.bounds import project
+from unrender.problem.bounds import check_bounds, clip_to_bounds, project
 from unrender.problem.coarse_to_fine import CoarseToFine
 from unrender.problem.errors import FieldError
 from unrender.problem.key_hints import instead_of, near_key
@@ -32,7 +32,6 @@ from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
 __all__ = [
-    "Bounds",
     "CheckedParameter",
     "check_loss",
     "check_loss_function",
@@ -47,8 +46,6 @@ __all__ = [
     "open_renderer",
     "renderer_notices",
 ]
-
-Bounds = tuple[float | None, float | None]
 
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
@@ -160,8 +157,10 @@ def check_parameter(
         except InputError as error:
             raise FieldError(("parameters", index, field), str(error), f"parameter {key}: {field}") from error
 
+    with checking("initial"):
+        start, notice = _initial(parameter, info, renderer)
     with checking("bounds"):
-        bounds = _bounds(parameter.bounds, info)
+        bounds, narrowed = check_bounds(parameter.bounds, info, start)
     rate = parameter.learning_rate
     with checking("learning_rate"):
         if rate is not None and (not is_number(rate) or rate <= 0):
@@ -172,9 +171,7 @@ def check_parameter(
             preconditioner = check_preconditioner(key, parameter.preconditioner, info)
     with checking("coarse_to_fine"):
         schedule = _coarse_to_fine(parameter, info)
-    with checking("initial"):
-        start, notice = _initial(parameter, info, renderer)
-    initial, clipped = _clip_to_bounds(start, bounds)
+    initial, clipped = clip_to_bounds(start, bounds)
     initial.flags.writeable = False
     with checking("parameterisation"):
         if parameter.parameterisation is not None:
@@ -182,7 +179,8 @@ def check_parameter(
     with checking("regularizer"):
         if parameter.regularizer is not None:
             regularizer = check_regularizer(parameter.regularizer, info)
-    notices = [f"parameter {key}: initial {notice}"] * bool(notice) + [f"parameter {key}: {clipped}"] * bool(clipped)
+    notices = [f"parameter {key}: initial {notice}"] * bool(notice)
+    notices += [f"parameter {key}: {line}" for line in (narrowed, clipped) if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     own_rate = None if rate is None else float(rate)
     return CheckedParameter(
@@ -290,20 +288,6 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
     return start, ""
 
 
-def _clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
-    """`start` inside the bounds, and how many values changed, "" for none."""
-    low, high = bounds
-    moved = sum(
-        int(np.count_nonzero(outside(start, end)))
-        for outside, end in ((np.less, low), (np.greater, high))
-        if end is not None
-    )
-    if not moved:
-        return start, ""
-    notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
-    return np.asarray(np.clip(start, low, high), np.float32), notice  # of a number, clip returns no array
-
-
 def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:
     """Return the true value of a parameter, float32, and what was changed to make it fit, "" for nothing.
 
@@ -376,23 +360,6 @@ def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
             what = f"expected a {kind.__name__}, got {type(item).__name__}"
             raise FieldError((name, index), what)
     return tuple(items)
-
-
-def _bounds(given: Any, info: ParameterInfo) -> Bounds:
-    if given is None:
-        return info.lowest, info.highest
-    if isinstance(given, (str, bytes)) or not isinstance(given, Sequence) or len(given) != 2:
-        raise InputError(f"expected (low, high), either may be None, got {given!r}")
-    for side in given:
-        if side is not None and (isinstance(side, bool) or not isinstance(side, (int, float)) or math.isnan(side)):
-            raise InputError(f"expected two numbers or None, got {side!r}")
-    low, high = (None if side is None else float(side) for side in given)
-    if low == math.inf or high == -math.inf:
-        raise InputError(f"low must be less than high, got {low} and {high}")
-    low, high = None if low == -math.inf else low, None if high == math.inf else high
-    if low is not None and high is not None and low >= high:
-        raise InputError(f"low must be less than high, got {low:g} and {high:g}")
-    return low, high
 
 
 def is_number(x: Any) -> bool:

@@ -63,6 +63,8 @@ class ParameterInfo:
         reason: one line; why it is not differentiable or cannot share paths, else "".
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
+        singular: value between these at which images are singular, such as 1 for an index of refraction; values stay on the side on which
+            they start. None where there is none.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
@@ -82,6 +84,7 @@ class ParameterInfo:
     reason: str = ""
     lowest: float | None = None
     highest: float | None = None
+    singular: float | None = None
     perturbable: bool = True
     compiled: bool = False
     resizable: bool = False

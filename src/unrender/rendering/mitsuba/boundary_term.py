@@ -50,7 +50,8 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
         return "path gradients do not move instances"
     if has_instances(pair.current):
         return "boundary derivatives do not know the silhouettes of the scene's instances"
-    if not shape.is_mesh():
+    known = pair.current_parameters
+    if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in ("vertex_positions", "to_world")):
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():
         return "path gradients do not move emitters"

@@ -58,10 +58,9 @@ def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:
         for name in _LENSES:
             key = f"{sensor.id()}.{name}"
             if key in pair.current_parameters and not sensor_obstacle(pair, sensor.id()):
-                low, high = (0.1, 179.0) if name == "x_fov" else (None, None)
-                found[key] = ParameterInfo(
-                    (), True, False, "it changes what the sensor sees", low, high, viewpoint=True, sensor=index
-                )
+                limits = pair.physical_range(key)
+                why = "it changes what the sensor sees"
+                found[key] = ParameterInfo((), True, False, why, limits.low, limits.high, viewpoint=True, sensor=index)
     return found
 
 

@@ -32,6 +32,8 @@ _COLOURS = ("rgb", "spectrum")
 _NO_PLUGINS = ("scene", "ref", *_COLOURS)
 _MATERIAL = re.compile(r"[\w.+-]{1,100}")
 _POINTERS = "blender"
+_NEEDED = {"bitmap": (_FILE, "bitmap", "data"), "blendbsdf": ("weight",)}
+"""{type: names, of which one must be given}."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,10 @@ class Parsed:
         """The object that the description makes. Uses up `state`.
 
         Raises:
-            InputError: a file that it names is missing, malformed or too large.
+            InputError: a file that it names is missing, malformed or too large; an object lacks what Mitsuba needs.
         """
         for node in self.state.nodes:
+            _check_complete(node.props)
             self._check_files(node.props)
         with variant.two_threads(), plugins.only(plugins.own_folder()), _printable_log():
             found = mi.parser.instantiate(self.config, self.state)
@@ -120,6 +123,14 @@ def _check_types(names: set[str], is_file: bool) -> None:
         plugins.check_type(name)
     if is_file and _POINTERS in names:
         raise InputError(f"type {_POINTERS}: takes addresses in memory, which no file can know")
+
+
+def _check_complete(props: Any) -> None:
+    """Raise `InputError` for an object without what Mitsuba needs and does not check: it would end the process."""
+    plugin = props.plugin_name()
+    needed = _NEEDED.get(plugin)
+    if needed and not any(name in props for name in needed):
+        raise InputError(f"type {plugin}: expected {' or '.join(needed)}, got none")
 
 
 def _settle(props: Any, search: Sequence[Path]) -> None:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import functools
 import gc
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
 
-__all__ = ["FrozenFunction"]
+from unrender.core.errors import InputError
+
+__all__ = ["FrozenFunction", "naming"]
 
 _log = logging.getLogger("unrender")
+_INDEPENDENT = "the argument does not depend on the input variable"
+"""From Dr.Jit's error where a derivative was asked for and there is none."""
 
 
 class FrozenFunction:
@@ -84,6 +89,20 @@ def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -
     finally:
         if enabled:
             gc.enable()
+
+
+@contextmanager
+def naming(keys: Iterable[str]) -> Iterator[None]:
+    """Turn Dr.Jit's error about a picture that depends on no parameter into an `InputError` that names the parameters."""
+    try:
+        yield
+    except RuntimeError as error:
+        if _INDEPENDENT not in str(_first_cause(error)):
+            raise
+        names = ", ".join(sorted(keys))
+        raise InputError(
+            f"parameter {names}: the picture depends on it through nothing that Mitsuba differentiates: --method smoothed"
+        ) from error
 
 
 def _first_cause(error: BaseException) -> BaseException:

@@ -25,10 +25,12 @@ from unrender.core.text import reason_of
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.replaced_meshes import replace_meshes
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
+from unrender.rendering.mitsuba.scene_objects import refusal
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
@@ -138,6 +140,7 @@ class LoadedScene:
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps that it holds.
         equal: names of objects that are equal (`equal_objects`).
         meshed: ids of spheres that have become meshes.
+        readers: which slots read the parameters' values.
         parameters: of that scene. Write to them through `set_parameters` alone.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
@@ -154,8 +157,13 @@ class LoadedScene:
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
-        _make_distributions(self.scene)
         self.graph = ObjectGraph(self.scene)
+        if why := refusal(self.scene, self.graph.nodes):
+            del self.scene, self.graph
+            gc.collect()  # what lives on would be called from other scenes' kernels
+            raise InputError(f"scene: {why}")
+        self.readers = SlotReaders(self.graph.slots)
+        _make_distributions(self.scene)
         self.parameters: mi.SceneParameters = self.graph.parameters()
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}

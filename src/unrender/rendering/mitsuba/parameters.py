@@ -1,16 +1,16 @@
-"""How a parameter reaches the image, read off the scene graph, and the physical range of its values."""
+"""How a parameter reaches the image, read off the scene graph."""
 
 from __future__ import annotations
 
 import functools
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal
 
 import mitsuba as mi
 
 from unrender.evaluation.parameter_errors import Role
-from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
@@ -20,8 +20,9 @@ __all__ = [
     "is_of_vertices",
     "normals_key",
     "parameter_traits",
-    "physical_range",
     "role",
+    "transform_obstacle",
+    "update_obstacle",
 ]
 
 # Delta lobes whose value in the previous state can be had by sampling that lobe alone, where their directions do not
@@ -34,6 +35,15 @@ _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
 _DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
+
+_OUTLINES = {
+    "BSplineCurve": ("control_points",),
+    "LinearCurve": ("control_points",),
+    "Ellipsoids": ("data",),
+    "EllipsoidsMesh": ("data",),
+    "SDFGrid": ("grid",),
+}
+"""{class of a shape: parameters that change its outline}."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +118,21 @@ def _traits_of(chain: list[Any], leaf: str) -> ParameterTraits:
     """From one chain of objects, the one that holds the parameter first."""
     bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
     if bsdfs:
+        if bsdfs[0].class_name() == "RoughPlastic" and leaf in ("alpha", "eta"):
+            why = "Mitsuba's roughplastic tabulates its transmittance from it without a derivative"
+            return ParameterTraits(False, why, replayable=False)
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
             return ParameterTraits(True, "it moves an emitter")
         return ParameterTraits(False, "")
     if any(isinstance(n, mi.Medium) for n in chain):
+        if any(
+            n.class_name() == "BlendPhaseFunction" and not isinstance(held, mi.PhaseFunction)
+            for held, n in pairwise(chain)
+        ):
+            why = "Mitsuba's blendphase passes no derivative to its weight"
+            return ParameterTraits(False, why, replayable=False, phase=True)
         volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
         return ParameterTraits(False, "", medium=volume, phase=phase)
     if any(isinstance(n, mi.Sensor) for n in chain):
@@ -152,37 +171,29 @@ def _masks_delta(bsdf: Any) -> bool:
     )
 
 
-def physical_range(parameters: mi.SceneParameters, key: str) -> tuple[float | None, float | None]:
-    """The range that makes physical sense, from the names Mitsuba gives to its parameters."""
-    node = parameters.properties[key][2]
-    names = key.split(".")
-    role = next((n for n in reversed(names) if n not in ("value", "data", "color0", "color1", "scale")), "")
-    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Medium)):
-        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+def transform_obstacle(scene: mi.Scene, parameters: mi.SceneParameters, key: str) -> str:
+    """Return why the object whose transformation is `key` has no pose, "" where it has one."""
+    node: Any = parameters.properties[key][2]
     if isinstance(node, mi.Emitter):
-        if role in ("radiance", "intensity", "irradiance") or names[-1] in ("scale", "data"):
-            return 0.0, None
-        return {"turbidity": (1.0, 10.0), "albedo": (0.0, 1.0)}.get(role, (None, None))
-    if isinstance(node, mi.Medium):
-        if role == "emission" and f"{key.rpartition('.emission')[0]}.{COEFFICIENT}1.data" in parameters:
-            return None, None
-        ranges = {"sigma_t": (0.0, None), "albedo": (0.0, 1.0), "emission": (0.0, None), "g": (-0.99, 0.99)}
-        return ranges.get(role, (None, None))
-    if not isinstance(node, mi.BSDF):
-        return None, None
-    if role in ("alpha", "alpha_u", "alpha_v", "roughness"):
-        return 0.02, 1.0
-    if role in ("eta", "k"):
-        return 0.0, None
-    if role == "normalmap":
-        return 0.0, 1.0
-    if role in (
-        "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "diffuse_transmittance",
-        "transmittance", "base_color", "metallic", "specular", "anisotropic", "spec_tint", "sheen", "sheen_tint",
-        "clearcoat", "clearcoat_gloss", "spec_trans", "flatness", "diff_trans", "opacity", "weight",
-    ):  # fmt: skip
-        return 0.0, 1.0
-    return None, None
+        return f"it places an emitter ({node.class_name()}), which has no pose"
+    if isinstance(node, mi.Sensor) and not any(node.id() == sensor.id() for sensor in scene.sensors()):
+        return "it places a sensor of a batch, which has no pose of its own; give the sensors to the scene one by one"
+    if isinstance(node, mi.Shape) and node.is_emitter():
+        return "it places a shape that emits light, which has no pose"
+    if isinstance(node, mi.Shape) and node.is_sensor():
+        return "it places a shape that carries a sensor, which has no pose"
+    return ""
+
+
+def update_obstacle(parameters: mi.SceneParameters, key: str) -> str:
+    """Return why a parameter cannot be given another value, "" where it can."""
+    node, leaf = parameters.properties[key][2], key.rpartition(".")[2]
+    if leaf not in _OUTLINES.get(node.class_name(), ()):
+        return ""
+    why = "it changes the outline of a shape that is no mesh, whose derivative has not been shown to be right"
+    if leaf == "grid":
+        why = "Mitsuba corrupts memory when the distances of an sdfgrid change"
+    return f"{why}; recover a mesh's vertex_positions instead"
 
 
 def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Role:

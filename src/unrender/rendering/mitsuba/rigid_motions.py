@@ -25,14 +25,14 @@ class RigidMotions:
     def __init__(self, scene: Any, own: Mapping[str, Any]):
         movable = [shape for shape in scene.shapes() if shape.is_mesh()]
         movable += [sensor for sensor in scene.sensors() if sensor.get_shape() is None]
-        names = {item.id() for item in movable}
         self._own = own
-        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in names}
         self._worlds = {
             item.id(): _copy(parameters["to_world"])
             for item in movable
             if "to_world" in (parameters := mi.traverse(item))
         }
+        able = {item.id() for item in movable if item.id() in self._worlds or f"{item.id()}.vertex_positions" in own}
+        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in able}
         self._centres = poses.centres(scene, {pose.target for pose in self._keys.values()})
 
     def __contains__(self, key: str) -> bool:

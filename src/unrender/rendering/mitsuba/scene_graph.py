@@ -31,6 +31,7 @@ class ObjectGraph:
     Attributes:
         nodes: every object once. Two loads of a description have equal orders.
         owners: {object: what holds it}, in the order of visits; nothing holds the scene.
+        slots: {object: (object that holds it, name of the slot)}, a pair for every way to it.
         properties, hierarchy: of `mitsuba.SceneParameters`.
         names: of the objects.
     """
@@ -38,6 +39,7 @@ class ObjectGraph:
     def __init__(self, scene: Any):
         self._scene = scene
         self.owners: dict[Any, list[Any]] = {scene: []}
+        self.slots: dict[Any, list[tuple[Any, str]]] = {scene: []}
         self.hierarchy: dict[Any, tuple[Any, int]] = {scene: (None, 0)}
         self.properties: dict[str, tuple[Any, Any, Any, int]] = {}
         self.names: set[str] = set()
@@ -185,11 +187,11 @@ def _visitor(_variant: str) -> type:
                 self.put_value(name, value, flags, cpptype)
 
         def put_value(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            """Take a value."""
-            flags = self.flags | flags
-            if flags & mi.ParamFlags.NonDifferentiable:
+            """Take a value; one that is None, such as the `sigma_a` of a hair BSDF with pigments, is no parameter."""
+            if (self.flags | flags) & mi.ParamFlags.NonDifferentiable:
                 flags &= ~mi.ParamFlags.Discontinuous
-            self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
+            if value is not None:
+                self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
             """Take an object, now or at the end."""
@@ -202,6 +204,7 @@ def _visitor(_variant: str) -> type:
 
         def _enter(self, name: str, value: Any, flags: int) -> None:
             owners = self.graph.owners
+            self.graph.slots.setdefault(value, []).append((self.node, name))
             if value not in owners:
                 owners[value] = [self.node]
                 self.graph.hierarchy[value] = self.node, self.depth + 1

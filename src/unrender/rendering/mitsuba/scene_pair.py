@@ -31,10 +31,12 @@ from unrender.rendering.mitsuba.parameters import (
     brightness,
     is_of_vertices,
     parameter_traits,
-    physical_range,
     role,
+    transform_obstacle,
+    update_obstacle,
 )
 from unrender.rendering.mitsuba.pixel_filter import is_box
+from unrender.rendering.mitsuba.range_table import Range
 from unrender.rendering.mitsuba.scene_graph import object_ids
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
 from unrender.rendering.mitsuba.tensors import native_shape
@@ -272,7 +274,8 @@ class ScenePair:
         for key in self.current_parameters.keys():  # noqa: SIM118 (iterating gives pairs)
             if not self._traits(key).medium:
                 continue
-            low, high = physical_range(self.current_parameters, key)
+            physical = self.physical_range(key)
+            low, high = physical.low, physical.high
             values = self._current.value(key).numpy()
             if not np.isfinite(values).all():
                 raise InputError(f"scene: {key} holds values that are not finite")
@@ -304,6 +307,10 @@ class ScenePair:
     def _traits(self, key: str) -> ParameterTraits:
         return parameter_traits(self.current_parameters, key, self.loaded().graph)
 
+    def physical_range(self, key: str) -> Range:
+        """Return the physical range of a parameter, from the slots that read it."""
+        return self._current.readers.range_of(self.current_parameters, key)
+
     def info(self) -> Mapping[str, ParameterInfo]:
         """`ParameterInfo` of every parameter of the scene."""
         found = {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
@@ -321,7 +328,8 @@ class ScenePair:
         try:
             shape = native_shape(value)
         except TypeError:
-            why = f"its type {type(value).__name__} has no derivatives"
+            why = transform_obstacle(self.current, self.current_parameters, key) if key.endswith("to_world") else ""
+            why = why or f"its type {type(value).__name__} has no derivatives"
             return ParameterInfo((), False, False, why, perturbable=False)
         if re.match(r"object_\d{9,}\.", key):
             why = "its object has no id in the XML, so its name changes; give it one"
@@ -329,26 +337,31 @@ class ScenePair:
         if isinstance(value, (int, float)):
             why = "it is a plain number, which Mitsuba compiles into its kernels"
             return ParameterInfo(shape, False, False, why, perturbable=False, compiled=True)
+        if why := "it holds no values" if 0 in shape else update_obstacle(self.current_parameters, key):
+            return ParameterInfo(shape, False, False, why, perturbable=False)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             why = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):
                 why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
-            low, high = physical_range(self.current_parameters, key)
-            return ParameterInfo(shape, False, False, why, low, high, perturbable=able)
+            limits = self.physical_range(key)
+            return ParameterInfo(
+                shape, False, False, why, limits.low, limits.high, perturbable=able, singular=limits.singular
+            )
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
-        low, high = physical_range(self.current_parameters, key)
+        limits = self.physical_range(key)
         if not traits.replayable:
-            return ParameterInfo(shape, False, False, traits.reason, low, high)
+            return ParameterInfo(shape, False, False, traits.reason, limits.low, limits.high, singular=limits.singular)
         return ParameterInfo(
             shape,
             True,
             traits.shares_paths,
             traits.reason,
-            low,
-            high,
+            limits.low,
+            limits.high,
+            singular=limits.singular,
             resizable=self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
             welded=key.endswith(".vertex_positions"),

@@ -18,7 +18,7 @@ from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
-from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -286,9 +286,8 @@ class MitsubaSession:
         dr.eval(squares)
         moments = self._develop(squares, paths.request)
         if self._boundary is not None:
-            moments += mi.TensorXf(
-                self._boundary.tangent_moment(self._pair.loaded(), paths.request, combined).array, moments.shape[1:]
-            )
+            edges = self._boundary.tangent_moment(self._pair.loaded(), paths.request, combined)
+            moments += mi.TensorXf(edges.array, moments.shape[1:])
         return moments if paths.request.groups > 1 else moments[0]
 
     def emitters(self) -> np.ndarray:
@@ -390,12 +389,12 @@ class MitsubaSession:
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
-        # Of a constant, all kernels would be recorded anew where it first changes: after the warm-up.
-        seeds = dr.opaque(mi.UInt32, request.seed), request.positions
+        seeds = dr.opaque(mi.UInt32, request.seed), request.positions  # a constant would record all kernels anew
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
+        with naming(self._attached):
+            return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

@@ -1,0 +1,71 @@
+"""`python -m benchmarks coverage`: measure Mitsuba's plugins, and write docs/reference/coverage.md and docs/reference/ranges.md."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import unrender as ur
+
+__all__ = ["RECORD", "main"]
+
+RECORD = Path(__file__).parent / "record.json"
+_SECONDS = 600.0
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do what the command line says; the exit status."""
+    parser = argparse.ArgumentParser("python -m benchmarks coverage", description=__doc__)
+    parser.add_argument("plugins", nargs="*", help="measure these alone; the record keeps the others")
+    parser.add_argument("--ranges", action="store_true", help="write docs/reference/ranges.md alone")
+    parser.add_argument("--page", action="store_true", help="write the pages from the record, measure nothing")
+    parser.add_argument("--no-descent", action="store_true", help="leave out the descents")
+    parser.add_argument("--record", type=Path, default=RECORD, help="the record's file")
+    given = parser.parse_args(arguments)
+    ur.use()
+    from benchmarks.coverage import coverage_page, ranges_page
+    from benchmarks.coverage.plugins import PLUGINS
+
+    if not (given.ranges or given.page):
+        record = json.loads(given.record.read_text()) if given.record.is_file() else {}
+        for name in given.plugins or PLUGINS:
+            record[name] = _measure_apart(name, not given.no_descent)
+            print(name, json.dumps(record[name]), flush=True)
+            given.record.write_text(json.dumps({key: record[key] for key in PLUGINS if key in record}, indent=1) + "\n")
+    if given.record != RECORD:
+        return 0
+    if not given.ranges:
+        coverage_page.PAGE.write_text(coverage_page.page(json.loads(given.record.read_text())))
+        print(f"wrote {coverage_page.PAGE}")
+    ranges_page.PAGE.write_text(ranges_page.page())
+    print(f"wrote {ranges_page.PAGE}")
+    return 0
+
+
+def _measure_apart(name: str, descend: bool) -> dict[str, Any]:
+    """Measure a plugin in a process of its own, which Mitsuba may end."""
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(theirs, name, descend))
+    process.start()
+    theirs.close()
+    try:
+        found = ours.recv() if ours.poll(_SECONDS) else {"failed": f"no answer within {_SECONDS:g} s"}
+    except EOFError:
+        found = {"failed": "the process ended"}
+    process.kill()
+    process.join()
+    return found
+
+
+def _send(connection: Any, name: str, descend: bool) -> None:
+    from benchmarks.coverage.measure import measure
+
+    try:
+        connection.send(measure(name, descend))
+    except BaseException as error:  # any traceback is a finding
+        connection.send({"failed": f"{type(error).__name__}: {error}"[:400]})

@@ -1,0 +1,85 @@
+"""docs/reference/coverage.md: a table for each kind of plugin, from the record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks import markdown
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.runner.catalogue import ROOT
+
+__all__ = ["PAGE", "page"]
+
+PAGE = ROOT / "docs" / "reference" / "coverage.md"
+_HEAD = """# Coverage of Mitsuba's plugins
+
+Written by `python -m benchmarks coverage` from a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1.
+
+| column | contents |
+|---|---|
+| image | mean of our picture over Mitsuba's, and the largest difference of 2 x 2 pixels in standard errors |
+| gradient | path gradient over finite difference along a random direction, with its standard error |
+| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away |
+
+*refused* is followed by the line that a user reads. *perturbed* means that there is no path gradient, so `--method smoothed` recovers the
+parameter from perturbed renders. *weak* means that the comparison is too noisy to see a difference of 3 %. *unseen* means that the
+pictures hardly depend on the parameter."""
+
+
+def page(record: dict[str, Any]) -> str:
+    """Return the text of the page."""
+    parts = [_HEAD]
+    kinds = sorted({plugin.kind for plugin in PLUGINS.values()}, key=str.lower)
+    for kind in kinds:
+        rows = [row for name, plugin in PLUGINS.items() if plugin.kind == kind for row in _rows(name, record.get(name))]
+        table = markdown.table(["plugin", "parameter", "image", "gradient", "descent"], rows)
+        parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _rows(name: str, found: dict[str, Any] | None) -> list[list[str]]:
+    if found is None:
+        return [[name, "–", "not measured", "not measured", "not measured"]]
+    if "refused" in found or "failed" in found:
+        why = f"refused: {found['refused']}" if "refused" in found else f"**failed**: {found['failed']}"
+        return [[name, "–", _cell(why), "–", "–"]]
+    image = _image(found["image"])
+    if not found["parameters"]:
+        return [[name, "none", image, "–", "–"]]
+    return [
+        [name, f"`{key}`", image, _gradient(entry["gradient"]), _descent(entry.get("descent"))]
+        for key, entry in found["parameters"].items()
+    ]
+
+
+def _image(found: dict[str, Any]) -> str:
+    ratio = "black" if found["ratio"] is None else f"{found['ratio']:.3f}"
+    return f"{_verdict(found)}{ratio}, {found['z']:.1f} σ"
+
+
+def _gradient(found: dict[str, Any]) -> str:
+    if "refused" in found:
+        return _cell(f"refused: {found['refused']}")
+    if "perturbed" in found:
+        return _cell(f"perturbed: {found['perturbed']}")
+    if found["ratio"] is None:
+        return f"{_verdict(found)}zero"
+    return f"{_verdict(found)}{found['ratio']:.3f} ± {found['error']:.3f}"
+
+
+def _descent(found: dict[str, Any] | None) -> str:
+    if found is None:
+        return "not measured"
+    if "refused" in found:
+        return _cell(f"refused: {found['refused']}")
+    if found["ok"] is None:
+        return "unseen"
+    return f"{'' if found['ok'] else '**no**, '}{found['after'] / found['before']:.2g}"
+
+
+def _verdict(found: dict[str, Any]) -> str:
+    return {"ok": "", "zero": "", "weak": "weak, ", "wrong": "**wrong**, "}[found["verdict"]]
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())

@@ -1,0 +1,141 @@
+"""Measure one plugin: its picture, the gradient of each parameter, and a short descent."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.coverage.checks import descended, gradients_agree, images_agree
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import Plugin
+from benchmarks.internals import SampleRequest, load_scene, media, mi, mitsuba_renderer
+
+__all__ = ["measure"]
+
+DEPTH = 4
+RUNS, SPP = 16, 64
+STEPS = 30
+_UNROULETTED = 1000
+_AXES = (".x", ".y", ".z")
+
+
+def measure(name: str, descend: bool = True) -> dict[str, Any]:
+    """Return {"refused": reason}, or {"image": ..., "notices": ..., "parameters": {key: ...}}."""
+    plugin = PLUGINS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return _measure(plugin, Path(folder), descend)
+        except ur.InputError as error:
+            return {"refused": str(error)}
+
+
+def _measure(plugin: Plugin, folder: Path, descend: bool) -> dict[str, Any]:
+    def description() -> Any:
+        return plugin.build(folder)
+
+    renderer = mitsuba_renderer(description, DEPTH)
+    found: dict[str, Any] = {"notices": list(getattr(renderer, "notices", ())), "parameters": {}}
+    session = renderer.prepare([], None, False)
+    ours = [np.array(session.image({}, SampleRequest(0, SPP, 100 + n)).images[0]) for n in range(RUNS)]
+    found["image"] = images_agree(np.stack(ours), _stock(description())).record()
+    for key, info in renderer.parameters().items():
+        prefix = next((p for p in plugin.prefixes if key.startswith(f"{p}.")), None)
+        if prefix is None or key.endswith(_AXES) or not (info.perturbable or info.differentiable):
+            continue
+        entry = found["parameters"][key.removeprefix(f"{prefix}.")] = {}
+        try:
+            entry["gradient"] = _gradient(renderer, key, info)
+        except ur.InputError as error:
+            entry["gradient"] = {"refused": str(error)}
+        if not descend:
+            continue
+        try:
+            entry["descent"] = _descent(description, renderer, key, info)
+        except ur.InputError as error:
+            entry["descent"] = {"refused": str(error)}
+    return found
+
+
+def _stock(description: Any) -> np.ndarray:
+    scene = load_scene(description)
+    kind = "volpath" if media(scene) else "path"
+    integrator = mi.load_dict({"type": kind, "max_depth": DEPTH, "rr_depth": _UNROULETTED})
+    images = [np.array(mi.render(scene, integrator=integrator, spp=SPP, seed=900 + n)) for n in range(RUNS)]
+    return np.stack(images)[..., :3]
+
+
+def _weights(shape: tuple[int, ...]) -> np.ndarray:
+    """Return a ramp with some noise, (1, H, W, 3): motions show in a ramp."""
+    y, x = (np.linspace(0, 1, n) for n in shape)
+    ramp = 0.3 + x[None, :, None] + 0.6 * y[:, None, None]
+    return (ramp * np.random.default_rng(2).uniform(0.7, 1.3, (*shape, 3)))[None].astype(np.float32)
+
+
+def _direction(key: str, value: np.ndarray, scale: float) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    if key.endswith(("vertex_positions", "control_points", "vertex_normals", "nested_texture.data")):
+        return scale * rng.normal(size=value.shape)
+    return scale * rng.uniform(0.5, 1.5, value.shape)
+
+
+def _scale(value: np.ndarray, info: Any) -> float:
+    """Return a typical change of a value: a twentieth of its range, or of its size."""
+    if info.lowest is not None and info.highest is not None:
+        return 0.05 * min(info.highest - info.lowest, 1.0 + float(np.abs(value).max()))
+    return 0.05 * (float(np.abs(value).max(initial=0)) or 1.0)
+
+
+def _gradient(renderer: Any, key: str, info: Any) -> dict[str, Any]:
+    if not info.differentiable:
+        return {"perturbed": info.reason}
+    session = renderer.prepare([key], None)
+    value = renderer.values([key])[key]
+    at = np.array(value).astype(np.float64)
+    along, weights = _direction(key, at, _scale(at, info)), _weights(renderer.resolutions()[0])
+    given = renderer.array(weights)
+    width = 2.0 if info.rigid or info.welded or info.viewpoint or key.endswith("control_points") else 0.2
+    adjoints, differences = [], []
+    for number in range(RUNS):
+        paths = session.image({key: value}, SampleRequest(0, SPP, 200 + number)).paths
+        gradient = np.array(session.adjoint({key: value}, paths, given)[key]).astype(np.float64)
+        adjoints.append(float(np.sum(gradient * along)))
+        steps = np.array([0.5, -0.5, 0.25, -0.25]) * width
+        states = {key: np.stack([at + step * along for step in steps]).astype(np.float32)}
+        images = np.array(session.image_batch(states, SampleRequest(0, 4 * SPP, 500 + number))).astype(np.float64)
+        values = (images * weights).sum((1, 2, 3))
+        wide, narrow = (values[0] - values[1]) / width, (values[2] - values[3]) / (width / 2)
+        differences.append((4 * narrow - wide) / 3)
+    return gradients_agree(np.array(adjoints), np.array(differences)).record()
+
+
+def _descent(description: Any, renderer: Any, key: str, info: Any) -> dict[str, Any]:
+    truth = np.array(renderer.values([key])[key]).astype(np.float64)
+    offset = 2 * _direction(key, truth, _scale(truth, info))
+    start = truth - offset if info.highest is not None and (truth + offset > info.highest).any() else truth + offset
+    session = renderer.prepare([key], None, False)
+    reference = np.array(
+        session.image({key: renderer.array(truth.astype(np.float32))}, SampleRequest(0, 1024, 7)).images[0]
+    )
+    problem = ur.Problem(description, [ur.Parameter(key, start)], [ur.View(reference)], max_depth=DEPTH)
+    estimator = (
+        ur.PathGradient(spp=8)
+        if info.differentiable
+        else ur.SmoothedDerivatives(float(np.abs(offset).mean()) / 2, samples=8)
+    )
+    rate = 0.1 * float(np.abs(offset).mean())
+    result = ur.optimize(problem, estimator, ur.optimizers.Adam(rate), steps=STEPS, seed=1)
+
+    def error(value: Any) -> float:
+        image = np.array(
+            session.image({key: renderer.array(np.asarray(value, np.float32))}, SampleRequest(0, 1024, 8)).images[0]
+        )
+        return float(np.mean((image - reference) ** 2))
+
+    noise = error(truth)
+    before, after = max(error(start) - noise, 0.0), max(error(result.parameters[key]) - noise, 0.0)
+    seen = before > 3 * noise
+    return {"before": before, "after": after, "noise": noise, "ok": descended(before, after) if seen else None}

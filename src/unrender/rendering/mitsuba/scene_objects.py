@@ -1,0 +1,79 @@
+"""The objects of a scene, the slots that hold them, and plugins that cannot be rendered here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any
+
+import mitsuba as mi
+
+__all__ = ["Holders", "children", "class_name", "refusal"]
+
+Holders = Mapping[Any, list[tuple[Any, str]]]
+"""{object: (object that holds it, name of the slot)}, a pair for every way to it."""
+
+_SPECTRAL_ONLY = {
+    "RegularSpectrum": "regular",
+    "IrregularSpectrum": "irregular",
+    "BlackBodySpectrum": "blackbody",
+    "TimedSunskyEmitter": "timed_sunsky",
+}
+"""{class: plugin} of what Mitsuba loads in RGB variants and cannot evaluate there."""
+_PRIMITIVE_FIELD = "BasicVolumetricPrimitiveRadianceFieldIntegrator"
+
+
+def refusal(scene: Any, objects: Iterable[Any]) -> str:
+    """Return why a scene has a plugin that cannot be rendered, or not as its author means it; "" where it has none.
+
+    Nothing is raised here: an error would keep the scene alive, and calls through pointers reach all living objects.
+    """
+    names = {class_name(node) for node in objects}
+    found = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
+    if found:
+        plugin = _SPECTRAL_ONLY[found]
+        instead = "a sunsky" if plugin == "timed_sunsky" else "an rgb colour"
+        return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {mi.variant()}; give {instead} in its place"
+    if type(scene.integrator()).__name__ == _PRIMITIVE_FIELD:
+        return (
+            "the integrator volprim_rf_basic renders ellipsoids as a radiance field, and paths see surfaces there; "
+            "give the field as a medium of type emissive"
+        )
+    return ""
+
+
+def children(node: Any) -> list[tuple[str, Any]]:
+    """Return the objects that an object holds, with the names of their slots."""
+    found = _callback(mi.variant())()
+    node.traverse(found)
+    return found.objects
+
+
+def class_name(node: Any) -> str:
+    """Return the class of an object without its number format: "BitmapTextureImpl" for "BitmapTextureImpl[float32]"."""
+    return node.class_name().partition("[")[0]
+
+
+@cache
+def _callback(variant: str | None) -> Any:
+    del variant  # the base class is that of the variant that is set
+
+    class Children(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.objects: list[tuple[str, Any]] = []
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            del cpptype
+            if isinstance(value, mi.Object):
+                self.put_object(name, value, flags)
+
+        def put_value(self, name: str, ptr: Any, flags: Any, cpptype: Any) -> None:
+            del name, ptr, flags, cpptype
+
+        def put_object(self, name: str, obj: Any, flags: Any) -> None:
+            del flags
+            if obj is not None:
+                self.objects.append((name, obj))
+
+    return Children

@@ -1,0 +1,154 @@
+"""Plugins that cannot be used are refused in one line that says what to do."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.scenes import colour, scene
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+
+def refusal(description: Any, key: str | None = None, derivatives: bool = True) -> str:
+    """The line that refuses a scene, or one of its parameters."""
+
+    def use() -> None:
+        if key is None:
+            MitsubaRenderer(description, 3)
+        elif derivatives:
+            ur.Problem(description, [ur.Parameter(key)], [ur.View(np.zeros((16, 16, 3)))])
+        else:
+            MitsubaRenderer(description, 3).prepare([key], None)
+
+    with pytest.raises(ur.InputError) as caught:
+        use()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def built(name: str) -> Callable[[], dict[str, Any]]:
+    folder = Path(tempfile.mkdtemp())
+    return lambda: PLUGINS[name].build(folder)
+
+
+SPECTRA = {
+    "regular": {"wavelength_min": 400.0, "wavelength_max": 700.0, "values": "1,2,3"},
+    "irregular": {"wavelengths": "400,500,700", "values": "1,2,3"},
+    "blackbody": {"temperature": 3000.0},
+}
+
+
+@pytest.mark.parametrize("kind", SPECTRA)
+@pytest.mark.parametrize("slot", ["reflectance", "index of refraction", "textured light"])
+def test_spectra_that_rgb_variants_cannot_evaluate_are_refused(kind: str, slot: str) -> None:
+    spectrum = {"type": kind, **SPECTRA[kind]}
+    ball: dict[str, Any] = {"type": "sphere"}
+    if slot == "textured light":
+        ball["emitter"] = {"type": "area", "radiance": {"type": "checkerboard", "color0": spectrum}}
+    elif slot == "reflectance":
+        ball["bsdf"] = {"type": "twosided", "b": {"type": "diffuse", "reflectance": spectrum}}
+    else:
+        ball["bsdf"] = {"type": "conductor", "eta": spectrum, "k": spectrum}
+    assert f"cannot evaluate the plugin {kind} in the variant" in refusal(scene(ball=ball))
+
+
+def test_a_timed_sky_and_a_field_of_primitives_are_refused() -> None:
+    assert "give a sunsky in its place" in refusal(scene(sky={"type": "timed_sunsky"}))
+    field = scene(ball=built("ellipsoids")()["ball"], integrator={"type": "volprim_rf_basic"})
+    assert "volprim_rf_basic renders ellipsoids as a radiance field" in refusal(field)
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "diffuse", "reflectance": {"type": "bitmap"}}, {"type": "blendbsdf"}])
+def test_objects_without_what_they_need_do_not_end_the_process(bsdf: dict[str, Any]) -> None:
+    assert "expected " in refusal(scene(ball={"type": "sphere", "bsdf": bsdf}))
+
+
+def test_hair_with_pigments_renders_and_its_pigments_change_the_picture() -> None:
+    renderer = MitsubaRenderer(built("hair"), 3)
+    assert "ball.bsdf.sigma_a" not in renderer.parameters()
+    key = "ball.bsdf.eumelanin"
+    session = renderer.prepare([key], None, False)
+    states = {key: np.array([0.1, 2.0], np.float32)}
+    light, dark = np.array(session.image_batch(states, SampleRequest(0, 16, 1)))
+    assert np.isfinite(light).all()
+    assert dark.mean() < light.mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("bsplinecurve", "control_points"),
+        ("linearcurve", "control_points"),
+        ("ellipsoids", "data"),
+        ("ellipsoidsmesh", "data"),
+        ("sdfgrid", "grid"),
+    ],
+)
+def test_outlines_of_shapes_that_are_no_meshes_are_refused(name: str, key: str) -> None:
+    line = refusal(built(name), f"ball.{key}")
+    assert line.endswith("recover a mesh's vertex_positions instead")
+    assert ("corrupts memory" in line) == (name == "sdfgrid")
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("sun.to_world", "it places an emitter (DirectionalEmitter), which has no pose"),
+        ("sun.rotation", "sun.to_world: it places an emitter (DirectionalEmitter), which has no pose"),
+        ("beamer.rotation", "it places an emitter (Projector), which has no pose"),
+        ("lamp.to_world", "it places a shape that emits light, which has no pose"),
+        ("lamp.translation", "it places a shape that emits light, which has no pose"),
+        ("ball.center", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+        ("ball.radius", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+        ("ball.to_world", "its pose can be: ball.translation, ball.rotation, ball.scale (--method smoothed)"),
+    ],
+)
+def test_what_has_no_pose_is_named(key: str, words: str) -> None:
+    sun = {"type": "directional", "direction": [0, -1, 0], "irradiance": colour(1, 1, 1)}
+    beamer = {"type": "projector", "irradiance": colour(1, 1, 1)}
+    assert words in refusal(scene(sun=sun, beamer=beamer), key)
+
+
+def test_a_sensor_of_a_batch_has_no_pose_of_its_own() -> None:
+    line = refusal(built("batch"), "camera.left.to_world")
+    assert "it places a sensor of a batch" in line
+    assert "emits light" not in line
+
+
+def test_phase_functions_load_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    MitsubaRenderer(built("sggx"), 3).prepare([], None, False).image({}, SampleRequest(0, 4, 1))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_weight_and_a_light_without_a_derivative_are_refused_by_name() -> None:
+    weight = "ball.interior_medium.phase_function.weight.value.value"
+    assert "blendphase passes no derivative to its weight" in refusal(built("blendphase"), weight, derivatives=False)
+    key = "lamp.emitter.radiance.value"
+    renderer = MitsubaRenderer(built("directionalarea"), 3)
+    session, values = renderer.prepare([key], None), renderer.values([key])
+    paths = session.image(values, SampleRequest(0, 4, 1)).paths
+    with pytest.raises(ur.InputError, match=rf"parameter {key}: the picture depends on it through nothing"):
+        session.adjoint(values, paths, renderer.array(np.ones((1, 16, 16, 3), np.float32)))
+
+
+def test_a_mesh_of_ellipsoids_moves_in_perturbed_renders_only() -> None:
+    assert "is no mesh (EllipsoidsMesh)" in refusal(built("ellipsoidsmesh"), "ball.translation", derivatives=False)
+
+
+@pytest.mark.parametrize("leaf", ["alpha", "eta"])
+def test_what_roughplastic_tabulates_has_no_path_gradient(leaf: str) -> None:
+    """Finite differences: path gradients were .2 (alpha) and -15 (eta) times what they should be."""
+    line = refusal(built("roughplastic"), f"ball.bsdf.{leaf}", derivatives=False)
+    assert "tabulates its transmittance from it without a derivative" in line
+
+
+def test_texture_coordinates_that_a_mesh_does_not_have_are_refused() -> None:
+    assert "it holds no values" in refusal(built("obj"), "ball.vertex_texcoords")
