@@ -195,11 +195,9 @@ def _visitor(_variant: str) -> type:
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
             """Take an object, now or at the end."""
-            if value is None:
-                return
             if self.depth == 0 and isinstance(value, mi.Texture):
                 self.deferred.append((name, value, flags))
-            else:
+            elif value is not None:
                 self._enter(name, value, flags)
 
         def _enter(self, name: str, value: Any, flags: int) -> None:
