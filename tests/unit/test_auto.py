@@ -272,6 +272,31 @@ def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
     assert found == [True, True, False, False]
 
 
+def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (48, 4))
+    truth = {"place": np.full(3, 0.4), "gain": np.full(1, 0.5)}
+    renderer = AnalyticRenderer(truth, matrix, 0.1, 0.3, shape=SHAPE)
+    unknown = [Parameter(key, initial=0.2) for key in truth]
+    made = Problem(renderer, unknown, [View(renderer.exact(truth))], truth=truth)
+    assert isinstance(chosen(made)[0], PathGradient)
+    known = renderer.parameters()
+    formed = known | {"place": dataclasses.replace(known["place"], nonlinear=True)}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
+    plan = method("auto").plan(made)
+    assert plan.estimator == GaussNewton(module._MOST_NUMBER, module._MOST_DIFFERENCE)
+    assert isinstance(plan.optimizer, optimizers.AveragedNewton)
+    assert "4 numbers" in plan.reasons[0]
+    assert "with place" in plan.reasons[0]
+    for settings in ({"image": "plain"}, {"pixels": 8}):
+        assert isinstance(chosen(made, **settings)[0], PathGradient)
+    monkeypatch.setattr(module, "_FEW_NUMBERS", 3)
+    assert isinstance(chosen(made)[0], PathGradient)
+    monkeypatch.undo()
+    result = optimize(made, plan, steps=40, progress=False)
+    assert result.status == "finished"
+    assert all(error < 0.05 for error in made.parameter_error(result.parameters).values())
+
+
 def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     known = AnalyticRenderer(TRUTH, np.ones((48, 10)), shape=SHAPE).parameters()
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}

@@ -62,6 +62,12 @@ _IMAGE_PATHS, _FEWEST_IMAGE, _MOST_IMAGE = 1 << 21, 8, 256
 """Of a Gauss-Newton step: so many paths in all images, as far as that is between 8 and 256 samples per pixel."""
 _PER_DERIVATIVE, _FEWEST_DERIVATIVE, _MOST_ELEMENTS = 8, 4, 1 << 10
 """Samples of the images over those of the derivative images, and the fewest of these; elements of poses up to which there is a matrix."""
+_FEW_NUMBERS, _NUMBER_SIZE = 24, 4
+"""Elements of all numbers together, and of each, up to which they take Gauss-Newton steps."""
+_NUMBER_PATHS, _FEWEST_NUMBER, _MOST_NUMBER = 1 << 16, 4, 256
+"""Of such a step: so many paths in all images, as far as that is between 4 and 256 samples per pixel."""
+_DIFFERENCE_PATHS, _MOST_DIFFERENCE = 1 << 20, 8
+"""Paths of all derivative images, as far as that is between 2 and 8 samples per pixel; 16 times as many are too dear."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _CORRELATION = Sobolev().correlation
@@ -145,6 +151,8 @@ class AutoMethod(Options):
 
     def plan(self, problem: Problem) -> Plan:
         if _is_of_cameras(problem) and (plan := self._of_cameras(problem)):
+            return plan
+        if plan := self._of_numbers(problem):
             return plan
         perturbed = beyond_paths(problem.renderer.parameters(), list(problem.shapes()))
         part = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(perturbed)))
@@ -235,6 +243,31 @@ class AutoMethod(Options):
         reason = (
             f"Gauss-Newton steps of cameras by perturbed renders, {spp} samples per pixel of the image, {derivative_spp} of those; "
             "the mean of all steps' models"
+        )
+        tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
+        return Plan(problem, GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), reasons=(reason,))
+
+    def _of_numbers(self, problem: Problem) -> Plan | None:
+        """Gauss-Newton steps where few numbers are unknown and the picture changes its form with one of them; else None."""
+        known, shapes = problem.renderer.parameters(), problem.shapes()
+        elements = sum(math.prod(shape) for shape in shapes.values())
+        numbers = all(
+            len(shape) <= 1 and math.prod(shape) <= _NUMBER_SIZE and known[key].perturbable and not known[key].rigid
+            for key, shape in shapes.items()
+        )
+        differences = _DIFFERENCE_PATHS // (2 * elements * problem.pixels)
+        if not numbers or elements > _FEW_NUMBERS or not any(known[key].nonlinear for key in shapes):
+            return None
+        if self.image is not None or self.pixels is not None or not problem.loss.pixelwise:
+            return None
+        if problem.preconditioners or 4 * elements * problem.pixels > 16 * _DIFFERENCE_PATHS:
+            return None
+        spp = self.spp or min(max(_NUMBER_PATHS // problem.pixels, _FEWEST_NUMBER), _MOST_NUMBER)
+        spp, derivative_spp = max(spp, 2), min(max(differences, 2), _MOST_DIFFERENCE)
+        nonlinear = listed([key for key in shapes if known[key].nonlinear])
+        reason = (
+            f"Gauss-Newton steps of {elements} number{'s' * (elements > 1)} by perturbed renders, {spp} samples per pixel of the image, "
+            f"{derivative_spp} of those: pictures change their form with {nonlinear}"
         )
         tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
         return Plan(problem, GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), reasons=(reason,))

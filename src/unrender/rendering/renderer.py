@@ -76,6 +76,7 @@ class ParameterInfo:
         conversion: what the renderer does to a file's values when it loads such a parameter.
         role: what the values stand for: numbers, normals or directions. Of the last two, errors are angles.
         brightness: what the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
+        nonlinear: whether the picture changes its form with the values, not its brightness: positions, lenses, skies, indices.
     """
 
     shape: tuple[int, ...]
@@ -96,6 +97,7 @@ class ParameterInfo:
     conversion: FileConversion = PLAIN
     role: Role = "value"
     brightness: Literal["", "light", "reflectance"] = ""
+    nonlinear: bool = False
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

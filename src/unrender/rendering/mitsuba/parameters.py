@@ -17,6 +17,7 @@ from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 __all__ = [
     "ParameterTraits",
     "brightness",
+    "is_nonlinear",
     "is_of_vertices",
     "normals_key",
     "parameter_traits",
@@ -226,6 +227,16 @@ def brightness(parameters: mi.SceneParameters, key: str) -> Literal["", "light",
         emits = names[-1] in ("scale", "data") or any(name in _LIGHT for name in names)
         return "light" if emits else ""
     return "reflectance" if isinstance(node, mi.BSDF) and any(name in _REFLECTANCE for name in names) else ""
+
+
+def is_nonlinear(parameters: mi.SceneParameters, key: str, singular: float | None) -> bool:
+    """Return whether the picture changes its form with a parameter: of a sensor, of an emitter other than its light, of an index."""
+    node = parameters.properties[key][2]
+    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium)):
+        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    if isinstance(node, mi.Emitter):
+        return brightness(parameters, key) != "light"
+    return singular is not None or isinstance(node, mi.Sensor)
 
 
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:

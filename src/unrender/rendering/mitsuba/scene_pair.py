@@ -29,6 +29,7 @@ from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import (
     ParameterTraits,
     brightness,
+    is_nonlinear,
     is_of_vertices,
     parameter_traits,
     role,
@@ -320,7 +321,8 @@ class ScenePair:
         """`info` with what the values of the parameter stand for, and what a file becomes."""
         conversion = file_conversions.conversion(self.current_parameters, key, self.description)
         kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
-        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1])
+        form = is_nonlinear(self.current_parameters, key, info.singular)
+        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1], nonlinear=form)
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)
