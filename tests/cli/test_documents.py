@@ -84,6 +84,7 @@ SLOW_EXAMPLES = {
     "unrender.smoothing.grey_box",
 }
 ILLUSTRATIONS = {
+    "unrender.optimizers.chain.Chain": "the names are not imported; docs/reference/optimizers.md runs such one",
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
     "unrender.dealing.deal.deal": "it starts worker processes, as tests/render/test_dealt_runs.py does",

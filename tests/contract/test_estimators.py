@@ -234,7 +234,8 @@ def test_the_truth_is_recovered(estimator: str, optimizer: str) -> None:
     assert listener.until, "it never came near"
     assert max(asked.parameter_error(found.parameters).values()) < 0.4 * listener.first
     assert found.skipped == 0
-    assert not found.warnings
+    earlier = "the final picture is worse than that of step"  # the result is then of that step
+    assert [line for line in found.warnings if not line.startswith(earlier)] == []
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -647,7 +648,7 @@ def test_a_parameter_without_influence_is_warned_of() -> None:
 def test_bounds_hold_and_do_not_stall() -> None:
     """A parameter driven against its bound by a large step comes back."""
     asked = problem()
-    pushed = ur.optimize(asked, ur.PathGradient(spp=4), ur.optimizers.SGD(learning_rate=50.0), steps=1).parameters
+    pushed = ur.optimize(asked, ur.PathGradient(spp=4), ur.optimizers.SGD(learning_rate=50.0), steps=1).last
     assert all((v >= MARGIN * 0.999).all() and (v <= 1 - MARGIN * 0.999).all() for v in pushed.values())
     assert any((np.isclose(v, MARGIN) | np.isclose(v, 1 - MARGIN)).any() for v in pushed.values())
     again = ur.Problem(

@@ -589,7 +589,7 @@ def test_large_steps_on_a_grid_through_a_change_of_resolution(strength: float) -
     result = ur.optimize(found, ur.PathGradient(spp=2), ur.optimizers.SGD(rate), 2)
     moved = np.abs(expected - middle).max()
     assert moved > 1e-3
-    np.testing.assert_allclose(result.parameters[KEY], expected, atol=1e-3 * moved)
+    np.testing.assert_allclose(result.last[KEY], expected, atol=1e-3 * moved)
     assert np.abs(wrong - expected).max() > 0.1 * moved  # planted fault: another strength on the finer grid
 
 

@@ -75,7 +75,7 @@ def test_a_descent_on_its_gradients_stays_where_a_plain_one_drifts() -> None:
 
     def end(estimator: Any) -> float:
         runs = [ur.optimize(asked, estimator, ur.optimizers.Adam(0.01), steps=100, seed=seed) for seed in range(3)]
-        return float(np.mean([run.parameters["x"] for run in runs]))
+        return float(np.mean([run.last["x"] for run in runs]))
 
     assert end(DebiasedGradient(2, renders=1024)) == pytest.approx(1.0, abs=0.05)
     assert end(ur.PathGradient(spp=2)) > 1.2

@@ -103,6 +103,6 @@ def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:
     assert record["phases"]["steps"] == pytest.approx(result.seconds, abs=1e-3)
     own = sum(seconds for name, seconds in result.phases.items() if name != "loading")
     assert 5 * 0.05 < own <= whole
-    assert list(watch.seconds) == ["compiling", "final pictures"]
+    assert list(watch.seconds) == ["compiling", "verification", "final pictures"]
     assert set(record["image_errors"]) == {"view0/initial", "view0/result"}
     assert all(len(pair) == 2 for pair in record["image_errors"].values())

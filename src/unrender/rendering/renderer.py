@@ -346,7 +346,7 @@ class PictureFormat:
 
     Attributes:
         colour: "rgb" (linear), "luminance" or "xyz". Images of the renderer are RGB; with "luminance" all three channels are the luminance.
-        signed: whether its filter has negative lobes, so that pixels may be below 0.
+        signed: whether pixels may be below 0: by a filter with negative lobes, or because the renderer's images are not of light.
     """
 
     colour: Literal["rgb", "luminance", "xyz"] = "rgb"
@@ -363,8 +363,8 @@ class WithFormats(Protocol):
 
 
 def format_of(renderer: Any, sensor: int) -> PictureFormat:
-    """The format of a sensor's film; RGB where the renderer tells none."""
-    return renderer.formats()[sensor] if isinstance(renderer, WithFormats) else PictureFormat()
+    """Return the format of a sensor's film; RGB of any sign where the renderer has no films."""
+    return renderer.formats()[sensor] if isinstance(renderer, WithFormats) else PictureFormat(signed=True)
 
 
 @runtime_checkable

@@ -41,7 +41,12 @@ def run(folder: Path, *words: str, **environment: str) -> subprocess.CompletedPr
 @pytest.mark.parametrize("words", [["--version"], ["methods", "rcv"], ["gallery"]])
 def test_no_home_and_no_name(tmp_path: Path, words: list[str]) -> None:
     done = run(tmp_path, *words)
-    assert (done.returncode, done.stderr) == (0, "")
+    told = [
+        line
+        for line in done.stderr.splitlines()
+        if not line.startswith("jit_init(): the HOME environment variable is not set")
+    ]
+    assert (done.returncode, told) == (0, [])
 
 
 @pytest.mark.parametrize("home", ["missing", "file"])
