@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender.capture.mesh import Mesh as CapturedMesh
-from unrender.capture.mesh import ply
-from unrender.capture.turntable import light_turns
+from unrender.app.capture.mesh import Mesh as CapturedMesh
+from unrender.app.capture.mesh import ply
+from unrender.app.capture.turntable import light_turns
+from unrender.app.stages import stages_file
+from unrender.app.stages.stage_problem import Whole
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -25,21 +27,18 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
-from unrender.evaluation import denoising
-from unrender.evaluation.metrics import srgb
 from unrender.gallery import parts, volumes
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
+from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
 from unrender.io.images import srgb_to_linear
+from unrender.losses.metrics import srgb
 from unrender.methods import method
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
-from unrender.problem.batches import WholeView
-from unrender.problem.bounds import project
-from unrender.problem.parameter import ParameterSettings
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.mitsuba import turntable_light
@@ -56,8 +55,9 @@ from unrender.runs import optimize as runs_optimize
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
-from unrender.stages import stages_file
-from unrender.stages.stage_problem import Whole
+from unrender.scene.batches import WholeView
+from unrender.scene.bounds import project
+from unrender.scene.parameter import ParameterSettings
 from unrender.statistics.recursion import advance
 
 dr: Any = importlib.import_module("drjit")

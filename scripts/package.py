@@ -67,7 +67,7 @@ def main() -> None:
         _run("-m", "pip", "install", *options, str(wheel))
         start = (
             f"import sys; sys.path.insert(0, {str(empty)!r}); import unrender; print(unrender.__file__);"
-            "from unrender.cli.main import main; sys.exit(main(['--version']))"
+            "from unrender.app.cli.main import main; sys.exit(main(['--version']))"
         )
         file, version = _run("-I", "-c", start, cwd=Path(place)).split()
         if not file.startswith(str(empty)):

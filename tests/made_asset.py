@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 WIDTH, HEIGHT = 40, 30
 _TEXELS = 64

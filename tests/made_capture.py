@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from unrender.capture.cameras import FISHEYE, Lens
+from unrender.app.capture.cameras import FISHEYE, Lens
 
 PARTS = 4
 """Rays a side of a pixel."""

@@ -17,7 +17,7 @@ import unrender as ur
 from benchmarks.internals import SampleRequest, arrays, dr, mi, prepare, stock_scene
 from benchmarks.paths import truth
 from unrender.core.errors import InputError
-from unrender.evaluation.denoising import Denoiser, choose, denoise
+from unrender.images.denoising import Denoiser, choose, denoise
 
 DENOISERS: tuple[Denoiser, ...] = ("oidn", "optix", "variation")
 PROBLEMS = ("indirect-room", "glossy-room")

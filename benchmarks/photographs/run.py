@@ -28,8 +28,8 @@ from benchmarks.internals import Whole, dr, from_tensor, project, stages_file, s
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import scratch
 from unrender import methods
-from unrender.capture import importing
-from unrender.judging.measures import measure
+from unrender.app.capture import importing
+from unrender.app.evaluation.measures import measure
 
 METHODS: dict[str, dict[str, Any]] = {
     "auto": {},

@@ -15,9 +15,9 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.runner.records import scratch
-from unrender.capture import importing, photometric
-from unrender.capture.formats import lights
-from unrender.judging.measures import measure
+from unrender.app.capture import importing, photometric
+from unrender.app.capture.formats import lights
+from unrender.app.evaluation.measures import measure
 
 QUICK = {"steps": 3, "resolution": 24, "seeds": 1, "final_spp": 1}
 COLOUR, NORMAL = "plate.bsdf.nested_bsdf.reflectance.data", "plate.bsdf.normalmap.data"

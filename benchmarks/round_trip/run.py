@@ -20,7 +20,7 @@ import unrender as ur
 from benchmarks.internals import method, turntable_turns
 from benchmarks.round_trip.readers import READERS, described
 from benchmarks.runner.records import scratch
-from unrender.judging.measures import measure
+from unrender.app.evaluation.measures import measure
 
 QUICK = {"steps": 2, "views": 9, "size": 24, "texture": 16, "faces": 300, "spp": 2, "unknowns": ("normals",)}
 UNKNOWNS = {

@@ -33,18 +33,19 @@ if TYPE_CHECKING:
         pixels,
         preconditioners,
         protocols,
-        report,
         schedules,
         statistics,
     )
-    from unrender import (
-        smoothing as smoothed,
-    )
-    from unrender.capture.importing import ImportOptions, import_capture
-    from unrender.cli.sweep_function import sweep
+    from unrender.app import report as report
+    from unrender.app.capture.importing import ImportOptions, import_capture
+    from unrender.app.cli.sweep_function import sweep
+    from unrender.app.distributed.deal import deal
+    from unrender.app.evaluation.judge import judge
+    from unrender.app.evaluation.turntable import turntable
+    from unrender.app.exporting.scene_folder import export
     from unrender.core.random import Key
     from unrender.core.registry import register
-    from unrender.dealing.deal import deal
+    from unrender.estimators import smoothing as smoothed
     from unrender.estimators.base import Estimate
     from unrender.estimators.filtered import FilteredGradient
     from unrender.estimators.gauss_newton import GaussNewton
@@ -53,18 +54,11 @@ if TYPE_CHECKING:
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
+    from unrender.estimators.smoothing import grey_box as grey_box
     from unrender.estimators.stock import StockGradient
-    from unrender.evaluation import metrics
-    from unrender.exporting.scene_folder import export
     from unrender.io.volumes import Grid, read_grid, write_grid
-    from unrender.judging.judge import judge
-    from unrender.judging.turntable import turntable
-    from unrender.loops.renderer import Renderer
-    from unrender.problem.coarse_to_fine import CoarseToFine
-    from unrender.problem.parameter import Parameter
-    from unrender.problem.problem import Problem
-    from unrender.problem.render import render, render_pair
-    from unrender.problem.view import View
+    from unrender.losses import metrics
+    from unrender.own_loop.renderer import Renderer
     from unrender.runs.callbacks import Callback
     from unrender.runs.live import Live
     from unrender.runs.optimize import estimate, optimize
@@ -72,60 +66,64 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.sensitivity import sensitivity
     from unrender.runs.tensorboard import TensorBoard
-    from unrender.smoothing import grey_box as grey_box
+    from unrender.scene.coarse_to_fine import CoarseToFine
+    from unrender.scene.parameter import Parameter
+    from unrender.scene.problem import Problem
+    from unrender.scene.render import render, render_pair
+    from unrender.scene.view import View
 
 _MODULES = {
     "gallery": "gallery",
-    "grey_box": "smoothing.grey_box",
+    "grey_box": "estimators.smoothing.grey_box",
     "images": "images",
     "losses": "losses",
-    "metrics": "evaluation.metrics",
+    "metrics": "losses.metrics",
     "optimizers": "optimizers",
     "parameterisations": "parameterisations",
     "pixels": "pixels",
     "preconditioners": "preconditioners",
     "protocols": "protocols",
-    "report": "report",
+    "report": "app.report",
     "schedules": "schedules",
-    "smoothed": "smoothing",
+    "smoothed": "estimators.smoothing",
     "statistics": "statistics",
 }
 _HOMES = {
     "Callback": "runs.callbacks",
-    "CoarseToFine": "problem.coarse_to_fine",
+    "CoarseToFine": "scene.coarse_to_fine",
     "Estimate": "estimators.base",
     "FilteredGradient": "estimators.filtered",
     "GaussNewton": "estimators.gauss_newton",
     "Grid": "io.volumes",
     "HybridGradient": "estimators.hybrid",
-    "ImportOptions": "capture.importing",
+    "ImportOptions": "app.capture.importing",
     "Key": "core.random",
     "Live": "runs.live",
     "LossValues": "estimators.loss_values",
     "MetaEstimator": "estimators.meta",
-    "Parameter": "problem.parameter",
+    "Parameter": "scene.parameter",
     "PathGradient": "estimators.path",
-    "Problem": "problem.problem",
-    "Renderer": "loops.renderer",
+    "Problem": "scene.problem",
+    "Renderer": "own_loop.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
     "StockGradient": "estimators.stock",
     "TensorBoard": "runs.tensorboard",
-    "View": "problem.view",
-    "deal": "dealing.deal",
+    "View": "scene.view",
+    "deal": "app.distributed.deal",
     "estimate": "runs.optimize",
-    "export": "exporting.scene_folder",
-    "import_capture": "capture.importing",
-    "judge": "judging.judge",
+    "export": "app.exporting.scene_folder",
+    "import_capture": "app.capture.importing",
+    "judge": "app.evaluation.judge",
     "optimize": "runs.optimize",
     "read_grid": "io.volumes",
     "register": "core.registry",
-    "render": "problem.render",
-    "render_pair": "problem.render",
+    "render": "scene.render",
+    "render_pair": "scene.render",
     "resume": "runs.reopen",
     "sensitivity": "runs.sensitivity",
-    "sweep": "cli.sweep_function",
-    "turntable": "judging.turntable",
+    "sweep": "app.cli.sweep_function",
+    "turntable": "app.evaluation.turntable",
     "write_grid": "io.volumes",
 }
 

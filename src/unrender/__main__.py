@@ -2,6 +2,6 @@
 
 import sys
 
-from unrender.cli.main import main
+from unrender.app.cli.main import main
 
 sys.exit(main())

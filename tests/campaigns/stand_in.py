@@ -13,8 +13,8 @@ from unittest import mock
 
 import numpy as np
 
-from unrender.dealing.actor import ViewWorker
-from unrender.dealing.messages import Call, Difference, Reply
+from unrender.app.distributed.actor import ViewWorker
+from unrender.app.distributed.messages import Call, Difference, Reply
 
 __all__ = ["StandIn", "stand_ins"]
 
@@ -57,5 +57,5 @@ class StandIn(ViewWorker):
 def stand_ins(seconds: float) -> Iterator[None]:
     """Within, dealt runs have workers that answer after so many seconds for each view."""
     kind = type("StandIn", (StandIn,), {"seconds": seconds, "__module__": "__main__"})
-    with mock.patch("unrender.dealing.ray_hosts.ViewWorker", kind):
+    with mock.patch("unrender.app.distributed.ray_hosts.ViewWorker", kind):
         yield

@@ -23,7 +23,7 @@ __all__ = ["main"]
 def carry_out(order: dict[str, Any]) -> int:
     """One command."""
     from tests.campaigns.faults import die, operations
-    from unrender.cli.main import main as unrender
+    from unrender.app.cli.main import main as unrender
 
     words = [str(word) for word in order["words"]]
     if "watch" not in order:

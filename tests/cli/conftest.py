@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender.cli.main import main
+from unrender.app.cli.main import main
 from unrender.io import confinement
 
 SCENE = """<scene version="3.0.0">

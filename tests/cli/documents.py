@@ -25,7 +25,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from unrender.cli.main import main
+from unrender.app.cli.main import main
 from unrender.core.errors import InputError
 from unrender.io.toml_lines import tomllib
 
@@ -150,8 +150,8 @@ def check_toml(text: str, place: str, file: Path | None = None) -> None:
 
     What is missing in a part is filled in with a scene that does not exist: that it is missing is then the first complaint.
     """
-    from unrender.problem.problem import Problem
-    from unrender.stages import stages_file
+    from unrender.app.stages import stages_file
+    from unrender.scene.problem import Problem
 
     if file is not None and stages_file.is_stages(file):
         stages_file.read(file)
@@ -205,7 +205,7 @@ def check_options(words: list[str], place: str) -> None:
     """Every option that a line names exists."""
     from typer.main import get_command
 
-    from unrender.cli.app import app
+    from unrender.app.cli.app import app
 
     commands: Mapping[str, Any] = get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
     assert words[1] in commands, f"{place}: no command {words[1]}"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from unrender.app.cli import doctor
 from unrender.backend import cache, variant
-from unrender.cli import doctor
 from unrender.core.errors import VariantError
 from unrender.display.terminal import Console
 

@@ -48,13 +48,13 @@ SLOW = {
 GIVEN = {
     "unrender.core.phases": "",
     "unrender": "",
-    "unrender.exporting.scene_folder.export": """
+    "unrender.app.exporting.scene_folder.export": """
         import unrender as ur
         problem = ur.gallery.problem("indirect-room", resolution=16, texture_resolution=8)
         result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), 2, run_directory="out/indirect-room-auto")
     """,
     "unrender.gallery.catalogue.problem": "from unrender.gallery import problem",
-    "unrender.loops.renderer.Renderer": """
+    "unrender.own_loop.renderer.Renderer": """
         import unrender as ur
         ur.use("llvm_ad_rgb")
         import mitsuba as mi
@@ -65,12 +65,12 @@ GIVEN = {
         renderer = ur.Renderer(scene, ["red.reflectance.value"])
     """,
     "unrender.rendering.mitsuba.emissive": "volume = None",
-    "unrender.smoothing.function": """
+    "unrender.estimators.smoothing.function": """
         import unrender as ur
         def f(x): return (x**2).sum(axis=1)
         theta = [0.5, -0.2]
     """,
-    "unrender.smoothing.grey_box": """
+    "unrender.estimators.smoothing.grey_box": """
         import torch
         import unrender as ur
         pictures = torch.ones(3, 4)
@@ -79,16 +79,16 @@ GIVEN = {
     """,
 }
 SLOW_EXAMPLES = {
-    "unrender.exporting.scene_folder.export",
-    "unrender.loops.renderer.Renderer",
-    "unrender.smoothing.grey_box",
+    "unrender.app.exporting.scene_folder.export",
+    "unrender.own_loop.renderer.Renderer",
+    "unrender.estimators.smoothing.grey_box",
 }
 ILLUSTRATIONS = {
     "unrender.optimizers.chain.Chain": "the names are not imported; docs/reference/optimizers.md runs such one",
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
-    "unrender.dealing.deal.deal": "it starts worker processes, as tests/render/test_dealt_runs.py does",
-    "unrender.cli.sweep_function.sweep": "it starts worker processes for minutes; tests/cli/test_sweep_command.py has a sweep from Python",
+    "unrender.app.distributed.deal.deal": "it starts worker processes, as tests/render/test_dealt_runs.py does",
+    "unrender.app.cli.sweep_function.sweep": "it starts worker processes; tests/cli/test_sweep_command.py has a sweep from Python",
 }
 
 
@@ -215,16 +215,16 @@ def test_the_examples_of_docstrings_run(name: str) -> None:
 
 def test_the_fields_of_the_documented_problem_file_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    text = importlib.import_module("unrender.problem.toml_file").__doc__ or ""
+    text = importlib.import_module("unrender.scene.toml_file").__doc__ or ""
     shown = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    ") or not line)
-    documents.check_toml(shown, "unrender.problem.toml_file")
+    documents.check_toml(shown, "unrender.scene.toml_file")
 
 
 PUBLIC_MODULES = {
     "images": "unrender.images", "pixels": "unrender.pixels", "losses": "unrender.losses", "optimizers": "unrender.optimizers",
     "schedules": "unrender.schedules", "preconditioners": "unrender.preconditioners",
-    "parameterisations": "unrender.parameterisations", "smoothed": "unrender.smoothing",
-    "statistics": "unrender.statistics", "metrics": "unrender.evaluation.metrics", "report": "unrender.report",
+    "parameterisations": "unrender.parameterisations", "smoothed": "unrender.estimators.smoothing",
+    "statistics": "unrender.statistics", "metrics": "unrender.losses.metrics", "report": "unrender.app.report",
     "gallery": "unrender.gallery", "protocols": "unrender.protocols",
 }  # fmt: skip
 
@@ -249,7 +249,7 @@ def test_names_in_the_pages_exist():
 def _resolve(name: str) -> bool:
     if name.startswith("grey_box"):  # needs PyTorch
         return (
-            f"def {name.rpartition('.')[2]}" in (ROOT / "src/unrender/smoothing/grey_box.py").read_text()
+            f"def {name.rpartition('.')[2]}" in (ROOT / "src/unrender/estimators/smoothing/grey_box.py").read_text()
             or "." not in name
         )
     found: Any = ur

@@ -24,9 +24,9 @@ pytest.importorskip("fast_simplification", reason="hulls need fast-simplificatio
 
 import made_capture as made
 import unrender as ur
-from unrender.capture.cameras import Lens
+from unrender.app.capture.cameras import Lens
+from unrender.app.stages import stages_file
 from unrender.io import images, toml_lines
-from unrender.stages import stages_file
 
 LENS = Lens(40, 40, 48.0, 48.0, 20.0, 20.0)
 SMALL = ("--voxels", 24, "--faces", 400, "--texture", 16)

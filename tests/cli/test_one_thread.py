@@ -12,7 +12,7 @@ import numpy as np
 import mitsuba as mi
 import unrender as ur
 from unrender.backend import variant
-from unrender.exporting.ready_made import as_bitmap, write_bitmap
+from unrender.app.exporting.ready_made import as_bitmap, write_bitmap
 from unrender.io import images
 
 folder = sys.argv[1]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import unrender as ur
-from unrender.cli import arguments
+from unrender.app.cli import arguments
 from unrender.core import phases
 from unrender.display.terminal import Console
 from unrender.gallery import specification

@@ -16,7 +16,7 @@ def unknown(uid):
     raise KeyError(f"getpwuid(): uid not found: {uid}")
 
 pwd.getpwuid = unknown
-from unrender.cli.main import main
+from unrender.app.cli.main import main
 sys.exit(main())
 """
 """The command of a user whose number has no name, as of `docker run --user 4321`."""

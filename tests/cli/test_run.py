@@ -15,7 +15,7 @@ import pytest
 
 import unrender as package
 from tiers import quick
-from unrender.cli import execute
+from unrender.app.cli import execute
 from unrender.runs.final_images import render_pictures
 
 KEY = "wall.bsdf.reflectance.value"
@@ -196,7 +196,17 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
 
 def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
     source = Path(package.__file__).parents[1]
-    command = [sys.executable, "-m", "unrender.cli.main", "run", "problem.toml", "--seconds", "600", "--out", "result"]
+    command = [
+        sys.executable,
+        "-m",
+        "unrender.app.cli.main",
+        "run",
+        "problem.toml",
+        "--seconds",
+        "600",
+        "--out",
+        "result",
+    ]
     process = subprocess.Popen(
         [*command, "--variant", mitsuba_variant, *QUICK],
         cwd=problem.parent,
@@ -228,7 +238,7 @@ def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
 def test_a_reader_that_leaves_gets_no_traceback():
     source = Path(package.__file__).parents[1]
     process = subprocess.Popen(
-        [sys.executable, "-m", "unrender.cli.main", "methods"],
+        [sys.executable, "-m", "unrender.app.cli.main", "methods"],
         env={**os.environ, "PYTHONPATH": str(source)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

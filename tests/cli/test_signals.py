@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unrender.cli import main as command
-from unrender.cli.signals import Signals
+from unrender.app.cli import main as command
+from unrender.app.cli.signals import Signals
 from unrender.core.signals import GRACEFUL
 from unrender.estimators.path import PathGradient
 from unrender.runs.live import Live

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from unrender.cli import signals as handled
+from unrender.app.cli import signals as handled
 from unrender.core.errors import InputError
 from unrender.runs.folder import reader
 
@@ -37,7 +37,7 @@ RUN = [
     "run",
 ]
 COMMAND = "import sys; sys.argv[0] = 'unrender'; import unrender; print('loading', file=sys.stderr, flush=True); "
-COMMAND += "from unrender.cli.main import main; sys.exit(main())"
+COMMAND += "from unrender.app.cli.main import main; sys.exit(main())"
 """As the command's script, and it tells when the package is there: until then, what happens is Python's own affair."""
 
 
@@ -78,7 +78,7 @@ def test_an_import_that_never_ends_is_interrupted_all_the_same(tmp_path: Path) -
     code = textwrap.dedent("""
         import os, signal, sys, threading
         sys.path.insert(0, sys.argv[1])
-        from unrender.cli.signals import Signals
+        from unrender.app.cli.signals import Signals
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
         with Signals(process=True):
             import endless_module
@@ -118,7 +118,7 @@ def test_an_interrupt_waits_for_the_end_of_an_import(tmp_path: Path) -> None:
     code = textwrap.dedent("""
         import os, signal, sys, threading, time
         sys.path.insert(0, sys.argv[1])
-        from unrender.cli.signals import Signals
+        from unrender.app.cli.signals import Signals
         signals = Signals(process=True)
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
         try:

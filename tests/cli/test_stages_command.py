@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from conftest import KEY, Unrender
-from unrender.cli import stages
+from unrender.app.cli import stages
+from unrender.app.stages import run_folders, stages_file
+from unrender.app.stages.stage_problem import Whole
 from unrender.core.errors import InputError
 from unrender.runs.folder import checkpoint, method_file
 from unrender.runs.folder.lock import Lock
-from unrender.stages import run_folders, stages_file
-from unrender.stages.stage_problem import Whole
 
 STAGES = f"""\
 problem = "problem.toml"

@@ -13,13 +13,13 @@ import unrender
 
 PROGRAM = """
 import sys
-from unrender.cli.main import main
+from unrender.app.cli.main import main
 assert main({arguments!r}) == 0
 print(*sorted({{name.partition(".")[0] for name in sys.modules}}))
 """
 WHEN_NEEDED = """
 import sys
-import unrender.cli.execute, unrender.runs.live
+import unrender.app.cli.execute, unrender.runs.live
 from unrender import gallery
 from unrender.methods import methods
 gallery.names(), methods()
@@ -69,6 +69,6 @@ def test_a_run_imports_what_its_end_needs_at_its_end() -> None:
         "skimage",
         "jinja2",
         "uvicorn",
-        "unrender.report",
+        "unrender.app.report",
     }
     assert not needed & late

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 import unrender as ur
-from unrender.cli import tasks
-from unrender.sweeps.record import write_sweep
+from unrender.app.cli import tasks
+from unrender.app.sweeps.record import write_sweep
 
 TOY = ["quad", "--method", "plain", "--steps", 20, "--final-spp", 1]
 GRID = [*TOY, "--over", "learning_rate=0.03,0.3"]
@@ -114,7 +114,7 @@ def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.Monke
         write_sweep(session.folder, record)
 
     for home in ("sweep_function", "sweep_driver"):
-        monkeypatch.setattr(f"unrender.cli.{home}.run_trials", run_trials)
+        monkeypatch.setattr(f"unrender.app.cli.{home}.run_trials", run_trials)
     found = ur.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
     words = ["--method", "plain", "--over", "learning_rate=0.01:0.1:log", "--over", "spp=1,4", "--steps", 3]
     assert unrender("sweep", "quad", *words, "--trials", 5, "-s", "beta_2=0.9", "--threads", 1).status == 0

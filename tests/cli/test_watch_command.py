@@ -19,7 +19,7 @@ import pytest
 
 import unrender as package
 from browser import chromium
-from unrender.watch import server
+from unrender.app.watch import server
 
 PATIENCE = 120.0
 SOURCE = Path(package.__file__).parents[1]
@@ -29,7 +29,7 @@ SOURCE = Path(package.__file__).parents[1]
 def command(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """`unrender ARGUMENTS` in another process, ended with the block."""
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "unrender.cli.main", *map(str, arguments)],
+        [sys.executable, "-u", "-m", "unrender.app.cli.main", *map(str, arguments)],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(SOURCE)},
         stdout=subprocess.PIPE,

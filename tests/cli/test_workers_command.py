@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from unrender.cli.main import main
-from unrender.cli.tasks import Job, RunTask
-from unrender.cluster import Ended
+from unrender.app.cli.main import main
+from unrender.app.cli.tasks import Job, RunTask
+from unrender.app.distributed.cluster import Ended
+from unrender.app.sweeps.record import RunOutcome
 from unrender.display.terminal import Console
-from unrender.sweeps.record import RunOutcome
 
-compare = import_module("unrender.cli.compare")
+compare = import_module("unrender.app.cli.compare")
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_an_interrupted_comparison_tells_what_was_done(monkeypatch: pytest.Monke
         def saved(self) -> list[Ended]:
             return [found(self.started[1], "interrupted")]
 
-    monkeypatch.setattr("unrender.cluster.OnWorkers", Executor)
+    monkeypatch.setattr("unrender.app.distributed.cluster.OnWorkers", Executor)
     runs = [RunTask(f"plain-seed{n}", "plain", {}, None, 1.0, n, None) for n in range(4)]
     comparison: Any = SimpleNamespace(job=Job("quad", {}, True, "", str(tmp_path)), runs=runs, cluster=object())
     outcomes = compare._on_workers(Console(quiet=True), comparison)

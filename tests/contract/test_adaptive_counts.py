@@ -15,10 +15,10 @@ from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.pixels.base import DrawStatistics, MiniBatch
-from unrender.problem.batches import WholeView
-from unrender.problem.sample_counts import SampleCounts, SampleShares, rounded
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
+from unrender.scene.batches import WholeView
+from unrender.scene.sample_counts import SampleCounts, SampleShares, rounded
 
 CV, Counts = ur.images.RecursiveControlVariate, ur.pixels.AdaptiveCounts
 

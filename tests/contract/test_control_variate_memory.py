@@ -9,8 +9,8 @@ from analytic import problem
 import unrender as ur
 from unrender.core.random import Key
 from unrender.images.recursive_control_variate import ViewMemory
-from unrender.problem.batches import WholeView
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.scene.batches import WholeView
 from unrender.statistics import welford
 
 STEPS, RUNS, NOISE, SPP = 30, 12, 0.5, 2

@@ -21,12 +21,12 @@ from unrender.estimators.capabilities import FreshGradient
 from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
 from unrender.optimizers import transforms
-from unrender.problem.batches import WholeView
-from unrender.problem.bounds import MARGIN
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.callbacks import Callback
 from unrender.runs.run import Run
+from unrender.scene.batches import WholeView
+from unrender.scene.bounds import MARGIN
 
 Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate

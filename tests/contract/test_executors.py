@@ -11,11 +11,11 @@ import pytest
 
 import unrender as ur
 from tests.contract import analytic
-from unrender.dealing.assignment import deal
-from unrender.dealing.executor import DistributedExecutor
-from unrender.dealing.hosts import LocalHosts
-from unrender.dealing.share import ViewShare
-from unrender.problem.executor import Executor, LocalExecutor
+from unrender.app.distributed.assignment import deal
+from unrender.app.distributed.executor import DistributedExecutor
+from unrender.app.distributed.hosts import LocalHosts
+from unrender.app.distributed.share import ViewShare
+from unrender.scene.executor import Executor, LocalExecutor
 
 VIEWS, STEPS = 3, 6
 

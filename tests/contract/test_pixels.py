@@ -17,9 +17,9 @@ from unrender.pixels import pixel_statistics
 from unrender.pixels import tiles as cells_module
 from unrender.pixels.map_denoising import denoise_side_by_side
 from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
-from unrender.problem.batches import PixelBatch, PixelSample, WholeView
-from unrender.problem.references import References
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.scene.batches import PixelBatch, PixelSample, WholeView
+from unrender.scene.references import References
 
 SCHEMES: dict[str, Any] = {
     "uniform": ur.pixels.Uniform,

@@ -27,9 +27,9 @@ from hostile_inputs import KEY, Hostile, ply, scene, serialized, write_scene
 from hostile_worker import Outcome, take_in
 
 import unrender as ur
-from unrender import report
-from unrender.capture import formats, pictures
-from unrender.capture.formats import lights
+from unrender.app import report
+from unrender.app.capture import formats, pictures
+from unrender.app.capture.formats import lights
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, volumes
 from unrender.runs.folder import reader

@@ -16,7 +16,7 @@ from hostile_inputs import Hostile, names_archive
 from test_hostile_input import CHECKPOINTS, RECORDS
 
 import unrender as ur
-from unrender import report
+from unrender.app import report
 from unrender.runs.folder import checkpoint
 
 __all__ = ["FOLDERS", "HARMLESS", "warm_up"]

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.exporting import blender, gltf, mesh_formats, textures, usd
-from unrender.exporting.asset import Asset, Camera, Part
-from unrender.exporting.materials import Material
+from unrender.app.exporting import blender, gltf, mesh_formats, textures, usd
+from unrender.app.exporting.asset import Asset, Camera, Part
+from unrender.app.exporting.materials import Material
 
 COLOURS = np.array([[[0.9, 0.1, 0.2], [0.1, 0.8, 0.3]], [[0.2, 0.3, 0.7], [0.6, 0.6, 0.1]]], np.float32)
 ROUGHNESS = np.array([[0.2, 0.4], [0.6, 0.8]], np.float32)

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import made_asset
-from unrender.evaluation import metrics
-from unrender.exporting import asset as assets
-from unrender.exporting import gltf, textures
-from unrender.exporting.asset import Asset
-from unrender.exporting.scene_folder import export
-from unrender.problem.problem import Problem
+from unrender.app.exporting import asset as assets
+from unrender.app.exporting import gltf, textures
+from unrender.app.exporting.asset import Asset
+from unrender.app.exporting.scene_folder import export
+from unrender.losses import metrics
+from unrender.scene.problem import Problem
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("pygltflib")

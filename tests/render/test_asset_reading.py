@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.exporting import asset as assets
-from unrender.exporting import materials
+from unrender.app.exporting import asset as assets
+from unrender.app.exporting import materials
 
 _FILM = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
 _SENSOR = f'<sensor type="perspective" id="camera">{_FILM}</sensor>'

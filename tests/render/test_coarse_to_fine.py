@@ -19,12 +19,12 @@ from scipy import stats
 
 import unrender as ur
 from tiers import quick
+from unrender.app.distributed.executor import DistributedExecutor
+from unrender.app.distributed.hosts import LocalHosts
+from unrender.app.distributed.share import ViewShare
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.dealing.executor import DistributedExecutor
-from unrender.dealing.hosts import LocalHosts
-from unrender.dealing.share import ViewShare
 from unrender.estimators.filtered import FilteredGradientState
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
@@ -32,9 +32,9 @@ from unrender.io.volumes import write_grid
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.optimizers.chain import ChainState
-from unrender.problem.parameter import ParameterSettings
-from unrender.problem.upsampling import SQUARES
 from unrender.runs import loop, multiresolution
+from unrender.scene.parameter import ParameterSettings
+from unrender.scene.upsampling import SQUARES
 
 TRUTH = np.random.default_rng(2).uniform(0.2, 0.8, (16, 12, 1))
 rcv = ur.images.RecursiveControlVariate

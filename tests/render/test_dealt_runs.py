@@ -15,12 +15,12 @@ import unrender as ur
 from tests.campaigns.stand_in import stand_ins
 from tests.contract import analytic
 from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
+from unrender.app.distributed.cluster import Workers, connect
+from unrender.app.distributed.executor import DistributedExecutor
+from unrender.app.distributed.messages import Call
+from unrender.app.distributed.outbox import Outbox
+from unrender.app.distributed.ray_hosts import RayHosts
 from unrender.backend import variant
-from unrender.cluster import Workers, connect
-from unrender.dealing.executor import DistributedExecutor
-from unrender.dealing.messages import Call
-from unrender.dealing.outbox import Outbox
-from unrender.dealing.ray_hosts import RayHosts
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.exporting import scene_folder as exporting
+from unrender.app.exporting import scene_folder as exporting
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.described import load_described
 from unrender.rendering.mitsuba.poses import Pose

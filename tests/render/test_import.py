@@ -18,11 +18,11 @@ from skimage.registration import phase_cross_correlation
 
 import made_capture as made
 from tiers import quick
-from unrender.capture import formats, importing
-from unrender.capture.cameras import FISHEYE, Lens, project
-from unrender.capture.conventions import reinterpreted
-from unrender.capture.importing import ImportOptions
-from unrender.capture.views import prepare
+from unrender.app.capture import formats, importing
+from unrender.app.capture.cameras import FISHEYE, Lens, project
+from unrender.app.capture.conventions import reinterpreted
+from unrender.app.capture.importing import ImportOptions
+from unrender.app.capture.views import prepare
 from unrender.io import images
 
 CENTRED = Lens(48, 40, 60.0, 60.0, 24.0, 20.0)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.app.watch.monitor import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, RunMonitor
 from unrender.io.bounded_files import read_float_arrays
 from unrender.io.thumbnails import reduced
 from unrender.runs import live as module
 from unrender.runs.folder.reader import read_record
 from unrender.runs.live import Live
-from unrender.watch.monitor import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, RunMonitor
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ import pytest
 import trimesh
 
 import unrender as ur
-from unrender.problem.problem import Problem
 from unrender.runs.folder import reader
 from unrender.runs.metadata import RunAnnotations
+from unrender.scene.problem import Problem
 
 SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}
 STATUE, STONE = "statue.vertex_positions", "statue.bsdf.brdf_0.reflectance.data"

@@ -12,7 +12,7 @@ pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrende
 from PIL import Image
 
 import unrender as ur
-from unrender.evaluation.metrics import srgb
+from unrender.losses.metrics import srgb
 
 WIDTH, HEIGHT = 20, 12
 DIRECTIONS = np.array([[0, 0, 1], [0.5, 0, 1], [-0.5, 0.2, 1], [0, 0.6, 1], [0.3, -0.5, 1], [-0.2, -0.4, 1.0]])

@@ -16,15 +16,15 @@ import pytest
 
 ray = pytest.importorskip("ray")
 
-from unrender.cluster import Workers, connect  # noqa: E402
-from unrender.cluster.private import private_cluster, private_folder  # noqa: E402
+from unrender.app.distributed.cluster import Workers, connect  # noqa: E402
+from unrender.app.distributed.cluster.private import private_cluster, private_folder  # noqa: E402
 from unrender.core.errors import InputError  # noqa: E402
 
 STRANGER = Path(__file__).with_name("stranger_of_ray.py")
 NOBODY = 65534
 SLEEPER = """
 import sys, time
-from unrender.cluster.private import private_folder
+from unrender.app.distributed.cluster.private import private_folder
 with private_folder() as folder:
     (folder / "r").mkdir()
     print(folder, flush=True)

@@ -12,7 +12,7 @@ from unrender import losses
 from unrender.core.errors import InputError
 from unrender.io import toml_lines
 from unrender.preconditioners import LargeSteps
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective">

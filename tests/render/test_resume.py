@@ -19,9 +19,9 @@ from unrender.core.errors import InputError
 from unrender.optimizers.chain import ChainState
 from unrender.optimizers.transforms.momentum import MeanDirection
 from unrender.optimizers.transforms.scale import MeanSquare
-from unrender.problem.fingerprint import differences, fingerprint
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
 from unrender.runs.reopen import problem_of
+from unrender.scene.fingerprint import differences, fingerprint
 
 WALL = "wall.bsdf.reflectance.value"
 SCENE = """<scene version="3.0.0">

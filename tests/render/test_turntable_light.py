@@ -11,7 +11,7 @@ import pytest
 
 import unrender as ur
 from kernels import recorded
-from unrender.judging import scenes
+from unrender.app.evaluation import scenes
 from unrender.rendering.mitsuba import film, turntable_light
 
 ANGLE = 60.0

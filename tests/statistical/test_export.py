@@ -14,7 +14,7 @@ from zscores import agree
 import unrender as ur
 from tiers import quick
 from unrender.gallery import meshes
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 RUNS, SPP = 24, 32
 LEFT_OUT = (

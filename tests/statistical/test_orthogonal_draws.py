@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.smoothing.options import SamplingOptions
-from unrender.smoothing.sampling import SmoothedFunction
+from unrender.estimators.smoothing.options import SamplingOptions
+from unrender.estimators.smoothing.sampling import SmoothedFunction
 
 N = 6
 RNG = np.random.default_rng(4)

@@ -21,12 +21,12 @@ from unrender.methods import auto as module
 from unrender.methods import first_rates, method
 from unrender.methods.plan import Plan
 from unrender.preconditioners import LargeSteps, Sobolev
-from unrender.problem.parameter import Parameter, ParameterSettings
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
+from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 SHAPE = (4, 4)
 TRUTH = {"map": np.random.default_rng(0).uniform(0.2, 0.8, (3, 3, 1)), "gain": np.full(1, 200.0)}

@@ -15,14 +15,14 @@ from PIL import Image
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
 import unrender
-from unrender.capture import atlas, formats, hull, importing, pictures
-from unrender.capture.cameras import Lens, project, rigid
-from unrender.capture.capture import Capture, Photograph
-from unrender.capture.captured_view import CapturedView
-from unrender.capture.conventions import AXES, pose, reinterpreted
-from unrender.capture.formats import colmap
-from unrender.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
-from unrender.capture.undistortion import Resampling, pinhole
+from unrender.app.capture import atlas, formats, hull, importing, pictures
+from unrender.app.capture.cameras import Lens, project, rigid
+from unrender.app.capture.capture import Capture, Photograph
+from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.conventions import AXES, pose, reinterpreted
+from unrender.app.capture.formats import colmap
+from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
+from unrender.app.capture.undistortion import Resampling, pinhole
 from unrender.core.errors import InputError
 
 LENS = Lens(64, 64, 80.0, 80.0, 32.0, 32.0)

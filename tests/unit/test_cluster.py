@@ -10,8 +10,18 @@ from typing import Any
 
 import pytest
 
-from unrender.cluster import Cluster, Ended, InProcess, OnWorkers, Share, Workers, connect, load_ray, share
-from unrender.cluster.head import HeadNode
+from unrender.app.distributed.cluster import (
+    Cluster,
+    Ended,
+    InProcess,
+    OnWorkers,
+    Share,
+    Workers,
+    connect,
+    load_ray,
+    share,
+)
+from unrender.app.distributed.cluster.head import HeadNode
 from unrender.core.errors import InputError
 
 
@@ -92,7 +102,7 @@ def test_the_package_imports_neither_ray_nor_optuna() -> None:
     code = (
         "import sys, pkgutil, importlib, unrender\n"
         "for name in sorted(unrender.__all__): getattr(unrender, name)\n"
-        "import unrender.cli.app, unrender.cluster\n"
+        "import unrender.app.cli.app, unrender.app.distributed.cluster\n"
         "print({'ray', 'optuna'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.capture import formats
-from unrender.capture.formats import lights
+from unrender.app.capture import formats
+from unrender.app.capture.formats import lights
 from unrender.core.errors import InputError
 from unrender.io import confinement
 

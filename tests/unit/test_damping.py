@@ -12,7 +12,7 @@ from unrender.estimators.damping import damping, smoothed_variance
 from unrender.estimators.sample_groups import _derivative
 from unrender.images.base import variance_of_mean
 from unrender.losses import L1
-from unrender.problem.batches import PixelBatch, PixelSample
+from unrender.scene.batches import PixelBatch, PixelSample
 
 
 def test_the_damped_sign_is_the_derivative_of_charbonniers_loss():

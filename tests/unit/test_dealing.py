@@ -14,17 +14,17 @@ import pytest
 
 import unrender as ur
 from tests.contract import analytic
-from unrender.cli.dealing import variant_again
-from unrender.cluster import Workers, share
+from unrender.app.cli.dealing import variant_again
+from unrender.app.distributed import capacity
+from unrender.app.distributed.assignment import deal, total
+from unrender.app.distributed.cluster import Workers, share
+from unrender.app.distributed.executor import DistributedExecutor
+from unrender.app.distributed.hosts import LocalHosts
+from unrender.app.distributed.messages import Call, Reply
+from unrender.app.distributed.outbox import Outbox
+from unrender.app.distributed.share import ViewShare
+from unrender.app.distributed.transfer import packed, unpacked
 from unrender.core import arrays
-from unrender.dealing import capacity
-from unrender.dealing.assignment import deal, total
-from unrender.dealing.executor import DistributedExecutor
-from unrender.dealing.hosts import LocalHosts
-from unrender.dealing.messages import Call, Reply
-from unrender.dealing.outbox import Outbox
-from unrender.dealing.share import ViewShare
-from unrender.dealing.transfer import packed, unpacked
 from unrender.runs.resume import load_run
 
 RCV = ur.images.RecursiveControlVariate
@@ -186,7 +186,9 @@ def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
 def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("unrender.dealing.memories._MOST_STEPS", 4)  # so that memories are collected and stored, too
+    monkeypatch.setattr(
+        "unrender.app.distributed.memories._MOST_STEPS", 4
+    )  # so that memories are collected and stored, too
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     shares = deal([16] * VIEWS, 3)
     whole = descend(dealt(problem, 3, compress=True), name)
@@ -198,7 +200,7 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
 def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = analytic.problem(views=VIEWS)
     step = sum(np.asarray(value).nbytes for value in problem.initial().values())
-    monkeypatch.setattr("unrender.dealing.memories._MOST_BYTES", 3 * step)
+    monkeypatch.setattr("unrender.app.distributed.memories._MOST_BYTES", 3 * step)
     together, collected = dealt(problem, 2), list[int]()
     hosts: Any = together.executor._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     fetch = hosts.fetch
@@ -320,7 +322,7 @@ def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pyt
         assert store_bytes == 256 << 20
         raise ur.InputError(str(share([(16, 0)], workers.count, gpu=False, most=most)))
 
-    monkeypatch.setattr("unrender.dealing.deal.connect", connect)
+    monkeypatch.setattr("unrender.app.distributed.deal.connect", connect)
     with pytest.raises(ur.InputError, match=r"count=4, cpus=4\.0"), ur.deal(analytic.problem(views=4), "auto"):
         pass
 

@@ -9,7 +9,7 @@ import pytest
 
 from unrender.core.errors import InputError
 from unrender.display import formatting
-from unrender.evaluation import debiased
+from unrender.statistics import debiased
 
 RUNS = 400
 

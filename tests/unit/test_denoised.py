@@ -10,10 +10,10 @@ import pytest
 
 import unrender as ur
 from unrender.core.random import Key
-from unrender.evaluation import denoising
+from unrender.images import denoising
 from unrender.images.base import PairRequest
-from unrender.problem.batches import WholeView
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.scene.batches import WholeView
 
 Denoised, Plain, CV = ur.images.Denoised, ur.images.Plain, ur.images.RecursiveControlVariate
 OIDN = pytest.param(

@@ -10,8 +10,8 @@ import pytest
 
 import unrender as ur
 from unrender.backend import variant
-from unrender.evaluation import denoising
-from unrender.evaluation.denoising import denoise
+from unrender.images import denoising
+from unrender.images.denoising import denoise
 
 OIDN = pytest.param(
     "oidn", marks=pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.capture import field_folder
+from unrender.app.capture import field_folder
 
 
 def around(middle: np.ndarray, distance: float, count: int = 6) -> np.ndarray:

@@ -13,9 +13,6 @@ import pytest
 from unrender import optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import final_images
 from unrender.runs.callbacks import Callback
@@ -24,6 +21,9 @@ from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.result import Result
 from unrender.runs.run import Run
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 SHAPE = (16, 16)
 

@@ -40,7 +40,7 @@ class Counted:
 def test_without_pytorch_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     _ = ur.smoothed  # what grey_box imports before: SciPy looks for PyTorch in sys.modules
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "unrender.smoothing.grey_box", raising=False)
+    monkeypatch.delitem(sys.modules, "unrender.estimators.smoothing.grey_box", raising=False)
     monkeypatch.delitem(vars(ur), "grey_box", raising=False)
     with pytest.raises(ur.InputError, match=r"grey_box needs PyTorch .*: pip install torch$"):
         _ = ur.grey_box

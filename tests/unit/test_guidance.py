@@ -16,15 +16,15 @@ from unrender.images import RecursiveControlVariate
 from unrender.losses import Huber
 from unrender.methods import method
 from unrender.methods.smoothed import SmoothedMethod
-from unrender.problem.key_hints import instead_of, near_key
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.advice import remarks
 from unrender.runs.components import resolve
 from unrender.runs.optimize import estimate, optimize
+from unrender.scene.key_hints import instead_of, near_key
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 SHAPE = (4, 4)
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guide"

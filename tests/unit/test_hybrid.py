@@ -12,9 +12,9 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.images.base import PairRequest
 from unrender.methods import method
-from unrender.problem.batches import PixelBatch
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
+from unrender.scene.batches import PixelBatch
 
 CV = ur.images.RecursiveControlVariate
 SHAPE = (4, 4)

@@ -11,7 +11,7 @@ import pytest
 
 @pytest.mark.mitsuba
 def test_pixels_that_masks_leave_out_do_not_count() -> None:
-    from unrender.cli.execute import image_error
+    from unrender.app.cli.execute import image_error
 
     reference = np.zeros((2, 3, 3), np.float32)
     shown = reference + 0.5

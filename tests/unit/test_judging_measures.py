@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from unrender.app.evaluation.measures import best_factors, compare_albedo, mean, measure
 from unrender.core.errors import InputError
-from unrender.evaluation import lpips, metrics
-from unrender.judging.measures import best_factors, compare_albedo, mean, measure
+from unrender.losses import lpips, metrics
 
 MASK = np.zeros((16, 20), np.float32)
 MASK[3:12, 4:15] = 1

@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.app.stages.stage_problem import _check
 from unrender.core import tables
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate
-from unrender.evaluation.self_intersections import crossing_triangles
-from unrender.evaluation.surfaces import Surface, folds, surface_error
 from unrender.gallery import blobs, meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
-from unrender.problem import remeshing
-from unrender.problem.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
-from unrender.problem.mesh_regularizer import MeshRegularizer
-from unrender.problem.remeshing import Remeshing
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.mesh_watch import MeshWatch
-from unrender.stages.stage_problem import _check
+from unrender.scene import remeshing
+from unrender.scene.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
+from unrender.scene.mesh_regularizer import MeshRegularizer
+from unrender.scene.remeshing import Remeshing
+from unrender.scene.self_intersections import crossing_triangles
+from unrender.scene.surfaces import Surface, folds, surface_error
 
 POINTS, FACES = meshes.icosphere(2)
 COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from unrender.core.errors import InputError
-from unrender.evaluation import metrics
+from unrender.losses import metrics
 
 RNG = np.random.default_rng(5)
 REFERENCE = RNG.uniform(0.05, 0.6, (32, 48, 3))

@@ -16,12 +16,12 @@ from unrender.core import phases
 from unrender.display import notebook_bar
 from unrender.display.notebook_bar import NotebookBar
 from unrender.estimators.path import PathGradient
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 HOSTILE = '<script>alert("x")</script>'
 

@@ -16,7 +16,7 @@ from scipy import stats
 import unrender as ur
 from tiers import slow
 from unrender.core.errors import InputError
-from unrender.loops.stream import Rendered
+from unrender.own_loop.stream import Rendered
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
 CV = ur.images.RecursiveControlVariate

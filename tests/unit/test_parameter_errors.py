@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unrender.evaluation import parameter_errors
-from unrender.evaluation.parameter_errors import PLAIN, ErrorMeasure
+from unrender.rendering import parameter_errors
+from unrender.rendering.parameter_errors import PLAIN, ErrorMeasure
 
 NORMAL, DIRECTION = ErrorMeasure("normal"), ErrorMeasure("direction")
 

@@ -24,8 +24,8 @@ from unrender.estimators.capabilities import (
 )
 from unrender.estimators.coordinates import by_coordinates
 from unrender.parameterisations import Identity, Log, Logit, Softplus
-from unrender.problem.fingerprint import fingerprint
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.scene.fingerprint import fingerprint
 
 MAPS = {
     "log": (Log(), (0.0, None), lambda u: np.exp(u)),

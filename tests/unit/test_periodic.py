@@ -9,7 +9,7 @@ import unrender as ur
 from unrender.core import periodic
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.grid import laplacian
-from unrender.problem.coordinates import Coordinates
+from unrender.scene.coordinates import Coordinates
 
 HEIGHT, WIDTH = 5, 8
 X = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import unrender
-from unrender.capture import pictures
+from unrender.app.capture import pictures
 from unrender.core.errors import InputError
 from unrender.io import image_size, tiff_header
 from unrender.io.images import srgb_to_linear
@@ -128,7 +128,7 @@ def test_pictures_are_decoded_in_a_few_modules_alone() -> None:
     allowed = {
         "io/image_size.py": {"open"},
         "io/images.py": {"Bitmap"},
-        "capture/pictures.py": {"open", "imdecode"},
+        "app/capture/pictures.py": {"open", "imdecode"},
         "gallery/textures.py": {"open"},
     }
     root = Path(unrender.__file__).parent

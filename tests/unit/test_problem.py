@@ -10,11 +10,11 @@ import pytest
 from unrender import losses
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 HEIGHT, WIDTH = 4, 5
 PIXELS = HEIGHT * WIDTH * 3

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.cluster import Cluster, Share
+from unrender.app.distributed.actor import Place
+from unrender.app.distributed.cluster import Cluster, Share
+from unrender.app.distributed.messages import Call, Reply
+from unrender.app.distributed.ray_hosts import RayHosts
 from unrender.core.random import Key
-from unrender.dealing.actor import Place
-from unrender.dealing.messages import Call, Reply
-from unrender.dealing.ray_hosts import RayHosts
 
 
 class Died(Exception):

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 from report_folders import KEY, Page, write_run
 
-from unrender import report
+from unrender.app import report
+from unrender.app.report import curves, panels, tone_mapping
 from unrender.display import formatting
-from unrender.report import curves, panels, tone_mapping
 from unrender.runs.folder.reader import read
 
 

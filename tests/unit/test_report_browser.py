@@ -7,8 +7,8 @@ import pytest
 from report_folders import write_run
 
 from browser import chromium
-from unrender import report
-from unrender.report import tone_mapping
+from unrender.app import report
+from unrender.app.report import tone_mapping
 
 PIXEL = """async (image) => {
   await image.decode();

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from report_folders import KEY, Page, write_run
 
-from unrender import report
+from unrender.app import report
+from unrender.app.report import groups
 from unrender.core.errors import InputError
-from unrender.evaluation import metrics
-from unrender.report import groups
+from unrender.losses import metrics
 from unrender.runs.folder.reader import read
 
 

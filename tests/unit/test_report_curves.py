@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from report_folders import write_run
 
+from unrender.app.report import curves
+from unrender.app.report.curves import Series
 from unrender.display import formatting, plots
 from unrender.display.plots import Line
-from unrender.report import curves
-from unrender.report.curves import Series
 from unrender.runs.folder.reader import read
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from report_folders import KEY, write_run
 
-from unrender import report
+from unrender.app import report
 from unrender.core.errors import InputError
 
 

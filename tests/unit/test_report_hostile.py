@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from report_folders import KEY, Page, write_run
 
-from unrender import report
+from unrender.app import report
+from unrender.app.watch.monitor import RunMonitor
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 from unrender.runs.folder import history
-from unrender.watch.monitor import RunMonitor
 
 GOOD = np.ones((4, 5, 3), np.float32)
 Break = Callable[[Path], Any]
@@ -337,7 +337,7 @@ def test_a_good_folder_reached_by_a_link_is_read(tmp_path):
 @pytest.mark.parametrize("where", ["label", "notice", "error"])
 def test_a_terminal_is_not_told_what_to_do(tmp_path, capsys, monkeypatch, where):
     """Escape sequences in names: they could move the cursor, retitle the window, or hide what went before."""
-    from unrender.cli.main import main
+    from unrender.app.cli.main import main
 
     monkeypatch.chdir(tmp_path)
     evil = "\x1b]0;owned\x07\x1b[2J"

@@ -10,7 +10,7 @@ from PIL import Image
 from test_photographs_parameters import check_adjoint, requests
 
 import unrender as ur
-from unrender.capture import decoding, pictures, unknowns
+from unrender.app.capture import decoding, pictures, unknowns
 from unrender.core.errors import InputError
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, scene_values, with_photographs

@@ -15,10 +15,10 @@ from report_folders import write_run
 
 import unrender as ur
 from browser import chromium
-from unrender import report
+from unrender.app import report
+from unrender.app.report import shapes
 from unrender.gallery import meshes
 from unrender.io import mesh_writing
-from unrender.report import shapes
 from unrender.runs import reopen
 from unrender.runs.folder import reader
 

@@ -9,12 +9,12 @@ import pytest
 
 import unrender as ur
 from unrender.core.errors import InputError
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import sensitivity as module
 from unrender.runs.sensitivity import hardly_seen, sensitivity
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 SHAPE, TEXTURE = (8, 8), (4, 3, 2)
 MATRIX = np.random.default_rng(0).random((8 * 8 * 3, 24)) * np.geomspace(0.001, 3.0, 24)

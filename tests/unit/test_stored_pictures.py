@@ -8,8 +8,8 @@ import pytest
 import unrender as ur
 from unrender.io import stored_pictures
 from unrender.io.stored_pictures import PictureStore, StoredPicture
-from unrender.problem import view_checks
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.scene import view_checks
 
 
 def pictures() -> dict[str, tuple[np.ndarray, int]]:

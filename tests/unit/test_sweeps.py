@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from unrender.app.sweeps import folders, pruning
+from unrender.app.sweeps.axes import Axis, parse_axes
+from unrender.app.sweeps.record import RunOutcome, SweepPlan, SweepRecord, read_sweep, write_sweep
+from unrender.app.sweeps.search import Grid, Random, Search
+from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.core.errors import InputError
 from unrender.methods import method
-from unrender.sweeps import folders, pruning
-from unrender.sweeps.axes import Axis, parse_axes
-from unrender.sweeps.record import RunOutcome, SweepPlan, SweepRecord, read_sweep, write_sweep
-from unrender.sweeps.search import Grid, Random, Search
-from unrender.sweeps.trials import Started, Trials, trial_record
 
 PLAIN = method("plain")
 
@@ -135,7 +135,7 @@ def searches(kind: str) -> Search:
     space = axes("learning_rate=0.0003:3:log", "spp=2:16:log")
     if kind == "tpe":
         pytest.importorskip("optuna")
-        from unrender.sweeps.tpe import TPE
+        from unrender.app.sweeps.tpe import TPE
 
         return TPE(space, 24, 5)
     return Random(space, 24, 5)

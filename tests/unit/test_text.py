@@ -13,11 +13,11 @@ from rich.markup import escape
 from rich.progress import Progress, TextColumn
 from rich.table import Table
 
+from unrender.app.report import html
 from unrender.core.errors import InputError, VariantError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import LONGEST_LINE, grouped, listed, one_line, printable, shorten, visible
 from unrender.display.terminal import Console, echo
-from unrender.report import html
 
 EVIL = {
     "ESC": "\x1b]0;owned\x07\x1b[2J",

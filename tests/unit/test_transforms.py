@@ -29,8 +29,8 @@ from unrender.optimizers.transforms import (
     WienerShrinkage,
 )
 from unrender.preconditioners import Sobolev
-from unrender.problem.upsampling import restarted
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
+from unrender.scene.upsampling import restarted
 from unrender.schedules import Cosine
 
 SMOOTH = FittedSobolev(Sobolev(2.0), ("map",))

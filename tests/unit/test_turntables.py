@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unrender.capture import photometric, turntable
-from unrender.capture.cameras import Lens
-from unrender.capture.captured_view import CapturedView
-from unrender.capture.formats import is_lit, lights
-from unrender.capture.stored import StoredViews
+from unrender.app.capture import photometric, turntable
+from unrender.app.capture.cameras import Lens
+from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.formats import is_lit, lights
+from unrender.app.capture.stored import StoredViews
 from unrender.core.errors import InputError
 
 SIZE, COUNT = 48, 12

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unrender.dealing.batches import joined
-from unrender.dealing.messages import Batch
+from unrender.app.distributed.batches import joined
+from unrender.app.distributed.messages import Batch
 from unrender.pixels import tiles as tiles_module
 from unrender.pixels import uniform_share
 from unrender.pixels.base import DrawStatistics

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from unrender.capture import unknowns
+from unrender.app.capture import unknowns
+from unrender.app.stages.stages_file import split
 from unrender.core.errors import InputError
 from unrender.methods import method
-from unrender.stages.stages_file import split
 
 
 def _stages(*names: str) -> list[tuple[str, list[str], object]]:

@@ -18,9 +18,9 @@ from PIL import Image
 from report_folders import KEY, write_run
 
 from browser import chromium
-from unrender.report import tone_mapping
-from unrender.watch import Address, application
-from unrender.watch.server import listen
+from unrender.app.report import tone_mapping
+from unrender.app.watch import Address, application
+from unrender.app.watch.server import listen
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # newer ones of Starlette would rather have httpx's successor

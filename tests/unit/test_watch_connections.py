@@ -19,9 +19,9 @@ import uvicorn
 from report_folders import write_run
 
 from browser import chromium
-from unrender.watch import Address, connections, server
-from unrender.watch.monitor import RunMonitor
-from unrender.watch.redirect import Redirect
+from unrender.app.watch import Address, connections, server
+from unrender.app.watch.monitor import RunMonitor
+from unrender.app.watch.redirect import Redirect
 
 PATIENCE = 20.0
 

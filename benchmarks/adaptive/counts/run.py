@@ -63,7 +63,7 @@ def rows(problem: ur.Problem, kept: Kept, step: int, runs: int, equal: bool) -> 
 
 def cost(problem: ur.Problem, sampler: ur.pixels.AdaptiveCounts, state: Any, spp: int) -> float:
     """What a step's paths cost, by their counted vertices, over as many with equal numbers."""
-    from unrender.problem.sample_counts import rounded
+    from unrender.scene.sample_counts import rounded
 
     shares = sampler.redraw(problem, state, Key(0)).shares
     if shares is None or len(state.costs) != problem.pixels:

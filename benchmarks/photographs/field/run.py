@@ -21,10 +21,10 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import Whole, method_parts, stages_file
 from benchmarks.runner.records import scratch
-from unrender.capture import importing
-from unrender.capture.writing import PROBLEM
-from unrender.judging.held_out import HELD_OUT
-from unrender.judging.measures import measure
+from unrender.app.capture import importing
+from unrender.app.capture.writing import PROBLEM
+from unrender.app.evaluation.held_out import HELD_OUT
+from unrender.app.evaluation.measures import measure
 
 ENTRANTS = ("default", "plain")
 MERGE = ("captures.*.methods",)

@@ -8,8 +8,8 @@ import io
 import numpy as np
 
 from unrender.display import maps
-from unrender.evaluation.metrics import exposure, srgb
 from unrender.io.thumbnails import reduced
+from unrender.losses.metrics import exposure, srgb
 
 __all__ = ["data_uri", "png", "shown_image", "shown_map"]
 

@@ -25,7 +25,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
     Variance,
 )
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["Estimate", "Estimator", "as_numpy"]
 

@@ -20,7 +20,7 @@ from unrender.estimators.capabilities import (
     Variance,
 )
 from unrender.parameterisations.base import Transform
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["by_coordinates", "regularized"]
 

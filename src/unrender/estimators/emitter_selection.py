@@ -15,9 +15,9 @@ from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, leave_one_out
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.uniform_share import SHARES, ShareEvidence
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import SQUARES, Upsampler
 from unrender.rendering.renderer import EmitterMoments, RenderSession, drawing_emitters
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import SQUARES, Upsampler
 
 __all__ = [
     "EmitterRequest",

@@ -19,8 +19,8 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient, Variance
 from unrender.estimators.path import PathGradient
 from unrender.preconditioners import grid
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler, upsampled
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler, upsampled
 
 __all__ = ["FilteredGradient", "FilteredGradientState"]
 

@@ -17,10 +17,10 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
 from unrender.estimators.damping import damping, smoothed_variance
-from unrender.problem.bounds import project
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.bounds import project
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
 
 __all__ = ["GaussNewton", "GaussNewtonState"]
 

@@ -17,10 +17,10 @@ from unrender.estimators.capabilities import Capabilities, Capability, FreshGrad
 from unrender.estimators.coordinates import by_coordinates
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import SQUARES, Upsampler, restarted, upsampled
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import SQUARES, Upsampler, restarted, upsampled
 
 __all__ = ["HybridGradient", "HybridState", "beyond_paths"]
 

@@ -14,9 +14,9 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.problem.bounds import project
-from unrender.problem.problem import Problem
 from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.bounds import project
+from unrender.scene.problem import Problem
 
 __all__ = ["BlackBox", "LossState", "LossValues"]
 

@@ -19,9 +19,9 @@ from unrender.images.base import ImageEstimator, PairRequest
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import SQUARES, Upsampler, upsampled
 from unrender.rendering.renderer import Space
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import SQUARES, Upsampler, upsampled
 from unrender.statistics import meta
 
 __all__ = ["MetaEstimator", "MetaState"]

@@ -27,9 +27,9 @@ from unrender.losses.base import Loss
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, learned
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler, upsampled
 from unrender.rendering.renderer import with_differential_bsdf
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler, upsampled
 
 __all__ = ["PathGradient", "PathGradientState"]
 

@@ -11,7 +11,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.preconditioners.base import Preconditioner
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["PreconditionedPerturbations"]
 

@@ -24,10 +24,10 @@ from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
-from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView, whole_views
-from unrender.problem.problem import Problem
-from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
+from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView, whole_views
+from unrender.scene.problem import Problem
+from unrender.scene.sample_counts import SampleCounts
 
 __all__ = [
     "PIXELS",

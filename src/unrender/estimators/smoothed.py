@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from unrender import smoothing as smoothed
 from unrender.core import checks, vectors
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
+from unrender.estimators import smoothing as smoothed
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
     Capabilities,
@@ -28,16 +28,16 @@ from unrender.estimators.capabilities import (
 )
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.preconditioned_perturbations import PreconditionedPerturbations
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler
-from unrender.schedules.functions import Schedule
-from unrender.smoothing.function import (
+from unrender.estimators.smoothing.function import (
     estimate_gradient,
     estimate_gradient_and_product,
     estimate_hessian,
     estimate_hvp,
 )
-from unrender.smoothing.options import SamplingOptions
+from unrender.estimators.smoothing.options import SamplingOptions
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
+from unrender.schedules.functions import Schedule
 from unrender.statistics import diagonal_curvature
 
 __all__ = ["SmoothedDerivatives", "SmoothedState"]

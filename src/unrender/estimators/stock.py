@@ -13,8 +13,8 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.estimators.path import PathGradient, PathGradientState
-from unrender.problem.problem import Problem
 from unrender.rendering.renderer import StockRenderer
+from unrender.scene.problem import Problem
 
 __all__ = ["StockGradient", "StockState"]
 

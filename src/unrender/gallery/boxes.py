@@ -14,7 +14,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, parts, staging
 from unrender.losses import L2, Loss
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Box2", "Box10"]
 

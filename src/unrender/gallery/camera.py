@@ -11,7 +11,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.losses import L2, Loss
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Camera"]
 

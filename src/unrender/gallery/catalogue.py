@@ -12,7 +12,7 @@ from unrender.display import notebook_bar
 from unrender.gallery import fields
 from unrender.gallery.fields import Option
 from unrender.gallery.specification import ProblemSource, build_problem
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["names", "options", "problem", "summary"]
 

@@ -14,7 +14,7 @@ from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
 from unrender.losses import L1, Loss
 from unrender.preconditioners import LargeSteps
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["IndirectRoom"]
 

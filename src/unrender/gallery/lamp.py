@@ -14,7 +14,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Lamp"]
 

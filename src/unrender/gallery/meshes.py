@@ -9,8 +9,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.evaluation.surfaces import Surface
 from unrender.rendering.mitsuba.described import load_described
+from unrender.scene.surfaces import Surface
 
 __all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "surface", "sweep", "triangles", "unrolled"]
 

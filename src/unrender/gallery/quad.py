@@ -9,10 +9,10 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields
 from unrender.losses import L2, Loss
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.numpy.quadratic import POINT, QuadraticRenderer
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 __all__ = ["Quad"]
 

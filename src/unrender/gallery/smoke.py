@@ -15,7 +15,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, textures, volumes
 from unrender.losses import L1, Loss
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Smoke"]
 

@@ -15,13 +15,13 @@ from unrender.core import phases
 from unrender.core.random import Key
 from unrender.gallery import reference_cache
 from unrender.losses import Loss
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 __all__ = ["ProblemSource", "Specification", "build_problem", "reference"]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.gallery import parts
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["sun", "unknown"]
 

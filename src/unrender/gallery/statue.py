@@ -11,10 +11,10 @@ from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
-from unrender.problem.parameter import Parameter
-from unrender.problem.problem import Problem
-from unrender.problem.view import View
 from unrender.rendering.mitsuba.scene_loading import load
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
 
 __all__ = ["Statue"]
 

@@ -12,7 +12,7 @@ from typing import Any
 from unrender.core.registry import register
 from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Tea"]
 

@@ -16,7 +16,7 @@ from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, skies, textures, two_planets
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["ThreeTextures"]
 

@@ -14,7 +14,7 @@ from unrender.core.registry import register
 from unrender.gallery import fields, parts
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.losses import L1, Loss
-from unrender.problem.parameter import Parameter
+from unrender.scene.parameter import Parameter
 
 __all__ = ["Wall"]
 

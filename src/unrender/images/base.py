@@ -10,10 +10,10 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.problem.batches import Frame, PixelSample
-from unrender.problem.problem import Problem
-from unrender.problem.sample_counts import SampleCounts
 from unrender.rendering.renderer import Space
+from unrender.scene.batches import Frame, PixelSample
+from unrender.scene.problem import Problem
+from unrender.scene.sample_counts import SampleCounts
 
 __all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "leave_one_out", "variance_of_mean"]
 

@@ -12,13 +12,13 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.evaluation import denoising
-from unrender.evaluation.denoising import Denoiser
+from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
+from unrender.images.denoising import Denoiser
 from unrender.images.plain import Plain
-from unrender.problem.batches import Frame, PixelSample
-from unrender.problem.problem import Problem
 from unrender.rendering.renderer import Space
+from unrender.scene.batches import Frame, PixelSample
+from unrender.scene.problem import Problem
 
 __all__ = ["Denoised"]
 

@@ -9,10 +9,10 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
-from unrender.problem.batches import Frame, PixelSample, WholeView
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Space
+from unrender.scene.batches import Frame, PixelSample, WholeView
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
 
 __all__ = ["Plain", "PlainState"]
 

@@ -19,11 +19,11 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
-from unrender.problem.batches import Frame, PixelBatch, PixelSample, WholeView
-from unrender.problem.problem import Problem
-from unrender.problem.sample_counts import SampleCounts
-from unrender.problem.upsampling import Upsampler
 from unrender.rendering.renderer import Rendering, Space
+from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView
+from unrender.scene.problem import Problem
+from unrender.scene.sample_counts import SampleCounts
+from unrender.scene.upsampling import Upsampler
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 

@@ -33,10 +33,10 @@ from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.pixels.base import PixelSampler
 from unrender.preconditioners import LargeSteps, Sobolev, grid
-from unrender.problem.coarse_to_fine import CoarseToFine
-from unrender.problem.parameter import ParameterSettings
-from unrender.problem.problem import Problem
 from unrender.rendering.partial import PartialDerivatives
+from unrender.scene.coarse_to_fine import CoarseToFine
+from unrender.scene.parameter import ParameterSettings
+from unrender.scene.problem import Problem
 from unrender.schedules import Exponential, InverseRoot
 
 __all__ = ["AutoMethod"]

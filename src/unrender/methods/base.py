@@ -17,7 +17,7 @@ from unrender.core.text import grouped
 from unrender.estimators.base import Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 from unrender.schedules.functions import Schedule
 
 __all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parameterised", "parse_schedule"]

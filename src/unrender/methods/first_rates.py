@@ -8,8 +8,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unrender.problem.bounds import MARGIN
-from unrender.problem.problem import Problem
+from unrender.scene.bounds import MARGIN
+from unrender.scene.problem import Problem
 
 __all__ = ["first_rates", "logarithms"]
 

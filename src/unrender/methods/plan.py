@@ -10,9 +10,9 @@ from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
-from unrender.problem.coarse_to_fine import CoarseToFine
-from unrender.problem.parameter import ParameterSettings
-from unrender.problem.problem import Problem
+from unrender.scene.coarse_to_fine import CoarseToFine
+from unrender.scene.parameter import ParameterSettings
+from unrender.scene.problem import Problem
 
 __all__ = ["Plan"]
 

@@ -12,7 +12,7 @@ import tomli_w
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, toml_lines
 from unrender.methods.plan import Plan
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["SUFFIX", "PlanFile", "text"]
 

@@ -17,7 +17,7 @@ from unrender.optimizers import rates
 from unrender.optimizers.base import OnMeshes
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_transforms
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.scene.upsampling import Upsampler, restarted, upsampled
 from unrender.schedules.functions import Schedule
 
 __all__ = ["Chain", "ChainState", "Recipe"]

@@ -20,7 +20,7 @@ from unrender.estimators.capabilities import Smoothing
 from unrender.optimizers import rates
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.chain import ChainState
-from unrender.problem.upsampling import NotCarried, Upsampler
+from unrender.scene.upsampling import NotCarried, Upsampler
 from unrender.schedules.functions import Schedule
 
 __all__ = ["DirectionOptions", "NewtonState", "apply_direction", "check_options", "coordinate_scales", "init_state"]

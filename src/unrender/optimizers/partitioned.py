@@ -14,7 +14,7 @@ from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradie
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 __all__ = ["Partitioned", "PartitionedState"]
 

@@ -15,8 +15,8 @@ from unrender.pixels.guided import GuidedSampler, GuidedSamplerState, Maps
 from unrender.pixels.map_denoising import MapDenoiser
 from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
 
 __all__ = ["Adaptive"]
 

@@ -18,10 +18,10 @@ from unrender.pixels.pooling import pool
 from unrender.pixels.tile_samples import Maps, TileSamples, finite
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.pixels.uniform_share import ShareEvidence
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
-from unrender.problem.sample_counts import SampleShares
-from unrender.problem.upsampling import SQUARES, Upsampler
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
+from unrender.scene.sample_counts import SampleShares
+from unrender.scene.upsampling import SQUARES, Upsampler
 
 __all__ = ["AdaptiveCounts", "AdaptiveCountsState"]
 

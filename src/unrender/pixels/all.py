@@ -8,8 +8,8 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
 
 __all__ = ["All", "AllState"]
 

@@ -10,9 +10,9 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
-from unrender.problem.sample_counts import SampleShares
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
+from unrender.scene.sample_counts import SampleShares
 
 __all__ = [
     "DrawStatistics",

@@ -18,9 +18,9 @@ from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_ma
 from unrender.pixels.tile_samples import FACTORS, Maps, TileSamples, finite
 from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
 from unrender.pixels.uniform_share import ShareEvidence
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import SQUARES, Upsampler
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import SQUARES, Upsampler
 
 __all__ = ["GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
 

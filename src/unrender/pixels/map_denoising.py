@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from unrender.evaluation import denoising
+from unrender.images import denoising
 from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import Tiles
 

@@ -15,9 +15,9 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels.pooling import pool
 from unrender.pixels.tiles import InverseCdfTable, Tiles
-from unrender.problem.batches import PixelBatch, PixelSample
-from unrender.problem.problem import Problem
 from unrender.rendering.renderer import CountingSession
+from unrender.scene.batches import PixelBatch, PixelSample
+from unrender.scene.problem import Problem
 
 __all__ = [
     "PilotRequest",

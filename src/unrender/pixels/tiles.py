@@ -16,8 +16,8 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.random import Key
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
 
 __all__ = ["MOST_TILES", "Grid", "InverseCdfTable", "Tiles", "cut"]
 

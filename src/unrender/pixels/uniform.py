@@ -10,8 +10,8 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch, check_batch
 from unrender.pixels.tiles import InverseCdfTable, cut
-from unrender.problem.problem import Problem
-from unrender.problem.upsampling import Upsampler
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
 
 __all__ = ["Uniform", "UniformState"]
 

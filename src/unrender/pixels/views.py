@@ -12,8 +12,8 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch, check_batch
-from unrender.problem.batches import PixelSample
-from unrender.problem.problem import Problem
+from unrender.scene.batches import PixelSample
+from unrender.scene.problem import Problem
 
 __all__ = ["Views"]
 

@@ -16,8 +16,8 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.evaluation.parameter_errors import Role
 from unrender.io.file_conversion import PLAIN, FileConversion
+from unrender.rendering.parameter_errors import Role
 
 __all__ = [
     "CountingSession",
@@ -58,13 +58,11 @@ class ParameterInfo:
     Attributes:
         shape: of the array that stands for it.
         differentiable: whether `adjoint` can return its gradient.
-        shares_paths: whether one set of paths serves two values of it (path space). Of meshes that move it does not, but a renderer may
-            relate the paths of two values, so that their images have path space all the same.
-        reason: one line; why it is not differentiable or cannot share paths, else "".
+        shares_paths: whether one set of paths serves two values of it (path space). A renderer may relate those of a moving mesh.
+        reason: why it is not differentiable or cannot share paths; else "".
         lowest: the smallest value that makes physical sense, or None.
         highest: the largest, or None.
-        singular: value between these at which images are singular, such as 1 for an index of refraction; values stay on the side on which
-            they start. None where there is none.
+        singular: value between these at which images are singular, such as 1 for an index of refraction, and which is not crossed.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
         rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
@@ -76,7 +74,7 @@ class ParameterInfo:
         conversion: what the renderer does to a file's values when it loads such a parameter.
         role: what the values stand for: numbers, normals or directions. Of the last two, errors are angles.
         brightness: what the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
-        nonlinear: whether the picture changes its form with the values, not its brightness: positions, lenses, skies, indices.
+        nonlinear: whether the picture changes its form with it, not its brightness: positions, lenses, skies, indices.
     """
 
     shape: tuple[int, ...]

@@ -6,7 +6,7 @@ from unrender.optimizers import rates
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["remarks"]
 

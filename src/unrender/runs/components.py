@@ -10,7 +10,7 @@ from unrender.core.suggestions import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.methods import method, methods
 from unrender.methods.plan import Plan
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
 
 __all__ = ["resolve", "resolve_estimator"]
 

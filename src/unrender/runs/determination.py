@@ -10,10 +10,10 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import listed
-from unrender.problem.bounds import project
-from unrender.problem.problem import Problem
-from unrender.problem.render import render
 from unrender.runs.sensitivity import seen_cells
+from unrender.scene.bounds import project
+from unrender.scene.problem import Problem
+from unrender.scene.render import render
 
 __all__ = ["Change", "common_factor", "undetermined", "undetermined_cells"]
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import phases
-from unrender.evaluation import debiased
 from unrender.io.thumbnails import resize_nearest
-from unrender.problem.problem import Problem
-from unrender.problem.render import render
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
+from unrender.scene.problem import Problem
+from unrender.scene.render import render
+from unrender.statistics import debiased
 
 __all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"]
 

@@ -18,8 +18,6 @@ from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates, regularized
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
-from unrender.problem.bounds import project
-from unrender.problem.problem import Problem
 from unrender.runs.hooks import Hook
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.metadata import RunMetadata
@@ -27,6 +25,8 @@ from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible, snapshot
+from unrender.scene.bounds import project
+from unrender.scene.problem import Problem
 
 __all__ = ["Descent", "descend", "initialize", "prepare"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from unrender.evaluation.self_intersections import crossing_triangles
-from unrender.evaluation.surfaces import area_normals
+from unrender.scene.self_intersections import crossing_triangles
+from unrender.scene.surfaces import area_normals
 
 __all__ = ["guarded"]
 

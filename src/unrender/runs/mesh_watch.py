@@ -8,9 +8,9 @@ import numpy as np
 
 from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
-from unrender.evaluation.self_intersections import crossing_triangles
-from unrender.evaluation.surfaces import folds
 from unrender.runs.hooks import Hook
+from unrender.scene.self_intersections import crossing_triangles
+from unrender.scene.surfaces import folds
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent

@@ -11,12 +11,12 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.estimators.base import Estimator
-from unrender.evaluation.parameter_errors import PLAIN
-from unrender.problem.fingerprint import fingerprint
-from unrender.problem.problem import Problem
+from unrender.rendering.parameter_errors import PLAIN
 from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.result import Result
 from unrender.runs.run import Run
+from unrender.scene.fingerprint import fingerprint
+from unrender.scene.problem import Problem
 
 __all__ = [
     "RunAnnotations",

@@ -10,10 +10,10 @@ from __future__ import annotations
 import time
 
 from unrender.core import arrays, trees
-from unrender.problem.coarse_to_fine import NEVER
-from unrender.problem.upsampling import NotCarried, Upsampler, restarted, upsampled
 from unrender.runs.noise import GradientNoise
 from unrender.runs.run import Run, RunState
+from unrender.scene.coarse_to_fine import NEVER
+from unrender.scene.upsampling import NotCarried, Upsampler, restarted, upsampled
 
 __all__ = ["is_due", "refine", "unfinished"]
 

@@ -10,8 +10,8 @@ from unrender.core import periodic
 from unrender.display import formatting, maps, notebook
 from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
-from unrender.evaluation import parameter_errors
-from unrender.evaluation.parameter_errors import ErrorMeasure
+from unrender.rendering import parameter_errors
+from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs import curves
 
 if TYPE_CHECKING:

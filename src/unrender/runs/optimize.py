@@ -17,9 +17,6 @@ from unrender.display.notebook_bar import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.problem.problem import Problem
-from unrender.problem.render import as_tree
-from unrender.problem.serialization import origin
 from unrender.runs import advice, components
 from unrender.runs.bounds_watch import BoundsWatch
 from unrender.runs.budget import Budget, check_budget
@@ -46,6 +43,9 @@ from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, terminate_if_told
 from unrender.runs.verify import Verify
+from unrender.scene.problem import Problem
+from unrender.scene.render import as_tree
+from unrender.scene.serialization import origin
 
 __all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
 

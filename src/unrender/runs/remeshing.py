@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.optimizers.partitioned import PartitionedState
-from unrender.problem.upsampling import restarted
 from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.hooks import Hook
 from unrender.runs.noise import GradientNoise
+from unrender.scene.upsampling import restarted
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent

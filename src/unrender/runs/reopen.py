@@ -13,13 +13,13 @@ from unrender.core.exclusive import exclusive
 from unrender.estimators.base import Estimator
 from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
-from unrender.problem import serialization
-from unrender.problem.problem import Problem
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder.reader import RunFolder, read_run_record
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
+from unrender.scene import serialization
+from unrender.scene.problem import Problem
 
 __all__ = ["problem_of", "resume", "with_meshes"]
 

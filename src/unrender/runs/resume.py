@@ -16,9 +16,6 @@ from unrender.estimators.base import Estimator
 from unrender.io import bounded_files
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.problem.fingerprint import differences
-from unrender.problem.problem import Problem
-from unrender.problem.serialization import origin
 from unrender.runs.budget import check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import checkpoint, history, method_file, reader
@@ -34,6 +31,9 @@ from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fi
 from unrender.runs.optimize import assemble_hooks, check, open_writer
 from unrender.runs.result import NON_FINITE, Result, deciding_versions
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
+from unrender.scene.fingerprint import differences
+from unrender.scene.problem import Problem
+from unrender.scene.serialization import origin
 
 __all__ = ["StoredRun", "load_run", "resume_run"]
 

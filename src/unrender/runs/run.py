@@ -18,9 +18,9 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.problem.problem import Problem
 from unrender.runs.noise import GradientNoise
 from unrender.runs.result import INTERRUPTED, TERMINATED
+from unrender.scene.problem import Problem
 
 __all__ = [
     "SNAPSHOT_COUNTS",

@@ -12,9 +12,9 @@ from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.problem.problem import Problem
-from unrender.problem.render import as_tree, view_request
 from unrender.rendering.renderer import RenderSession
+from unrender.scene.problem import Problem
+from unrender.scene.render import as_tree, view_request
 
 __all__ = ["around", "hardly_seen", "seen_cells", "sensitivity"]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.evaluation.metrics import exposure, srgb
 from unrender.io.thumbnails import reduced
+from unrender.losses.metrics import exposure, srgb
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:

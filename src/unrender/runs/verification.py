@@ -14,11 +14,11 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.evaluation import paired_losses
-from unrender.problem.batches import PixelBatch, PixelSample
-from unrender.problem.problem import Problem
-from unrender.problem.render import view_request
 from unrender.rendering.renderer import SampleRequest
+from unrender.scene.batches import PixelBatch, PixelSample
+from unrender.scene.problem import Problem
+from unrender.scene.render import view_request
+from unrender.statistics import paired_losses
 
 __all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
 

@@ -12,8 +12,6 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.display import formatting
-from unrender.evaluation import paired_losses
-from unrender.problem.problem import Problem
 from unrender.runs import phase_times
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.hooks import Hook
@@ -25,6 +23,8 @@ from unrender.runs.verification import (
     is_finite,
     remembered,
 )
+from unrender.scene.problem import Problem
+from unrender.statistics import paired_losses
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent

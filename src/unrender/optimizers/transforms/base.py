@@ -12,7 +12,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capability
 from unrender.preconditioners.base import Preconditioner
-from unrender.problem.upsampling import SQUARES, Upsampler
+from unrender.scene.upsampling import SQUARES, Upsampler
 
 __all__ = [
     "GRADIENTS",

@@ -27,7 +27,7 @@ from unrender.optimizers.transforms.base import (
 from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.problem.upsampling import Upsampler
+from unrender.scene.upsampling import Upsampler
 
 __all__ = ["STEPS", "ApplyPreconditioner", "FittedSobolev", "FittedSobolevState", "StrengthFit"]
 

@@ -13,7 +13,7 @@ from unrender.estimators.capabilities import Capability
 from unrender.optimizers.base import OnMeshes
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_keys, checked_transforms
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.problem.upsampling import Upsampler, restarted, upsampled
+from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 __all__ = ["PerParameter", "PerParameterState"]
 

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 import mitsuba as mi
 
-from unrender.evaluation.parameter_errors import Role
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.parameter_errors import Role
 
 __all__ = [
     "ParameterTraits",

@@ -11,9 +11,9 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import printable
-from unrender.evaluation.surfaces import Surface
 from unrender.io import files, mesh_writing
-from unrender.problem.problem import Problem
+from unrender.scene.problem import Problem
+from unrender.scene.surfaces import Surface
 
 __all__ = ["FOLDER", "RunMesh", "arrays_of", "meshes_in", "write_files"]
 

@@ -14,13 +14,13 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import printable
-from unrender.evaluation.parameter_errors import ErrorMeasure
-from unrender.evaluation.surfaces import Surface, surface_error
 from unrender.io import bounded_files
+from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.meshes import RunMesh, meshes_in
 from unrender.runs.folder.schema import RunRecord
+from unrender.scene.surfaces import Surface, surface_error
 
 __all__ = [
     "RunFolder",

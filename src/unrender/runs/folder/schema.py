@@ -31,9 +31,9 @@ from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import printable, reason_of
-from unrender.evaluation import parameter_errors
-from unrender.evaluation.parameter_errors import ErrorMeasure
 from unrender.io import bounded_files
+from unrender.rendering import parameter_errors
+from unrender.rendering.parameter_errors import ErrorMeasure
 
 __all__ = [
     "COMMANDS",

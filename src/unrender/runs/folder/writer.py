@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, Any
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
-from unrender.problem import serialization
-from unrender.problem.problem import Problem
 from unrender.runs import phase_times
 from unrender.runs.final_images import render_final_images
 from unrender.runs.folder import checkpoint, method_file
@@ -47,6 +45,8 @@ from unrender.runs.folder.schema import (
 from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.hooks import Hook
 from unrender.runs.result import PRUNED, TERMINATED, Result, deciding_versions
+from unrender.scene import serialization
+from unrender.scene.problem import Problem
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent

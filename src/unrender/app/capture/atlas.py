@@ -1,0 +1,105 @@
+"""Texture atlases by xatlas, in a process of its own with a time limit: on some meshes it does not end, and it cannot be interrupted.
+
+As a program, `python -m unrender.app.capture.atlas IN.npz OUT.npz`, it is that process.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from unrender.app.capture.mesh import Mesh, normals
+from unrender.core.errors import InputError
+
+__all__ = ["SECONDS", "check_installed", "unwrap"]
+
+SECONDS = 120.0
+"""Time limit; 10 000 faces take 2 seconds, 20 000 15."""
+_PADDING = 3
+"""Texels between charts, of an atlas that is then scaled down a little."""
+_COMMAND = (sys.executable, "-m", "unrender.app.capture.atlas")
+
+
+def check_installed() -> None:
+    """Raise `InputError` where xatlas is missing."""
+    if importlib.util.find_spec("xatlas") is None:
+        raise InputError("a mesh without texture coordinates needs xatlas: pip install 'unrender[capture]'")
+
+
+def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
+    """The mesh with texture coordinates: one atlas without overlaps, charts about 2 texels apart.
+
+    Vertices on seams are doubled, normals are kept.
+
+    Args:
+        mesh: at most 2^31 faces.
+        resolution: texels along the atlas's sides.
+        seconds: time limit.
+        command: the program, to which two files are added.
+
+    Raises:
+        InputError: xatlas is not installed, fails, or does not end in time.
+    """
+    check_installed()
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    with tempfile.TemporaryDirectory(prefix="unrender-atlas-") as folder:
+        given, made = Path(folder, "mesh.npz"), Path(folder, "atlas.npz")
+        local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
+        np.savez(given, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
+        try:
+            # Python begins its search for modules in the current directory, which may have come from anywhere.
+            done = subprocess.run(
+                [*command, str(given), str(made)],
+                timeout=seconds,
+                capture_output=True,
+                check=False,
+                cwd=folder,
+                env=_environment(),
+            )
+        except subprocess.TimeoutExpired as error:
+            many = f"{len(mesh.faces)} faces"
+            raise InputError(f"the atlas of {many} was not ready within {seconds:g} s: try fewer (--faces)") from error
+        if done.returncode or not made.is_file():
+            last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"status {done.returncode}"]
+            raise InputError(f"the atlas of {len(mesh.faces)} faces could not be made: {last[0][:200]}")
+        with np.load(made, allow_pickle=False) as found:
+            of, faces, uv = found["of"], found["faces"].astype(np.int64), found["uv"].astype(float)
+    own = normals(mesh) if mesh.normals is None else mesh.normals
+    return Mesh(mesh.vertices[of], faces, uv, own[of])
+
+
+def _environment() -> dict[str, str]:
+    """This process's, for one in another directory that does not look for modules there."""
+    found = {**os.environ, "PYTHONSAFEPATH": "1"}
+    if path := found.get("PYTHONPATH"):
+        found["PYTHONPATH"] = os.pathsep.join(os.path.abspath(place) for place in path.split(os.pathsep))
+    return found
+
+
+def _main(given: str, made: str) -> None:
+    import xatlas  # pyright: ignore[reportMissingImports]
+
+    with np.load(given, allow_pickle=False) as mesh:
+        vertices, faces, resolution = mesh["vertices"], mesh["faces"], int(mesh["resolution"])
+    packing = xatlas.PackOptions()
+    packing.resolution, packing.padding, packing.bilinear = resolution, _PADDING, True
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(vertices, faces)
+    atlas.generate(pack_options=packing)
+    if atlas.atlas_count != 1:
+        raise SystemExit(f"its charts fill {atlas.atlas_count} atlases")
+    of, kept, uv = atlas.get_mesh(0)
+    # The resolution is a hint: what was made is a little larger, and not square.
+    uv = uv * np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
+    np.savez(made, of=of, faces=kept, uv=uv.astype(np.float32))
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,67 @@
+"""Conventions of camera poses: how formats name a camera's axes, and how a matrix in a file becomes a pose.
+
+| name | x | y | z | written by |
+|---|---|---|---|---|
+| opengl | right | up | backwards | NeRF, instant-ngp, nerfstudio, Blender |
+| opencv | right | down | forwards | COLMAP, OpenCV |
+| llff | down | right | backwards | LLFF's `poses_bounds.npy` |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from unrender.app.capture.cameras import rigid
+from unrender.app.capture.capture import Capture
+from unrender.core.errors import InputError
+
+__all__ = ["AXES", "pose", "reinterpreted"]
+
+AXES = {
+    "opengl": np.eye(3),
+    "opencv": np.diag([1.0, -1.0, -1.0]),
+    "llff": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+"""Of each convention, its x, y and z axis as columns in the axes right, up, backwards."""
+
+
+def pose(matrix: object, axes: str, world_to_camera: bool, where: str) -> tuple[np.ndarray, float]:
+    """The matrix of a file as camera-to-world, (4, 4), with the axes right, up, backwards; and the scale of its axes, which is taken out.
+
+    Of [sR | t], world to camera, the camera is at -Rᵀ t / s. Raises `InputError`.
+    """
+    found, scale = rigid(matrix, where)
+    if world_to_camera:
+        with np.errstate(over="ignore"):
+            found[:3, 3] /= scale
+        if not np.isfinite(found).all():
+            raise InputError(f"{where}: its axes are too short for its position")
+        found = _inverse(found)
+    found[:3, :3] = found[:3, :3] @ AXES[axes].T
+    return found, scale
+
+
+def reinterpreted(capture: Capture, axes: str, world_to_camera: bool) -> Capture:
+    """The capture as it is where its files hold the other convention. Raises `InputError` for an unknown name of axes."""
+    if axes not in AXES:
+        raise InputError(f"axes: expected one of {', '.join(AXES)}, got {axes!r}")
+    photographs = []
+    for photograph in capture.photographs:
+        stored = photograph.camera_to_world.copy()
+        stored[:3, :3] = stored[:3, :3] @ AXES[capture.axes]
+        if capture.world_to_camera:
+            stored = _inverse(stored)
+            stored[:3, 3] *= photograph.scale
+        stored[:3, :3] *= photograph.scale
+        moved, _ = pose(stored, axes, world_to_camera, photograph.name)
+        photographs.append(replace(photograph, camera_to_world=moved))
+    return replace(capture, photographs=tuple(photographs), axes=axes, world_to_camera=world_to_camera)
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    found = np.eye(4)
+    found[:3, :3] = matrix[:3, :3].T
+    found[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
+    return found

@@ -1,0 +1,183 @@
+"""Views as the problem of a radiance field: a cube that glows and absorbs around what the cameras look at, before a sky."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+
+from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.overlays import png
+from unrender.app.capture.problem_folder import sensor_element
+from unrender.app.capture.stored import StoredViews
+from unrender.app.capture.writing import MASKS, PROBLEM, REFERENCES, SCENE, add_value, problem_text, write_exr
+from unrender.app.evaluation.held_out import HELD_OUT
+from unrender.app.exporting.ready_made import file_name
+from unrender.app.stages import stages_file
+from unrender.app.stages.stages_file import Stage, Stages
+from unrender.core.errors import InputError
+from unrender.io import volumes
+from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.mitsuba.emissive import COEFFICIENT
+
+__all__ = ["NAMES", "OWN", "cube_of", "write"]
+
+NAMES = ("field", "light", "exposure")
+"""The unknowns that such a problem may have; the field always is."""
+GRIDS, EXTINCTION, LIGHT = "grids", "grids/extinction.vol", "grids/light.exr"
+_HARMONICS = ["emission", *(f"{COEFFICIENT}{k}" for k in range(1, 9))]
+OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, GRIDS, stages_file.FILE})
+"""What `write` puts into a folder."""
+_FIELD = "field"
+"""Id of the medium."""
+_KEYS = {
+    "extinction": f"{_FIELD}.sigma_t.data",
+    **{name: f"{_FIELD}.{name}.data" for name in _HARMONICS},
+    "light": "light.data",
+    "exposure": EXPOSURE,
+}
+_DEPTH = 0.5
+"""Optical depth through the cube at first: half of it is seen through."""
+_RATES = {"extinction": 0.1, "light": 0.04, "emission": 0.04, **dict.fromkeys(_HARMONICS[1:], 0.01)}
+"""First steps: of the logarithm of extinction, of the others over the photographs' mean."""
+_LOGARITHM = {"bounds": [0.0, math.inf], "parameterisation": "log"}
+"""Of extinction: steps that are noise and end at 0 would leave fog wherever little is seen; as shares, they leave it as thin as it is."""
+_COARSER = 2
+"""Times fewer voxels a side of harmonics beyond degree 0, from 64 voxels on: what is seen changes more with the place than with the
+direction, they are 24 of 28 numbers a voxel, and a step takes its time for each."""
+_COARSEST, _COARSER_FROM = 16, 64
+_METHOD = "adaptive"
+_PIXELS, _PIXELS_FOR = 4096, 32
+"""Pixels of a step up to so many voxels a side, and in proportion to them beyond: steps have a cost by the voxel, too."""
+_SETTINGS = {"scheme": "uniform", "pixels": _PIXELS, "spp": 4, "beta_2": 0.99, "schedule": "exponential(150, 0.05)"}
+"""Of the stages: mini-batches of pixels of all photographs, and rates that fall, since their noise does not. Four samples a pixel: the
+residual that weights a path is that of the three others, which noise of two would drown."""
+_LIGHT_SIZE = 16, 32
+_WHOLE = 0.999
+
+
+def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
+    """The middle (3,) and half the side of the cube that the cameras look at, from their poses (V, 4, 4), axes right, up, backwards.
+
+    The middle is nearest to all optical axes, by least squares; the side is twice the median distance from it to the cameras.
+
+    Raises:
+        InputError: the cameras look in parallel, at no point.
+    """
+    places, views = cameras[:, :3, 3], -cameras[:, :3, 2]
+    across = np.eye(3) - views[:, :, None] * views[:, None, :]
+    normal = across.sum(0)
+    if np.linalg.cond(normal) > 1e6:
+        raise InputError("--field: the cameras look in parallel, at no common point")
+    middle = np.linalg.solve(normal, (across @ places[:, :, None]).sum(0))[:, 0]
+    if np.median(((middle - places) * views).sum(1)) <= 0:
+        raise InputError(
+            "--field: the cameras look away from the point that is nearest to their axes; --axes may be wrong"
+        )
+    return middle, float(np.median(np.linalg.norm(places - middle, axis=1)))
+
+
+def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequence[str]) -> None:
+    """Write the problem and its stages, coarse to fine, to an empty folder.
+
+    Args:
+        folder: exists.
+        name: of the problem.
+        views: of photographs; their masks are not used.
+        voxels: along a side of the cube.
+        chosen: the unknowns, of `NAMES`.
+
+    Raises:
+        InputError: the cameras look at no common point.
+    """
+    bare = views.bare()
+    middle, half = cube_of(np.array([view.camera_to_world for view in bare]))
+    stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(bare)]
+    for part in (REFERENCES, MASKS, GRIDS):
+        (folder / part).mkdir()
+    means, masked = [], []
+    for view, stem in zip(views, stems, strict=True):
+        shown = view.shown > _WHOLE
+        if not view.held_out:
+            means.append(float(view.values[shown].mean()))
+        write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        masked.append(not shown.all())
+        if masked[-1]:
+            (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(shown[..., None].astype(np.float32), 3, 2)))
+    level = max(float(np.mean(means)), 1e-4)
+    size = (voxels,) * 3
+    volumes.write_grid(folder / EXTINCTION, np.full((*size, 1), _DEPTH / (2 * half), np.float32))
+    coarse = (-(-voxels // (_COARSER if voxels >= _COARSER_FROM else 1)),) * 3
+    for number, file in enumerate(_HARMONICS):
+        values = np.zeros((*coarse, 3), np.float32) if number else np.full((*size, 3), level, np.float32)
+        volumes.write_grid(folder / GRIDS / f"{file}.vol", values)
+    write_exr(np.full((*_LIGHT_SIZE, 3), level, np.float32), folder / LIGHT)
+    (folder / SCENE).write_bytes(_scene(bare, stems, middle, half))
+    rates = {one: rate if one == "extinction" else rate * level for one, rate in _RATES.items()}
+    bounds: dict[str, Any] = {"extinction": _LOGARITHM, "light": {"bounds": [0.0, math.inf]}}
+    moved = ["extinction", *_HARMONICS, *(one for one in ("light", "exposure") if one in chosen)]
+    tables = [
+        {"key": _KEYS[one], **bounds.get(one, {}), **({"learning_rate": rates[one]} if one in rates else {})}
+        for one in moved
+    ]
+    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
+        listed = [
+            {"reference": f"{REFERENCES}/{stem}.exr", "sensor": i}
+            | ({"mask": f"{MASKS}/{stem}.png"} if masked[i] else {})
+            for i, (view, stem) in enumerate(zip(bare, stems, strict=True))
+            if view.held_out == held_out
+        ]
+        if listed:
+            given = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
+            (folder / file).write_text(problem_text(name, listed, held_out, given, "L2", 1), encoding="utf-8")
+    note = "Each stage has twice the voxels a side. Run all: unrender run stages.toml. Written by `unrender import`."
+    (folder / stages_file.FILE).write_text(stages_file.text(_stages(voxels, moved), note), encoding="utf-8")
+
+
+def _stages(voxels: int, moved: Sequence[str]) -> Stages:
+    """Coarse to fine, by halves, down to 16 voxels or so a side. Each takes as long as those before it together."""
+    keys, found, coarser = tuple(_KEYS[one] for one in moved), [], 1
+    while voxels / coarser >= 1:
+        side = -(-voxels // coarser)
+        more = {"pixels": _PIXELS * side // _PIXELS_FOR} if side > _PIXELS_FOR else None
+        found.insert(0, Stage(f"voxels-{side}", keys, 1.0, coarser, settings=more))
+        if voxels // coarser <= _COARSEST:
+            break
+        coarser *= 2
+    found[1:] = [replace(stage, share=2.0**number) for number, stage in enumerate(found[1:])]
+    return Stages(Path(PROBLEM), tuple(found), _METHOD, dict(_SETTINGS), seconds=600.0)
+
+
+def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarray, half: float) -> bytes:
+    root = Xml.Element("scene", version="3.0.0")
+    medium = Xml.SubElement(root, "medium", type="emissive", id=_FIELD)
+    for name, file in (("sigma_t", EXTINCTION), *((one, f"{GRIDS}/{one}.vol") for one in _HARMONICS)):
+        volume = Xml.SubElement(medium, "volume", type="gridvolume", name=name)
+        add_value(volume, "string", "filename", file)
+        add_value(volume, "boolean", "raw", "true")
+        _place(volume, middle - half, 2 * half)
+    shape = Xml.SubElement(root, "shape", type="cube", id="cube")
+    _place(shape, middle, half)
+    Xml.SubElement(shape, "bsdf", type="null")
+    Xml.SubElement(shape, "ref", name="interior", id=_FIELD)
+    for view, stem in zip(views, stems, strict=True):
+        sensor = sensor_element(view, stem, half / 100, 100 * half)
+        if np.abs(view.camera_to_world[:3, 3] - middle).max() < half:
+            Xml.SubElement(sensor, "ref", id=_FIELD)
+        root.append(sensor)
+    light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    add_value(light, "string", "filename", LIGHT)
+    Xml.indent(root)
+    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _place(parent: Xml.Element, corner: np.ndarray, scale: float) -> None:
+    transform = Xml.SubElement(parent, "transform", name="to_world")
+    Xml.SubElement(transform, "scale", value=repr(scale))
+    x, y, z = (repr(float(v)) for v in corner)
+    Xml.SubElement(transform, "translate", x=x, y=y, z=z)

@@ -1,0 +1,111 @@
+"""Which format a folder of posed photographs has, and reading it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unrender.app.capture.capture import Capture
+from unrender.app.capture.formats import colmap, lights, llff, transforms
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.io import bounded_files, confinement
+
+__all__ = ["FORMATS", "LIGHTS", "is_lit", "read"]
+
+
+@dataclass(frozen=True)
+class _Format:
+    recognise: Callable[[Path], bool]
+    read: Callable[[Path, Path | None], Capture]
+    files: str
+
+
+FORMATS = {
+    "transforms": _Format(transforms.recognise, transforms.read, "transforms.json or transforms_train.json"),
+    "colmap": _Format(colmap.recognise, colmap.read, "cameras and images (.bin or .txt), here or in sparse/0"),
+    "llff": _Format(llff.recognise, llff.read, "poses_bounds.npy"),
+}
+"""By name, in the order in which a folder that has several is read."""
+
+
+LIGHTS = "lights"
+"""The format of `lights`, which is no capture with poses."""
+
+
+def is_lit(folder: Path, kind: str | None) -> bool:
+    """Whether a folder holds photographs of one camera under known lights, to be read as such."""
+    if kind is not None:
+        return kind == LIGHTS and lights.recognise(folder)
+    return lights.recognise(folder) and not any(each.recognise(folder) for each in FORMATS.values())
+
+
+def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Capture:
+    """The capture in a folder.
+
+    Args:
+        folder: where it is.
+        kind: a key of `FORMATS`; None for the first whose files are there.
+        masks: a folder of masks named like the photographs; None for those that the format names or that lie beside the photographs.
+
+    Raises:
+        InputError: no such folder, none of the formats, or files that cannot be read; which file, and what was expected.
+    """
+    for given, name in ((folder, "FOLDER"), (masks, "--masks")):
+        if given is not None and bounded_files.kind(given) != "folder":
+            found = "not a folder" if bounded_files.exists(given) else "no such folder"
+            raise InputError(f"{given}: {found}" if name == "FOLDER" else f"{name} {given}: {found}")
+    if kind == LIGHTS:
+        raise InputError(f"{folder}: not in the format {LIGHTS}: expected {lights.FILE}")
+    if kind is not None and kind not in FORMATS:
+        raise InputError(f"--format {kind}: expected one of {', '.join((*FORMATS, LIGHTS))}")
+    for name, each in FORMATS.items():
+        if kind in (None, name) and each.recognise(folder):
+            capture = each.read(folder, masks)
+            if not capture.photographs:
+                raise InputError(f"{folder}: none of its photographs is there")
+            _check_places(capture, masks)
+            _check_photographs(capture)
+            _check_masks(capture)
+            return capture
+    if kind is not None:
+        raise InputError(f"{folder}: not in the format {kind}: expected {FORMATS[kind].files}")
+    raise InputError(
+        f"{folder}: no camera poses: expected {'; '.join([*(each.files for each in FORMATS.values()), lights.FILE])}"
+    )
+
+
+def _check_places(capture: Capture, masks: Path | None) -> None:
+    """Raise `InputError` where a photograph or a mask lies outside of the capture's folder; masks may lie in `masks`, too."""
+    for photograph in capture.photographs:
+        confinement.check(photograph.file, [capture.folder], f"{capture.folder}: it names the photograph")
+        if photograph.mask is not None:
+            places = [capture.folder] if masks is None else [capture.folder, masks]
+            confinement.check(photograph.mask, places, f"{capture.folder}: it names the mask")
+
+
+def _check_photographs(capture: Capture) -> None:
+    """Raise `InputError` where a photograph was taken by two cameras."""
+    cameras: dict[Path, np.ndarray] = {}
+    for photograph in capture.photographs:
+        pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
+        if not np.array_equal(pose, photograph.camera_to_world):
+            raise InputError(
+                f"{capture.folder}: {printable(photograph.name)}: given twice, with different poses; expected one each"
+            )
+
+
+def _check_masks(capture: Capture) -> None:
+    """Raise `InputError` where two photographs have one mask."""
+    owners: dict[Path, Path] = {}
+    for photograph in capture.photographs:
+        if photograph.mask is not None:
+            other = owners.setdefault(photograph.mask.resolve(), photograph.file)
+            if other != photograph.file:
+                two = f"{printable(str(other))} and {printable(str(photograph.file))}"
+                raise InputError(
+                    f"{photograph.mask}: the mask of two photographs, {two}; put masks into folders as the photographs are"
+                )

@@ -1,0 +1,99 @@
+"""One camera, several distant lights: `lights.txt` and a photograph for each, as collections for photometric stereo have them.
+
+The first line is their count, then a line of three numbers for each, a direction towards the light: x right, y up, z towards the camera.
+Photographs follow in the order of their names, numbers in them by value (`cat.2` before `cat.10`). A picture whose name has "mask" in it is
+the mask. The camera is taken as orthographic.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unrender.app.capture.formats import files
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.io import bounded_files, confinement
+
+__all__ = ["FILE", "LitCapture", "read", "recognise"]
+
+FILE = "lights.txt"
+_LARGEST = 1 << 20
+_FEWEST = 4
+"""Three unknowns of a pixel, and one photograph to tell whether they are right."""
+
+
+@dataclass(frozen=True)
+class LitCapture:
+    """Photographs of one camera under one light each.
+
+    Attributes:
+        folder: where they are.
+        photographs: files, at least four.
+        directions: (N, 3) unit, towards the lights: x right, y up, z towards the camera.
+        mask: a file, white on the object; None for none.
+    """
+
+    folder: Path
+    photographs: tuple[Path, ...]
+    directions: np.ndarray
+    mask: Path | None
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder has such a file."""
+    return (folder / FILE).is_file()
+
+
+def read(folder: Path, mask: Path | None = None) -> LitCapture:
+    """The capture of such a folder; `mask`: a folder with one mask, None for the folder itself. Raises `InputError`."""
+    directions = _directions(folder / FILE)
+    pictures = sorted(files.pictures(folder), key=_by_number)
+    if not any("mask" not in path.name.lower() for path in pictures):
+        pictures += sorted(files.pictures(folder / "images"), key=_by_number)
+    photographs = tuple(path for path in pictures if "mask" not in path.name.lower())
+    if len(photographs) != len(directions):
+        many = f"{len(directions)} lights, and {len(photographs)} photographs"
+        raise InputError(f"{folder / FILE}: {many}: they belong together in the order of names, so none may be missing")
+    masks = files.pictures(mask) if mask is not None else [path for path in pictures if path not in photographs]
+    if len(masks) > 1 or (mask is not None and not masks):
+        place = folder if mask is None else mask
+        raise InputError(f"{place}: expected one mask, got {len(masks)}, the camera stands still")
+    for path in photographs:
+        confinement.check(path, [folder], f"{folder}: it has the photograph")
+    for path in masks:
+        confinement.check(path, [folder if mask is None else mask], f"{folder}: it has the mask")
+    return LitCapture(folder, photographs, directions, masks[0] if masks else None)
+
+
+def _directions(path: Path) -> np.ndarray:
+    lines = [line.split() for line in bounded_files.read_text(path, _LARGEST).splitlines() if line.strip()]
+    expected = f"{path}: expected a count, then so many lines of three numbers, directions towards lights"
+    try:
+        if len(lines) < 2 or len(lines[0]) != 1 or int(lines[0][0]) != len(lines) - 1:
+            raise InputError(expected)
+        found = np.array([[float(number) for number in line] for line in lines[1:]], float)
+    except ValueError as error:
+        raise InputError(f"{expected} ({printable(str(error)[:80])})") from error
+    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
+        raise InputError(expected)
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    if not (length > 0).all():
+        raise InputError(f"{expected}; one is 0 0 0")
+    if len(found) < _FEWEST:
+        raise InputError(f"{path}: {len(found)} lights, expected at least {_FEWEST}")
+    if (found[:, 2] <= 0).any():
+        raise InputError(f"{path}: a light behind the object (z <= 0); expected z towards the camera")
+    found = found / length
+    if np.linalg.svd(found)[1][2] < 0.05 * len(found) ** 0.5:
+        raise InputError(f"{path}: all lights lie in a plane, which leaves normals unknown")
+    return found
+
+
+def _by_number(path: Path) -> list[tuple[int, int | str]]:
+    """Numbers in a name count by value."""
+    parts = re.split(r"(\d{1,18})", path.name.lower())
+    return [(0, int(part)) if index % 2 else (1, part) for index, part in enumerate(parts)]

@@ -1,0 +1,182 @@
+"""The visual hull of masks: all that no photograph shows to be empty.
+
+A. Laurentini, "The visual hull concept for silhouette-based image understanding", PAMI 1994. The field of a point is the least, over the
+photographs, of its distance to the mask's edge there, positive inside, in units of the world: pixels times depth over focal length. Its
+zero level is the hull, so that marching cubes place vertices within a voxel. What no mask can tell remains: concavities that no silhouette
+shows are filled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from unrender.app.capture.cameras import Lens, project
+from unrender.app.capture.captured_view import CapturedView, CapturedViews
+from unrender.app.capture.mesh import Mesh, decimate, smooth, without_crumbs
+from unrender.app.capture.stored import StoredArrays
+from unrender.core.errors import InputError
+
+__all__ = ["EMPTY", "field", "shape", "visual_hull"]
+
+_COARSE = 32
+_REFINED = 4
+"""Voxels of the fine grid to one of the coarse one, along each axis."""
+_CHUNK = 1 << 17
+_UNKNOWN = 1e4
+"""Distance in pixels where a photograph tells nothing."""
+_CRUMBS = 0.02
+_SMOOTHING = 10
+
+Camera = tuple[Lens, np.ndarray]
+"""A lens and its pose."""
+
+
+def shape(views: CapturedViews, resolution: int, faces: int) -> Mesh:
+    """A first shape from the masks of `views`: the hull, without loose parts of less than 2 % of its faces, smoothed, decimated.
+
+    Args:
+        views: with masks.
+        resolution: voxels along the longest side of the hull's box.
+        faces: how many triangles are kept, about.
+
+    Raises:
+        InputError: no point lies inside all masks.
+    """
+    return decimate(smooth(without_crumbs(visual_hull(views, resolution), _CRUMBS), _SMOOTHING), faces)
+
+
+def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
+    """The zero level of `field`, by marching cubes. Raises `InputError` where it is empty."""
+    from skimage import measure
+
+    cameras = [(view.lens, view.camera_to_world) for view in views]
+    distances = StoredArrays(map(_distance, views))
+    low, high = _box(*_first_ball(views), cameras, distances)
+    spacing = float((high - low).max()) / resolution
+    counts = np.ceil((high - low) / spacing).astype(int) + 3  # a voxel of air around it
+    low = (low + high) / 2 - (counts - 1) / 2 * spacing
+    values = _refined(cameras, distances, low, spacing, counts)
+    values[0], values[-1] = np.minimum(values[0], -spacing), np.minimum(values[-1], -spacing)
+    for side in (0, -1):
+        values[:, side] = np.minimum(values[:, side], -spacing)
+        values[:, :, side] = np.minimum(values[:, :, side], -spacing)
+    if values.max() <= 0:
+        raise InputError(EMPTY)
+    # The field is a distance only near its zero level; what is far would make interpolation there uneven.
+    vertices, faces, _, _ = measure.marching_cubes(
+        np.clip(values, -4 * spacing, 4 * spacing), 0.0, gradient_direction="ascent"
+    )
+    return Mesh(vertices.astype(float) * spacing + low, faces.astype(np.int64))
+
+
+EMPTY = "no point lies inside all masks: poses, masks or their order do not belong together"
+
+
+def field(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
+    """Of points (N, 3), (N,): positive inside. `distances` are those of the masks, in pixels."""
+    from scipy import ndimage
+
+    found = np.full(len(points), np.inf)
+    for (lens, pose), distance in zip(cameras, distances, strict=True):
+        at, depth = project(lens, pose, points)
+        pixels = ndimage.map_coordinates(distance, (at - 0.5).T[::-1], order=1, mode="nearest")
+        outside = (at < 0) | (at > (lens.width, lens.height))
+        if _touches_edge(distance):
+            pixels[outside.any(1)] = _UNKNOWN
+        else:  # the object ends inside the picture
+            off = np.abs(at - np.clip(at, 0, (lens.width, lens.height))).max(1)
+            pixels = np.where(outside.any(1), np.minimum(pixels, 0) - off, pixels)
+        np.minimum(found, np.where(depth > 0, pixels * depth / lens.fx, -np.inf), out=found)
+    return found
+
+
+def _distance(view: CapturedView) -> np.ndarray:
+    """Of a mask, (H, W): pixels to its edge, positive inside, to a fraction of a pixel where coverage tells."""
+    from scipy import ndimage
+
+    assert view.mask is not None
+    inside = view.mask > 0.5
+    within, beyond = (np.asarray(ndimage.distance_transform_edt(part)) for part in (inside, ~inside))
+    found = np.where(inside, within - 0.5, 0.5 - beyond)
+    if inside.all():
+        found = np.full(inside.shape, _UNKNOWN)
+    edge = np.abs(found) <= 0.5
+    found[edge] = view.mask[edge] - 0.5
+    found[view.shown < 0.5] = _UNKNOWN
+    return found
+
+
+def _touches_edge(distance: np.ndarray) -> bool:
+    return any((side > 0).any() for side in (distance[0], distance[-1], distance[:, 0], distance[:, -1]))
+
+
+def _box(
+    middle: np.ndarray, radius: float, cameras: Sequence[Camera], distances: StoredArrays
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around the hull, by coarse grids that shrink or grow, of a ball to begin with."""
+    low, high = middle - radius, middle + radius
+    for _ in range(4):
+        spacing = float((high - low).max()) / _COARSE
+        axes = [np.linspace(low[axis], high[axis], _COARSE + 1) for axis in range(3)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+        values = _evaluated(cameras, distances, points.reshape(-1, 3)).reshape(points.shape[:3])
+        near = values > -spacing
+        if not near.any():
+            raise InputError(EMPTY)
+        occupied = points[near]
+        touched = np.isclose(occupied.min(0), low), np.isclose(occupied.max(0), high)
+        extent = high - low
+        new_low, new_high = occupied.min(0) - spacing, occupied.max(0) + spacing
+        low = np.where(touched[0], low - extent / 4, new_low)
+        high = np.where(touched[1], high + extent / 4, new_high)
+        if not (touched[0].any() or touched[1].any()) and np.all(high - low > 0.7 * extent):
+            break
+    return low, high
+
+
+def _first_ball(views: CapturedViews) -> tuple[np.ndarray, float]:
+    """The point nearest to the rays through the middles of all masks, and a radius that no mask exceeds there."""
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        assert view.mask is not None
+        rows, columns = np.nonzero(view.mask > 0.5) if (view.mask > 0.5).any() else np.nonzero(view.mask > 0)
+        x = (columns.mean() + 0.5 - view.lens.cx) / view.lens.fx
+        y = (rows.mean() + 0.5 - view.lens.cy) / view.lens.fy
+        direction = view.camera_to_world[:3, :3] @ np.array([x, -y, -1.0])
+        direction /= np.linalg.norm(direction)
+        across = np.eye(3) - np.outer(direction, direction)
+        matrix += across
+        right += across @ view.camera_to_world[:3, 3]
+    middle = np.linalg.lstsq(matrix, right, rcond=1e-6)[0]
+    radii = []
+    for view in views:
+        assert view.mask is not None
+        rows, columns = np.nonzero(view.mask > 0)
+        _, depth = project(view.lens, view.camera_to_world, middle[None])
+        half = max(np.ptp(rows) + 1, np.ptp(columns) + 1) / 2
+        radii.append(abs(float(depth[0])) * half / view.lens.fx)
+    return middle, 1.2 * float(np.max(radii))
+
+
+def _evaluated(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
+    chunks = [points[start : start + _CHUNK] for start in range(0, len(points), _CHUNK)]
+    return np.concatenate([field(cameras, distances, chunk) for chunk in chunks])
+
+
+def _refined(
+    cameras: Sequence[Camera], distances: StoredArrays, low: np.ndarray, spacing: float, counts: np.ndarray
+) -> np.ndarray:
+    """The field on a grid, evaluated only where a coarser one says that its zero level may be near."""
+    from scipy import ndimage
+
+    coarse_counts = -(-(counts - 1) // _REFINED) + 1
+    indices = np.stack(np.meshgrid(*(np.arange(n) for n in coarse_counts), indexing="ij"), -1)
+    coarse = _evaluated(cameras, distances, (low + indices * (_REFINED * spacing)).reshape(-1, 3))
+    coarse = np.clip(coarse, -_UNKNOWN * spacing, _UNKNOWN * spacing).reshape(coarse_counts)
+    fine = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1)
+    values = ndimage.map_coordinates(coarse, (fine / _REFINED).reshape(-1, 3).T, order=1, mode="nearest")
+    near = np.abs(values) < 2 * _REFINED * spacing
+    values[near] = _evaluated(cameras, distances, low + fine.reshape(-1, 3)[near] * spacing)
+    return values.reshape(counts)

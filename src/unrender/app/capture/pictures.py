@@ -1,0 +1,251 @@
+"""Reading photographs: pixels as stored, turned upright only where the camera says so, in linear values; and what their masks hold."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from unrender.app.capture import decoding
+from unrender.app.capture.cameras import Lens, opencv
+from unrender.core.errors import InputError
+from unrender.core.text import reason_of
+from unrender.io import bounded_files, image_size, images, tiff_header
+
+__all__ = ["Pixels", "read", "read_mask", "upright"]
+
+_PILLOW_KINDS = {
+    "JPEG": ("JPEG", "MPO"),
+    "PNG": ("PNG",),
+    "WEBP": ("WEBP",),
+    "BMP": ("BMP",),
+    "PPM": ("PPM",),
+    "TGA": ("TGA",),
+}
+"""Kinds of files that Pillow decodes, with Pillow's names of their formats. Pillow opens no file by another plugin."""
+_PILLOW_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr")
+"""Modes of 8 bits or fewer a channel. Pillow clips what has more."""
+_ORIENTATION = 0x0112
+_QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
+_TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
+"""Quarter turns against the clock that EXIF's orientation asks for; 2, 4, 5 and 7 mirror, too."""
+_MIRRORED = (2, 4, 5, 7)
+_LONGEST_SIDE = 1 << 15
+"""In pixels, exclusive: OpenCV's `remap` takes no more."""
+_BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
+_RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """A photograph.
+
+    Attributes:
+        values: (H, W, 3) float32, linear.
+        alpha: (H, W) float32 in [0, 1]; None where the file has none, or it is 1 everywhere.
+    """
+
+    values: np.ndarray
+    alpha: np.ndarray | None
+
+
+def _stored_size(path: Path) -> tuple[int, int, int]:
+    """Width and height of the pixels as stored, and EXIF's orientation (1 where there is none). From the file's header alone.
+
+    Raises `InputError` where the file is no picture, or too large a one.
+    """
+    if path.suffix.lower() in _RAW:
+        raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
+    if bounded_files.kind(path) != "file":
+        raise InputError(f"{path}: {bounded_files.no_file(path)}")
+    header = _header(path)
+    if header.kind in _PILLOW_KINDS:
+        with _opened(path, header) as picture:
+            if picture.format == "PNG":
+                picture.load()  # EXIF may follow the pixels
+            return picture.width, picture.height, _orientation(picture)
+    if header.kind == "TIFF":
+        width, height, _ = header.sizes[0]
+        return width, height, header.orientation
+    height, width = _by_mitsuba(path).values.shape[:2]
+    return width, height, 1
+
+
+def _orientation(picture: Image.Image) -> int:
+    """EXIF's, 1 where there is none or it cannot be read."""
+    try:
+        return int(picture.getexif().get(_ORIENTATION, 1))
+    except Exception:  # what cameras and editors write there is often broken, and Pillow throws whatever it meets
+        return 1
+
+
+def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]:
+    """Width and height as EXIF's orientation shows the picture."""
+    return (height, width) if orientation in _QUARTER_TURNS else (width, height)
+
+
+def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pixels:
+    """The photograph in a file. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
+
+    Args:
+        path: the file.
+        orientation: EXIF's, to turn the pixels by; 1 for as stored.
+        response: of integers, see `decoding.linear`.
+
+    Raises:
+        InputError: the file cannot be read, or not all of it.
+    """
+    array = _decode(path)
+    if array is None:
+        return Pixels(_turn(_by_mitsuba(path).values, orientation), None)
+    array = _turn(array, orientation)
+    if array.dtype in (np.uint8, np.uint16):
+        largest = np.iinfo(array.dtype).max
+        curve = decoding.linear(np.arange(largest + 1) / largest, response).astype(np.float32)
+        values = curve[array[..., :3]]
+        alpha = array[..., 3].astype(np.float32) / largest if array.shape[2] == 4 else None
+    else:
+        values = array[..., :3].astype(np.float32)
+        alpha = array[..., 3].astype(np.float32) if array.shape[2] == 4 else None
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: {int((~np.isfinite(values)).any(-1).sum())} pixels are NaN or infinite")
+    return Pixels(values, None if alpha is None or alpha.min() >= 1 else alpha)
+
+
+def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
+    """A mask, (H, W) float32 in [0, 1]: alpha where a file has it and it is not 1 everywhere, else the mean of its channels as stored."""
+    _stored_size(path)
+    array = _decode(path)
+    if array is not None:
+        array = _turn(array, orientation)
+        scale = np.iinfo(array.dtype).max if array.dtype.kind == "u" else 1.0
+        values = array.astype(np.float32) / scale
+        if values.shape[2] == 4 and values[..., 3].min() < 1:
+            return values[..., 3]
+        return values[..., :3].mean(2)
+    values = _turn(images.read(path, linearise=False).values, orientation).mean(2)
+    return np.clip(values, 0, 1)
+
+
+def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
+    """Width, height and orientation with which a photograph is to be read, so that it has the lens's proportions.
+
+    Cameras are calibrated on pixels, and most programs take them as stored. So EXIF's orientation is applied only where the picture has the
+    lens's proportions when it is turned, and does not as it is stored.
+
+    Raises:
+        InputError: it has them neither way.
+    """
+    width, height, orientation = _stored_size(path)
+    if lens is None or _proportional(width, height, lens):
+        return width, height, 1
+    turned = _oriented_size(width, height, orientation)
+    if turned != (width, height) and _proportional(*turned, lens):
+        return *turned, orientation
+    raise InputError(
+        f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: other proportions"
+    )
+
+
+def _proportional(width: int, height: int, lens: Lens) -> bool:
+    """Whether a picture is the lens's to half a pixel along its shorter side."""
+    x, y = width / lens.width, height / lens.height
+    return abs(x - y) * min(lens.width, lens.height) <= 1.0 + 1e-6 and abs(x / y - 1) < 0.02
+
+
+def _turn(values: np.ndarray, orientation: int) -> np.ndarray:
+    turned = np.rot90(values, _TURNS.get(orientation, 2 if orientation == 4 else 0))
+    return np.ascontiguousarray(turned[:, ::-1] if orientation in _MIRRORED else turned)
+
+
+def _decode(path: Path) -> np.ndarray | None:
+    """Return the pixels as stored; None for kinds that Mitsuba reads."""
+    header = _header(path)
+    if header.kind == "TIFF" or _is_16_bit(header):
+        return _decode_opencv(path, header)
+    return _decode_pillow(path, header) if header.kind in _PILLOW_KINDS else None
+
+
+def _header(path: Path) -> image_size.Header:
+    """Return the header of a photograph or mask. Raises `InputError` where it is of no kind that is read, or too large."""
+    try:
+        header = image_size.read_photograph_header(path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    width, height, _ = header.sizes[0]
+    _check_size(path, width, height)
+    return header
+
+
+def _is_16_bit(header: image_size.Header) -> bool:
+    """Whether a PNG file has 16 bits a channel, which Pillow would cut to 8."""
+    return header.kind == "PNG" and header.bits == 16
+
+
+@contextmanager
+def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
+    """Open a file by Pillow, by the plugin of the kind that its header has and by no other. Errors of Pillow become `InputError`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of sizes, where our own limit is as large, and of broken EXIF
+            with (
+                bounded_files.open_regular(path) as file,
+                Image.open(file, formats=_PILLOW_KINDS[header.kind]) as picture,
+            ):
+                if (picture.width, picture.height) != header.sizes[0][:2]:
+                    raise InputError(f"{path}: cannot be read as a picture: its header declares two sizes")
+                yield picture
+    except InputError:
+        raise
+    except _BROKEN as error:
+        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
+
+
+def _decode_pillow(path: Path, header: image_size.Header) -> np.ndarray:
+    """Return (H, W, 3 or 4) uint8."""
+    with _opened(path, header) as picture:
+        if picture.mode not in _PILLOW_MODES:
+            raise InputError(f"{path}: {picture.mode} pixels, expected 8 bits a channel; save it as .png, .tif or .exr")
+        transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+        return np.array(picture.convert("RGBA" if transparent else "RGB"))
+
+
+def _decode_opencv(path: Path, header: image_size.Header) -> np.ndarray:
+    """Return (H, W, 3 or 4) uint8 or uint16, RGB. The file must be TIFF or PNG: OpenCV chooses a decoder by the first bytes."""
+    cv2 = opencv()
+    data = bounded_files.read_bytes(path, 4 * image_size.MOST_VALUES)
+    if header.kind == "TIFF":
+        data = tiff_header.without_orientation(data)
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
+    if array is None or array.shape[:2] != (header.sizes[0][1], header.sizes[0][0]):
+        raise InputError(f"{path}: cannot be read as a picture: its pixels are not as its header declares")
+    if array.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: expected 8 or 16 bits a channel, got {array.dtype}")
+    if array.ndim == 2 or array.shape[2] == 1:
+        return np.repeat(array.reshape(*array.shape[:2], 1), 3, 2)
+    if array.shape[2] > 4:
+        raise InputError(f"{path}: {array.shape[2]} channels, expected at most 4")
+    return array[..., [2, 1, 0, 3][: array.shape[2]]]
+
+
+def _by_mitsuba(path: Path) -> Pixels:
+    values = images.read(path).values
+    _check_size(path, values.shape[1], values.shape[0])
+    return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, None)
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height * 3 > image_size.MOST_VALUES or max(width, height) >= _LONGEST_SIDE:
+        most = image_size.MOST_VALUES // 3_000_000
+        limits = f"at most {most} megapixels and less than {_LONGEST_SIDE} pixels a side"
+        raise InputError(f"{path}: {width} x {height} pixels, expected {limits}")

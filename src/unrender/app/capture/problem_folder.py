@@ -1,0 +1,224 @@
+"""Views and a mesh as a problem: a Mitsuba scene, its files, and TOML files for training and held-out views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+
+from unrender.app.capture import unknowns
+from unrender.app.capture.captured_view import CapturedView, CapturedViews
+from unrender.app.capture.mesh import Mesh, ply
+from unrender.app.capture.overlays import png
+from unrender.app.capture.silhouettes import Silhouettes
+from unrender.app.capture.turntable import light_turns
+from unrender.app.capture.writing import (
+    MASKS,
+    PROBLEM,
+    REFERENCES,
+    SCENE,
+    TEXTURES,
+    add_texture,
+    add_value,
+    problem_text,
+    write_exr,
+)
+from unrender.app.evaluation.held_out import HELD_OUT
+from unrender.app.exporting.ready_made import file_name
+from unrender.app.stages import stages_file
+from unrender.core.errors import InputError
+from unrender.core.text import printable
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
+from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
+
+__all__ = ["OWN", "sensor_element", "to_world", "write"]
+
+MESH = "asset.ply"
+LIGHT = "textures/light.exr"
+_FOLDERS = (REFERENCES, MASKS, TEXTURES)
+OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
+"""What `write` puts into a folder."""
+_LIGHT_SIZE = 16, 32
+_MAX_DEPTH = 3
+_WHOLE = 0.999
+_BAND_WEIGHT = 0.1
+_WHITE = 0.95
+"""Of a saturated pixel, linear: resizing mixes it with its neighbours."""
+
+
+def write(
+    folder: Path,
+    name: str,
+    views: CapturedViews,
+    mesh: Mesh,
+    silhouettes: Silhouettes,
+    texture: int,
+    chosen: Sequence[str] = unknowns.DEFAULT,
+    band: int = 0,
+    turntable: bool = False,
+) -> None:
+    """Write the problem and its stages to an empty folder.
+
+    Args:
+        folder: exists.
+        name: of the problem.
+        views: of photographs.
+        mesh: with texture coordinates.
+        silhouettes: of it.
+        texture: texels along the sides of the textures.
+        chosen: the unknowns, of `unknowns.NAMES`.
+        band: pixels along the border of the masks that count little, of training views.
+        turntable: whether the light stands still before the cameras.
+
+    Raises:
+        InputError: a mask leaves no whole pixel.
+    """
+    stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
+    (folder / MESH).write_bytes(ply(mesh))
+    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
+    for part in _FOLDERS:
+        (folder / part).mkdir()
+    level, clipped, brightest = [], False, 0.0
+    for view, stem in zip(views, stems, strict=True):
+        mask = _loss_mask(view, silhouettes)
+        level.append(float(view.values[mask].mean()))
+        clipped |= bool((view.values[mask] >= _WHITE).any())
+        brightest = max(brightest, float(view.values.max()))
+        write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        weights = _banded(mask, 0 if view.held_out else band)
+        (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
+    for file, values in unknowns.textures(chosen, texture).values():
+        write_exr(values, folder / TEXTURES / file)
+    # Under an even light, a surface shows its base colour times the light's radiance.
+    radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
+    write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
+    # Numbers above 1 are no photograph's of 8 or 16 bits, which end at white.
+    white = clipped and brightest <= 1.001
+    loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
+    tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
+    _write_problems(folder, name, views, stems, tables, loss)
+    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
+    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
+    text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
+    (folder / stages_file.FILE).write_text(text, encoding="utf-8")
+
+
+def _write_problems(
+    folder: Path, name: str, views: CapturedViews, stems: Sequence[str], tables: Sequence[dict], loss: Any
+) -> None:
+    """The files of the training views and of those that are held out; `tables`: of the parameters."""
+    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
+        sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
+        moved = [table for table in tables if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
+        if sensors and moved:
+            listed = [
+                {"reference": f"{REFERENCES}/{stems[i]}.exr", "sensor": i, "mask": f"{MASKS}/{stems[i]}.png"}
+                for i in sensors
+            ]
+            text = problem_text(name, listed, held_out, moved, loss, _MAX_DEPTH)
+            (folder / file).write_text(text, encoding="utf-8")
+
+
+def to_world(camera_to_world: np.ndarray) -> np.ndarray:
+    """The pose of a camera as `to_world` of Mitsuba's sensors, (4, 4)."""
+    return camera_to_world @ MITSUBA_TO_OPENGL
+
+
+def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
+    """Which pixels count: wholly covered by the object, the mesh and the photograph, and so are their eight neighbours."""
+    from scipy import ndimage
+
+    inside = (view.shown > _WHOLE) & silhouettes.mask(view.lens, view.camera_to_world)
+    if view.mask is not None:
+        inside &= view.mask > _WHOLE
+    found = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
+    found = found if found.any() else inside
+    if not found.any():
+        raise InputError(f"{printable(view.name)}: mesh and mask share no whole pixel; give a larger --resolution")
+    return found
+
+
+def _banded(mask: np.ndarray, band: int) -> np.ndarray:
+    """Weights of pixels: 1 inside, little within `band` pixels of the border."""
+    from scipy import ndimage
+
+    if not band:
+        return mask.astype(np.float32)
+    # What lies outside of the picture is no border of the object.
+    distance = ndimage.distance_transform_edt(np.pad(mask, band + 1, mode="edge"))
+    assert isinstance(distance, np.ndarray)
+    inner = distance[band + 1 : -band - 1, band + 1 : -band - 1] > band
+    return np.where(mask, np.where(inner, 1.0, _BAND_WEIGHT), 0.0).astype(np.float32)
+
+
+def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Sequence[str], turntable: bool) -> bytes:
+    root = Xml.Element("scene", version="3.0.0")
+    corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
+    radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
+    distances = [float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0))) for view in views]
+    # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
+    clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
+    for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
+        sensor = sensor_element(view, stem, *clip)
+        for name in ("shutter_open", "shutter_close") if turntable else ():
+            add_value(sensor, "float", name, float(index))
+        root.append(sensor)
+    shape = Xml.SubElement(root, "shape", type="ply", id="asset")
+    add_value(shape, "string", "filename", MESH)
+    _material(shape, chosen)
+    _light(root, views, radius, turntable)
+    Xml.indent(root)
+    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
+    """An environment map; of a turntable, one that turns with the cameras."""
+    if turntable:
+        root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
+        turns = light_turns(np.array([view.camera_to_world for view in views]))
+        add_value(root, "string", "turns", turntable_light.text(turns))
+        add_value(root, "float", "distance", 1e4 * radius)
+        light = Xml.SubElement(root, "emitter", type="envmap", name="map")
+    else:
+        light = Xml.SubElement(root, "emitter", type="envmap", id="light")
+    add_value(light, "string", "filename", LIGHT)
+
+
+def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
+    """A principled BSDF whose textures lie over the atlas, within a normal map where that is unknown."""
+    textures = unknowns.textures(chosen, 1)
+    if "normalmap" in textures:
+        shape = Xml.SubElement(shape, "bsdf", type="normalmap")
+        add_texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
+    bsdf = Xml.SubElement(shape, "bsdf", type="principled")
+    for name, (file, values) in textures.items():
+        add_texture(bsdf, name, file, raw=values.shape[2] == 1)
+    if "roughness" not in textures:
+        add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
+
+
+def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
+    """The camera of a view, as the scene has it."""
+    lens = view.lens
+    sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
+    add_value(sensor, "string", "fov_axis", "x")
+    add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
+    # Mitsuba moves the picture against the principal point, in units of its sides.
+    add_value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
+    add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
+    add_value(sensor, "float", "near_clip", near)
+    add_value(sensor, "float", "far_clip", far)
+    transform = Xml.SubElement(sensor, "transform", name="to_world")
+    numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
+    Xml.SubElement(transform, "matrix", value=numbers)
+    film = Xml.SubElement(sensor, "film", type="hdrfilm")
+    add_value(film, "integer", "width", lens.width)
+    add_value(film, "integer", "height", lens.height)
+    add_value(film, "string", "pixel_format", "rgb")
+    Xml.SubElement(film, "rfilter", type="box")
+    return sensor

@@ -1,0 +1,62 @@
+"""The parts of the `unrender` command. Importing this is quick: each command imports what it needs when it is called."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from typing import Annotated
+
+import typer
+
+from unrender.app.cli.compare import compare
+from unrender.app.cli.export import export
+from unrender.app.cli.gallery import gallery
+from unrender.app.cli.import_ import import_
+from unrender.app.cli.judge import judge
+from unrender.app.cli.methods import methods
+from unrender.app.cli.report import report
+from unrender.app.cli.resume import resume
+from unrender.app.cli.run import run
+from unrender.app.cli.sweep import sweep
+from unrender.app.cli.turntable import turntable
+from unrender.app.cli.watch import watch
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Recover what a scene is made of (textures, materials, light) from images of it.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # rich's help takes half a second to import
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(run)
+app.command()(resume)
+app.command()(watch)
+app.command()(compare)
+app.command()(sweep)
+app.command()(report)
+app.command()(export)
+app.command()(judge)
+app.command()(turntable)
+app.command("import")(import_)
+app.command()(gallery)
+app.command()(methods)
+
+
+@app.command("doctor")
+def _doctor() -> None:
+    """Tell what this machine has, try a gradient, say what to install."""
+    from unrender.app.cli.doctor import doctor
+
+    raise typer.Exit(doctor())
+
+
+@app.callback(invoke_without_command=True)
+def _unrender(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
+    if version:
+        typer.echo(metadata.version("unrender"))
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())

@@ -1,0 +1,313 @@
+"""From what was typed to what it means: problems, settings, folders."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from unrender.backend import cache, variant
+from unrender.core import phases
+from unrender.core.errors import InputError
+from unrender.core.random import LARGEST_SEED
+from unrender.core.suggestions import did_you_mean
+from unrender.io import confinement
+
+if TYPE_CHECKING:
+    from unrender.app.distributed.cluster import Workers
+    from unrender.scene.problem import Problem
+
+__all__ = [
+    "DEFAULT_STEPS",
+    "AllowOutside",
+    "CheckpointEvery",
+    "FinalSpp",
+    "Insecure",
+    "NoCache",
+    "Overwrite",
+    "ProblemName",
+    "ProblemSettings",
+    "Seed",
+    "Threads",
+    "Variant",
+    "WorkersOption",
+    "absolute",
+    "budget",
+    "check_problem",
+    "check_variant",
+    "finished_run",
+    "folder",
+    "literal",
+    "open_problem",
+    "refuse_stages",
+    "remove_if_empty",
+    "settings",
+    "short_name",
+    "use_variant",
+    "workers",
+]
+
+DEFAULT_STEPS = 300
+
+ProblemName = Annotated[
+    str, typer.Argument(metavar="PROBLEM", help="A problem file (TOML), or a name from the gallery.")
+]
+ProblemSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--problem-set",
+        "-p",
+        metavar="NAME=VALUE",
+        help="An option of a gallery problem, such as resolution=64. Repeatable.",
+    ),
+]
+Variant = Annotated[str, typer.Option(help="Mitsuba's variant: auto, cuda_ad_rgb or llvm_ad_rgb.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, help="Threads of the processor. With 1, runs repeat bit for bit.", show_default=False),
+]
+CheckpointEvery = Annotated[
+    int | None, typer.Option(min=1, help="Steps between checkpoints. Default: 50 or so.", show_default=False)
+]
+FinalSpp = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows."
+    ),
+]
+
+
+Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers.")]
+
+
+AllowOutside = Annotated[
+    bool,
+    typer.Option(
+        "--allow-outside",
+        callback=confinement.allow,
+        help="Read files that a capture or a scene names outside of its own folder.",
+        show_default=False,
+    ),
+]
+"""The option has its effect when it is parsed: see `io.confinement`."""
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Render a gallery problem's references anew, and keep none.", show_default=False),
+]
+
+
+WorkersOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="auto | N | HOST:PORT",
+        help="Several processes by Ray: one a GPU or core, so many, or those of a cluster. Default: this process alone.",
+        show_default=False,
+    ),
+]
+
+
+Insecure = Annotated[
+    bool,
+    typer.Option(
+        "--insecure",
+        help="With --workers: join a cluster that other users can enter. They can run programs as its user.",
+        show_default=False,
+    ),
+]
+
+
+def workers(text: str | None, insecure: bool = False) -> Workers | None:
+    """Return what --workers and --insecure say; None for this process alone, which one worker without an address is, too.
+
+    Raises:
+        InputError: --workers cannot be understood, or --insecure is given without it.
+    """
+    if text is None:
+        if insecure:
+            raise InputError("--insecure: applies to the cluster of --workers HOST:PORT; give that, too")
+        return None
+    from dataclasses import replace
+
+    from unrender.app.distributed.cluster import Workers, load_ray
+
+    found = Workers.parse(text)
+    if found == Workers(1):
+        return None
+    load_ray()  # what is missing is known before anything that takes time
+    return replace(found, insecure=insecure)
+
+
+def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:
+    """["spp=4"] as {"spp": "4"}. Raises `InputError` for what is no NAME=VALUE, or a name given twice."""
+    found: dict[str, str] = {}
+    for pair in pairs or ():
+        name, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals or not name:
+            raise InputError(f"{option} {pair}: expected NAME=VALUE")
+        if name in found:
+            raise InputError(f"{option} {pair}: {name} is given twice")
+        found[name] = value
+    return found
+
+
+def literal(text: str) -> Any:
+    """A whole number, a number, true or false where `text` is one, else the text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def check_variant(name: str) -> None:
+    """Raise `InputError` for a variant that does not exist."""
+    known = ("auto", *variant.VARIANTS)
+    if name not in known:
+        raise InputError(f"--variant {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
+
+
+def use_variant(name: str, threads: int | None = None) -> str:
+    """Choose the variant and, on the processor, the number of threads (None for one per core). Before anything is rendered.
+
+    A name that does not exist is wrong input; one that cannot run here is not.
+    """
+    check_variant(name)
+    with phases.phase("loading"):
+        chosen = variant.use(name)
+        if threads is not None:
+            variant.use_threads(threads)
+    return chosen
+
+
+def check_problem(name: str, options: Mapping[str, str]) -> None:
+    """Raise `InputError` where `open_problem` would fail for reasons that can be told without Mitsuba."""
+    from unrender import gallery
+
+    if _is_file(name):
+        if Path(name).suffix.lower() == ".xml":
+            raise InputError(
+                f"{name}: a scene alone does not say what is unknown; write a problem file with: "
+                f'scene = "{Path(name).name}", [[parameters]] and [[views]]'
+            )
+        if options:
+            raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
+        if not Path(name).exists():
+            from unrender.io import bounded_files  # NumPy with it
+
+            raise InputError(f"{name}: {bounded_files.no_file(Path(name))}")
+        refuse_stages(name)
+    elif name not in gallery.names():
+        file = f"; did you mean {name}.toml?" if Path(f"{name}.toml").is_file() else ""
+        hint = file or did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
+        raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
+
+
+def refuse_stages(file: str) -> None:
+    """Raise `InputError` for a file of stages where a problem file is expected."""
+    from unrender.app.stages import stages_file
+
+    if Path(file).is_file() and stages_file.is_stages(Path(file)):
+        raise InputError(f"{file}: a file of stages, which `unrender run` alone takes; expected a problem file")
+
+
+def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
+    """The problem of a TOML file or of the gallery. A variant must be in use. Raises `InputError`.
+
+    Args:
+        name: as typed.
+        options: of a gallery problem.
+        cached: whether its references may come from the cache folder, and go there.
+    """
+    with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():
+        from unrender import gallery
+        from unrender.scene.problem import Problem
+
+        check_problem(name, options)
+        if _is_file(name):
+            return Problem.from_file(name)
+        return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+
+
+def short_name(problem: str) -> str:
+    """What folders are called after: the problem's name, or its file's without the ending."""
+    return Path(problem).stem if problem.endswith(".toml") else problem
+
+
+def absolute(problem: str) -> str:
+    """As typed, with the absolute path of a file: the same wherever it is opened from."""
+    return str(Path(problem).absolute()) if _is_file(problem) else problem
+
+
+def _is_file(name: str) -> bool:
+    return Path(name).suffix.lower() in (".toml", ".xml") or Path(name).is_file()
+
+
+def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
+    """Steps and seconds; `DEFAULT_STEPS` where neither is given. Raises `InputError` where one makes no sense."""
+    if steps is not None and not 1 <= steps < 1 << 63:
+        raise InputError(f"--steps {steps!s:.60}: expected at least 1 and less than 2**63")
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise InputError(f"--seconds {seconds:g}: expected a number above 0")
+    return (DEFAULT_STEPS if steps is None and seconds is None else steps), seconds
+
+
+def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
+    """Where results go: a folder without files, made here so that a wrong place is known before hours of work.
+
+    Args:
+        given: what the user asked for, or None for a new folder in out/.
+        default: its name there; a number is added to one that exists.
+        overwrite: whether a folder that holds earlier results may be written to.
+        marks: patterns of the files by which earlier results are known.
+
+    Raises:
+        InputError: a file, a folder with other things in it, earlier results without `overwrite`, or not writable.
+    """
+    if given is None:
+        name = re.sub(r"[^\w.-]+", "-", default).strip(".-") or "run"
+        number = 1
+        given = Path("out", name)
+        while given.exists():
+            number += 1
+            given = Path("out", f"{name}-{number}")
+    try:
+        if given.exists() and not given.is_dir():
+            raise InputError(f"--out {given}: a file, expected a folder")
+        if given.is_dir() and any(not path.is_dir() for path in given.rglob("*")):
+            if not any(True for mark in marks for _ in given.glob(mark)):
+                raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
+            if not overwrite:
+                raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
+        from unrender.io import files  # NumPy with it
+
+        files.make_folder(given)
+    except OSError as error:
+        raise InputError(f"--out {given}: {error.strerror or error}") from error
+    if not os.access(given, os.W_OK | os.X_OK):
+        raise InputError(f"--out {given}: not writable")
+    return given
+
+
+def finished_run(directory: Path) -> Path:
+    """The run folder whose result is meant by DIR: of a run in stages, the last that has begun. Raises `InputError`."""
+    from unrender.app.stages import run_folders
+
+    return run_folders.last_result(directory)
+
+
+def remove_if_empty(directory: Path) -> None:
+    """Take back a folder that `folder` made and nothing was written to."""
+    with contextlib.suppress(OSError):
+        directory.rmdir()
+        if directory.parent == Path("out"):
+            directory.parent.rmdir()

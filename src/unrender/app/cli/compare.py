@@ -1,0 +1,322 @@
+"""`unrender compare`: several methods, or runs made earlier, at equal time."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import secrets
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import (
+    AllowOutside,
+    FinalSpp,
+    Insecure,
+    NoCache,
+    Overwrite,
+    ProblemSettings,
+    Variant,
+    WorkersOption,
+)
+from unrender.app.cli.exit_status import FAILED
+from unrender.app.cli.run import exit_status
+from unrender.core import phases
+from unrender.core.errors import InputError
+from unrender.core.random import check_seed
+
+if TYPE_CHECKING:
+    from unrender.app.cli.tasks import Job, RunTask
+    from unrender.app.distributed.cluster import Cluster, Ended, Workers
+    from unrender.app.sweeps.record import RunOutcome
+    from unrender.display.terminal import Console
+    from unrender.methods import Method
+    from unrender.runs.progress import Progress
+    from unrender.scene.problem import Problem
+
+__all__ = ["DEFAULT_SECONDS", "compare"]
+
+DEFAULT_SECONDS = 20.0
+_DEFAULT = ("stock", "auto")
+"""What people have, and what they get here without an option."""
+_POLL_SECONDS = 0.5
+_MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
+
+
+_Methods = Annotated[
+    str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
+]
+
+
+def compare(
+    context: typer.Context,
+    what: Annotated[
+        list[str],
+        typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run here, or run folders made earlier."),
+    ],
+    methods: _Methods = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", "-s", metavar="[METHOD.]NAME=VALUE", help="An option of one method or of all, such as rcv.spp=4."
+        ),
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Time for each run, without compilation. [default: 20]")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="How many runs of each method.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")] = None,
+    problem_settings: ProblemSettings = None,
+    workers: WorkersOption = None,
+    insecure: Insecure = False,
+    variant: Variant = "auto",
+    final_spp: FinalSpp = None,
+    overwrite: Overwrite = False,
+    no_cache: NoCache = False,
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Compare methods at equal time on one problem, or runs made earlier.
+
+    Every run gets the same seconds of optimization. Compiling kernels before the first step is left out for all alike. With workers,
+    several runs go at a time, each with its share of the machine.
+    """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console = Console(highlight=False)
+    check_seed("--seed", seed, seeds)
+    where = arguments.workers(workers, insecure)
+    if all(Path(name).is_dir() for name in what):
+        run_options = methods or settings or problem_settings or workers or seconds is not None
+        return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))
+    _check_single(what)
+    typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    with Progress(console) as progress:
+        chosen, given = _methods_and_settings(methods, typed)
+        arguments.check_problem(what[0], options)
+        _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
+        folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
+        try:
+            command = shlex.join(context.find_root().obj or ["unrender"])
+            job = _job(what[0], options, not no_cache, command, folder)
+            turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
+            runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]
+            with _prepared(console, job, runs, variant, where) as comparison:
+                directories, status = _run_all(console, comparison, progress)
+        finally:
+            arguments.remove_if_empty(folder)
+        if directories:
+            _report(console, directories, folder)
+    if status:
+        raise typer.Exit(status)
+
+
+def _job(problem: str, options: Mapping[str, str], cached: bool, command: str, folder: Path) -> Job:
+    from unrender.app.cli.tasks import Job
+
+    return Job(arguments.absolute(problem), options, cached, command, str(folder.resolve()), secrets.token_hex(16))
+
+
+def _run_task(
+    method: str, settings: Mapping[str, str], seconds: float | None, seed: int, final_spp: int | None
+) -> RunTask:
+    from unrender.app.cli.tasks import RunTask
+
+    return RunTask(f"{method}-seed{seed}", method, settings, None, seconds, seed, final_spp)
+
+
+@contextlib.contextmanager
+def _prepared(
+    console: Console, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
+) -> Iterator[_Comparison]:
+    """The problem opened, and the workers there, where there are to be some."""
+    from unrender.app.cli.execute import introduce
+
+    with contextlib.ExitStack() as stack:
+        cluster = None
+        if workers is not None:
+            from unrender.app.distributed.cluster import connect
+
+            cluster = stack.enter_context(connect(workers, variant))
+            job = replace(job, variant=cluster.variant, threads=cluster.share.threads)
+        running = arguments.use_variant(variant)
+        problem = arguments.open_problem(job.problem, dict(job.problem_settings), job.cached)
+        introduce(console, problem, running if cluster is None else cluster.variant)
+        yield _Comparison(job, runs, problem, cluster)
+
+
+def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
+    """Compare runs made here."""
+    with phases.phase("page"):
+        from unrender.app import report
+        from unrender.app.cli import comparison_table
+
+        comparison, notices = report.load_comparison(directories)
+        page = report.write_comparison(comparison, notices, folder)
+    comparison_table.show(console, comparison)
+    console.print("Time of compilation is left out for every method alike.")
+    console.print(f"page: {comparison_table.plain(str(page))}", soft_wrap=True)
+
+
+def _check_single(what: Sequence[str]) -> None:
+    """Raise `InputError` unless one problem is given."""
+    if len(what) > 1:
+        missing = next(name for name in what if not Path(name).is_dir())
+        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
+
+
+def _compare_folders(
+    console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool, run_options: bool
+) -> None:
+    """Compare runs made earlier. `run_options`: whether options were given that only runs made here have."""
+    if run_options:
+        raise InputError(
+            "compare: run folders are compared as they are, without --methods, --set, --seconds, --workers"
+        )
+    from unrender.app import report
+    from unrender.app.cli import comparison_table
+
+    folder = arguments.folder(out, "compare", overwrite, *_MARKS)
+    try:
+        comparison, notices = report.load_comparison(directories)
+        page = report.write_comparison(comparison, notices, folder)
+    finally:
+        arguments.remove_if_empty(folder)
+    comparison_table.show(console, comparison)
+    for notice in notices:
+        console.print(f"note: {comparison_table.plain(notice)}", soft_wrap=True)
+    console.print(f"page: {comparison_table.plain(str(page))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """What is to be run, and by whom.
+
+    Attributes:
+        job: what the runs have in common.
+        runs: in the order in which they begin.
+        problem: opened here.
+        cluster: whose workers carry them out; None for this process.
+    """
+
+    job: Job
+    runs: Sequence[RunTask]
+    problem: Problem
+    cluster: Cluster | None
+
+
+def _run_all(console: Console, comparison: _Comparison, progress: Progress) -> tuple[list[Path], int]:
+    """Carry out the runs until one is interrupted.
+
+    Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
+    """
+    from unrender.app.cli import tasks
+
+    folder = Path(comparison.job.folder)
+    tasks.discard_earlier(folder, comparison.runs)
+    outcomes = _on_workers(console, comparison) if comparison.cluster else _here(console, comparison, progress)
+    names = [outcome.folder for outcome in outcomes if outcome.steps]
+    directories = [folder / run.name for run in comparison.runs if run.name in names]
+    interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
+    statuses = [exit_status(outcome.stopped) or (FAILED if outcome.message else 0) for outcome in outcomes]
+    return directories, exit_status(interrupted[0].stopped) if interrupted else max(statuses, default=0)
+
+
+def _here(console: Console, comparison: _Comparison, progress: Progress) -> list[RunOutcome]:
+    from unrender.app.cli import tasks
+
+    outcomes: list[RunOutcome] = []
+    for run in comparison.runs:
+        console.print(f"[bold]{run.method}[/], seed {run.seed}, {run.seconds:g} s")
+        outcomes.append(tasks.carry_out(comparison.job, run, comparison.problem, console, progress))
+        if outcomes[-1].status == "interrupted":
+            break
+    return outcomes
+
+
+def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
+    """As many runs at a time as there are workers; a run that cannot be carried out is one line, and the others go on. After an
+    interrupt: those that were carried out by then, and what the others had reached, where they saved it within seconds."""
+    from unrender.app.cli import tasks
+    from unrender.app.cli.task_display import TaskDisplay
+    from unrender.app.distributed.cluster import OnWorkers
+    from unrender.app.sweeps.record import RunOutcome
+
+    assert comparison.cluster is not None
+    job, waiting = comparison.job, list(comparison.runs)
+    folder = Path(job.folder)
+    outcomes: list[RunOutcome] = []
+    executor = OnWorkers(comparison.cluster, tasks.on_worker)
+
+    def take(ended: Ended) -> None:
+        name, seed = ended.key
+        outcome = RunOutcome(folder=name, seed=seed, status="failed", message=ended.message)
+        if not ended.message:
+            (outcome,), written = ended.value
+            tasks.receive(folder, written)
+        outcomes.append(outcome)
+        display.end(name, f"{name}: {outcome.message or f'{outcome.status}, {outcome.steps} steps'}")
+
+    console.print(f"{len(waiting)} runs on {executor.slots} workers, {job.threads} threads each")
+    with tasks.open_job(job), TaskDisplay(console, len(waiting), "runs") as display:
+        try:
+            while waiting or executor.pending:
+                while waiting and executor.pending < executor.slots:
+                    run = waiting.pop(0)
+                    display.begin(run.name, run.method, (folder / run.name,))
+                    executor.start((run.name, run.seed), job, [run])
+                for ended in executor.wait(_POLL_SECONDS):
+                    take(ended)
+        except KeyboardInterrupt:  # what has been done is compared; `main` knows the status
+            for ended in executor.saved():
+                take(ended)
+    for outcome in outcomes:
+        if outcome.message:
+            console.print(f"{outcome.folder}: failed: {outcome.message}", markup=False, soft_wrap=True, style="red")
+    return outcomes
+
+
+def _methods_and_settings(
+    names: str | None, typed: Mapping[str, str]
+) -> tuple[list[Method], dict[str, dict[str, str]]]:
+    """The methods, and the settings of each, all of which it takes. Raises `InputError`."""
+    with phases.phase("loading"):
+        chosen = _parse_methods(names)
+        given = _settings_by_method(chosen, typed)
+        for one in chosen:
+            one.start(given[one.name])
+    return chosen, given
+
+
+def _parse_methods(names: str | None) -> list[Method]:
+    from unrender.methods import method
+
+    if names is None:
+        return [method(name) for name in _DEFAULT]
+    chosen = [method(name.strip()) for name in names.split(",") if name.strip()]
+    if not chosen:
+        raise InputError("--methods: expected at least one name")
+    for one in chosen:
+        if chosen.count(one) > 1:
+            raise InputError(f"--methods: {one.name} is given twice")
+    return chosen
+
+
+def _settings_by_method(chosen: Sequence[Method], given: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """The settings of each method: those without a method's name go to all, those with one to it, and win."""
+    found: dict[str, dict[str, str]] = {one.name: {} for one in chosen}
+    for name, value in given.items():
+        if "." not in name:
+            for settings in found.values():
+                settings[name] = value
+    for name, value in given.items():
+        owner, dot, option = name.partition(".")
+        if dot:
+            if owner not in found:
+                raise InputError(f"--set {name}={value}: {owner} is not one of the methods {', '.join(found)}")
+            found[owner][option] = value
+    return found

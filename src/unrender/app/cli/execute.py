@@ -1,0 +1,177 @@
+"""One run of the command line, from a plan to a run folder, and its summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from unrender.display import formatting
+from unrender.display.terminal import Console
+from unrender.methods import Method
+from unrender.methods.plan_file import PlanFile
+from unrender.runs import advice
+from unrender.runs.callbacks import Callback
+from unrender.runs.final_images import image_name
+from unrender.runs.live import Live
+from unrender.runs.metadata import RunAnnotations
+from unrender.runs.optimize import optimize
+from unrender.runs.phase_times import RUN_PHASES
+from unrender.runs.progress import Progress
+from unrender.runs.result import Result
+from unrender.runs.sensitivity import seen_cells
+from unrender.scene.notebook import describe_views
+from unrender.scene.problem import Problem
+from unrender.statistics import debiased
+
+__all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise", "verified"]
+
+
+@dataclass(frozen=True)
+class RunOrder:
+    """What is to be run.
+
+    Attributes:
+        problem, method: of what, by what.
+        settings: of the method, where they are not the defaults.
+        steps, seconds, seed: see `optimize`.
+        final_spp: of the final pictures; None chooses.
+        command: what was typed, to be saved with the results.
+        problem_settings: of a gallery problem, to be saved with the results.
+        checkpoint_every: see `optimize`.
+    """
+
+    problem: Problem
+    method: Method | PlanFile
+    settings: Mapping[str, Any]
+    steps: int | None
+    seconds: float | None
+    seed: int
+    final_spp: int | None
+    command: str
+    problem_settings: Mapping[str, Any]
+    checkpoint_every: int | None = None
+
+
+def execute(
+    order: RunOrder, directory: Path, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
+) -> Result:
+    """Run, and leave a run folder. An interrupted run is saved as far as it came. `callbacks` listen besides."""
+    plan = order.method.plan(order.problem, order.settings)
+    for line in plan.reasons:
+        console.print(f"{order.method.name}: {escape(line)}", soft_wrap=True)
+    options = order.method.options_of(order.settings)
+    settings = {"options": options, "problem_options": dict(order.problem_settings)}
+    settings = {name: value for name, value in settings.items() if value}
+    for line in advice.remarks(order.problem, plan.optimizer):
+        console.print(f"note: {escape(line)}", soft_wrap=True)
+    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
+    annotations = RunAnnotations(order.method.name, settings, plan.reasons, order.command, order.final_spp, earlier)
+    live = Live(directory, order.problem.name, order.method.name, order.command)
+    result = optimize(
+        order.problem,
+        plan,
+        None,
+        order.steps,
+        order.seconds,
+        order.seed,
+        [progress, live, *callbacks],
+        directory,
+        order.checkpoint_every,
+        annotations,
+    )
+    live.clear()
+    return result
+
+
+def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:
+    """The mean over views with pictures of the root mean square error against the reference, in words: its noise taken out where it is
+    known.
+
+    `masks`: of the views, (H, W), by how much each pixel counts where the noise is not known; None for all pixels of all views.
+    """
+    views = [view for view in range(int(result.problem["views"])) if image_name(view, which) in result.pictures]
+    known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
+    if len(known) == len(views):
+        return formatting.with_error(*debiased.mean(known))
+    errors = []
+    for view in views:
+        difference = result.pictures[f"view{view}/{which}"] - result.pictures[f"view{view}/reference"]
+        squares, mask = np.square(difference, dtype=np.float64).mean(-1), None if masks is None else masks[view]
+        errors.append(float(np.sqrt(np.average(squares, weights=mask if mask is not None and mask.any() else None))))
+    return f"{formatting.number(float(np.mean(errors)))} with noise"
+
+
+def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:
+    """The error of a parameter at the start and at the end; and where the pictures tell of it."""
+    measure, told = problem.measures[key], result.sensitivity.get(key)
+    line = f"error {measure.text(before)} before, {measure.text(after)} after"
+    if measure.unit and key in problem.truth:
+        line += f" ({measure.name_with_median(result.parameters[key], problem.truth[key])})"
+    where = None if told is None else seen_cells(told)
+    if where is None or key not in problem.truth or where.all():
+        return line
+    seen = measure.error(result.parameters[key], problem.truth[key], where)
+    return line if seen is None else f"{line}, {measure.text(seen)} where seen ({where.mean():.0%} of it)"
+
+
+def verified(result: Result) -> str:
+    """Return what fresh pictures say about the run, in words: status, losses, and which parameters are kept."""
+    found = result.verification
+    first, last = (
+        formatting.with_error(*found[name]) if None not in found[name] else "not finite" for name in ("start", "end")
+    )
+    kept = "" if found["best"] == "end" else f"; kept: the parameters of {found['best']}"
+    return f"{found['status']}: loss {first} before, {last} after (fresh pictures, noise removed){kept}"
+
+
+def introduce(console: Console, problem: Problem, variant: str) -> None:
+    """What is about to be recovered, and what was done to the input."""
+    views = describe_views(problem)
+    keys = ", ".join(parameter.key for parameter in problem.parameters)
+    console.print(f"[bold]{escape(problem.name)}[/]: {escape(keys)} from {views}, on {variant}", soft_wrap=True)
+    for notice in problem.notices:
+        console.print(f"note: {escape(notice)}", soft_wrap=True)
+
+
+def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
+    """What came out."""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s (and {result.warmup_seconds:.1f} s to compile)")
+    if result.skipped:
+        table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
+    if result.resumed:
+        table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
+    if result.pictures:
+        masks = [None if view.mask is None else np.asarray(view.mask) for view in problem.views]
+        first, last = (image_error(result, which, masks) for which in ("initial", "result"))
+        where = " where masks count" if any(mask is not None for mask in masks) else ""
+        removed = "" if last.endswith("noise") else ", noise removed"
+        table.add_row("image error", f"{first} before, {last} after (root mean square{where}{removed})")
+    if result.verification:
+        table.add_row("verified", verified(result))
+    start = problem.parameter_error(result.initial)
+    last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
+    for key, error in (last | problem.parameter_error(result.parameters)).items():
+        table.add_row(escape(key), _error_line(problem, result, key, start[key], error))
+    after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
+    table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
+    console.print(table)
+    for line in result.undetermined:
+        console.print(f"[yellow]not determined[/] {escape(line)}", soft_wrap=True)
+    for warning in result.warnings:
+        console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
+    if result.status == "interrupted":
+        console.print(f"{result.stopped}: what was reached is saved")
+    if result.status == "failed":
+        applied = result.steps - result.skipped
+        console.print(
+            f"[red]failed[/]: given up after {result.steps} steps; kept are the values of the {applied} that were applied"
+        )

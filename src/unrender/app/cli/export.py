@@ -1,0 +1,65 @@
+"""`unrender export`: a run's result as a scene that plain Mitsuba renders, or for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import AllowOutside, Variant
+from unrender.core.errors import InputError
+from unrender.display.terminal import Console
+
+__all__ = ["export"]
+
+
+def export(
+    directory: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            help="A run folder, that of a run in stages, or a problem file (TOML) for its initial values.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Where it goes. Default: the folder scene in DIR, or NAME-scene in out/.")
+    ] = None,
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="NAME,NAME",
+            help="mitsuba, glb, obj, ply, usd, environment (.exr, .hdr), blender (.glb, light, cameras and a script).",
+        ),
+    ] = "mitsuba",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
+    spp: Annotated[int, typer.Option(min=1, help="Samples per pixel that the scene asks for.")] = 256,
+    variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Write a run's result as a scene folder for Mitsuba or for other programs, and the recovered maps alone."""
+    from rich.markup import escape
+
+    console = Console(highlight=False)
+    is_problem = directory.suffix.lower() == ".toml" and directory.is_file()
+    if not is_problem and not directory.is_dir():
+        raise InputError(f"{directory}: no such run folder")
+    if is_problem:
+        arguments.refuse_stages(str(directory))
+    directory = directory if is_problem else arguments.finished_run(directory)
+    arguments.use_variant(variant)
+    from unrender.app.exporting.scene_folder import export as write
+
+    default = Path("out", f"{directory.resolve().parent.name}-scene") if is_problem else directory / "scene"
+    place = default if out is None else out
+    chosen = [name.strip() for name in formats.split(",") if name.strip()]
+    done = write(directory, place, overwrite, spp, chosen)
+    for notice in done.notices:
+        console.print(f"note: {escape(notice)}", soft_wrap=True)
+    if done.scene is not None:
+        written = ("scene", done.scene)
+    else:
+        written = ("values" if chosen == ["mitsuba"] else "folder", done.folder)
+    console.print(f"{written[0]}: {escape(str(written[1]))}", soft_wrap=True)

@@ -1,0 +1,123 @@
+"""`unrender gallery`: problems made by code, ready to run."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.table import Table
+
+    from unrender.scene.problem import Problem
+
+__all__ = ["gallery"]
+
+_SPP = 64
+
+
+def gallery(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Tell more of this one.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="With NAME: render its references, its start and its truth to PNG files here.")
+    ] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+    spp: FinalSpp = None,
+    overwrite: Overwrite = False,
+    no_cache: NoCache = False,
+) -> None:
+    """List the gallery's problems, or tell more of one."""
+    from rich.markup import escape
+
+    from unrender import gallery as problems
+    from unrender.display.terminal import Console
+
+    console = Console(highlight=False)
+    if name is None:
+        table = _table()
+        for known in problems.names():
+            table.add_row(known, escape(problems.summary(known)))
+        console.print(table)
+        return
+    console.print(f"[bold]{escape(name)}[/]  {escape(problems.summary(name))}", soft_wrap=True)
+    options = arguments.settings(problem_settings, "--problem-set")
+    table = _table()
+    for option in problems.options(name):
+        default = option.default if isinstance(option.default, (int, float, str)) else type(option.default).__name__
+        table.add_row(f"  {option.name}", str(default), escape(option.about))
+    console.print(table)
+    if out is None and not options:
+        return
+    folder = None if out is None else arguments.folder(out, name, overwrite, "view0-reference.png")
+    try:
+        from unrender.app.cli.execute import introduce
+        from unrender.runs.progress import Progress
+
+        with Progress(console):
+            running = arguments.use_variant(variant)
+            problem = arguments.open_problem(name, options, not no_cache)
+        introduce(console, problem, running)
+        console.print(_parameters(problem))
+        if folder is not None:
+            for path in _draw(problem, folder, spp):
+                console.print(escape(str(path)), soft_wrap=True)
+    finally:
+        if folder is not None:
+            arguments.remove_if_empty(folder)
+
+
+def _table() -> Table:
+    from rich.table import Table
+
+    return Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+
+
+def _parameters(problem: Problem) -> Table:
+    import numpy as np
+    from rich.markup import escape
+
+    table = _table()
+    initial = {key: np.asarray(value) for key, value in problem.initial().items()}
+    for key, error in problem.parameter_error(problem.initial()).items():
+        low, high = (("open" if side is None else f"{side:g}") for side in problem.bounds[key])
+        about = f"shape {initial[key].shape}, bounds {low} to {high}, error of the start {error:.3g}{problem.measures[key].unit}"
+        table.add_row(escape(key), about)
+    return table
+
+
+def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
+    """PNG files of each view's reference, start and truth, all as bright as the reference."""
+    import numpy as np
+
+    from unrender.io.files import write
+    from unrender.losses.metrics import exposure
+    from unrender.scene.render import render
+
+    written: list[Path] = []
+    for index, view in enumerate(problem.views):
+        reference = np.asarray(view.reference, np.float32)
+        requests = {"reference": reference, "start": render(problem, None, index, spp or _SPP)}
+        if set(problem.truth) == {parameter.key for parameter in problem.parameters}:
+            requests["truth"] = render(problem, problem.truth, index, spp or _SPP)
+        for what, picture in requests.items():
+            path = folder / f"view{index}-{what}.png"
+            written.append(write(path, _png(picture * exposure(reference))))
+    return written
+
+
+def _png(linear: np.ndarray) -> bytes:
+    import numpy as np
+    from PIL import Image
+
+    from unrender.losses.metrics import srgb
+
+    buffer = io.BytesIO()
+    Image.fromarray((srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    return buffer.getvalue()

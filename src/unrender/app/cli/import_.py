@@ -1,0 +1,172 @@
+"""`unrender import`: a folder of photographs as a problem."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import AllowOutside, Overwrite, Variant
+from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    from unrender.app.capture.importing import Imported
+    from unrender.display.terminal import Console
+
+__all__ = ["import_"]
+
+
+_Folder = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model, poses_bounds.npy or lights.txt.")
+]
+_Mesh = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
+]
+_Masks = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
+]
+_Check = Annotated[
+    bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and judge them.")
+]
+_Resolution = Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")]
+_Scale = Annotated[float | None, typer.Option(help="In place of --resolution: 0.5 for half as many pixels a side.")]
+_HoldOut = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
+]
+_Kind = Annotated[
+    str | None, typer.Option("--format", help="transforms, colmap, llff or lights, where several are there.")
+]
+_Axes = Annotated[str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")]
+_Direction = Annotated[
+    bool | None,
+    typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
+]
+_Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape, along its longest side.")]
+_Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
+_Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
+_Unknowns = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,response,poses. "
+        "Default: colour,roughness,metallic,light, and normal of a carved shape.",
+    ),
+]
+_Band = Annotated[
+    int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
+]
+
+_Response = Annotated[
+    str,
+    typer.Option(
+        metavar="CURVE",
+        help="Of files of 8 or 16 bits: srgb, linear, an exponent such as 2.2, or fit to find what differs from sRGB.",
+    ),
+]
+_Turntable = Annotated[
+    bool | None,
+    typer.Option(
+        "--turntable/--no-turntable",
+        help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
+    ),
+]
+_Field = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=2, max=256, help="A radiance field of N voxels a side, without masks or mesh."),
+]
+
+
+def import_(
+    folder: _Folder,
+    mesh: _Mesh = None,
+    masks: _Masks = None,
+    out: Annotated[Path | None, typer.Option(help="The problem folder. Default: a new one in out/.")] = None,
+    check: _Check = False,
+    resolution: _Resolution = 256,
+    scale: _Scale = None,
+    hold_out: _HoldOut = None,
+    kind: _Kind = None,
+    axes: _Axes = None,
+    world_to_camera: _Direction = None,
+    voxels: _Voxels = 96,
+    faces: _Faces = 10_000,
+    texture: _Texture = 512,
+    unknowns: _Unknowns = None,
+    band: _Band = 0,
+    response: _Response = "srgb",
+    turntable: _Turntable = None,
+    field: _Field = None,
+    overwrite: Overwrite = False,
+    variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Write a problem from posed photographs: scene, undistorted references, masks, a first shape, problem.toml, held-out.toml."""
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console = Console(highlight=False)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'not a folder' if folder.exists() else 'no such folder'}")
+    from unrender.app.capture import importing
+    from unrender.app.capture.unknowns import parse
+
+    names = None if unknowns is None else parse(unknowns)
+    # fmt: off
+    options = importing.ImportOptions(
+        mesh, masks, kind, axes, world_to_camera, resolution, scale, hold_out, voxels, faces, texture, names, band, turntable, field,
+        response,
+    )
+    # fmt: on
+    marks = (importing.CHECK,) if check else (importing.PROBLEM, importing.CHECK)
+    place = arguments.folder(out, f"{folder.resolve().name}-{'check' if check else 'import'}", overwrite, *marks)
+    refusal = ""
+    try:
+        with Progress(console):
+            arguments.use_variant(variant)
+            if check:
+                found, refusal = importing.check(folder, place, options)
+            else:
+                found = importing.import_capture(folder, place, options, overwrite=True)
+    finally:
+        arguments.remove_if_empty(place)
+    _tell(console, found)
+    written = place / (importing.SHEET if check else importing.PROBLEM)
+    console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
+    if refusal:
+        raise InputError(f"{folder}: {refusal}")
+    if not check:
+        _tell_next(console, place)
+
+
+def _tell_next(console: Console, place: Path) -> None:
+    from unrender.app.capture import importing
+
+    staged = (place / importing.STAGES).is_file()
+    names = (
+        (importing.SHEET, "to look at", ""),
+        (importing.STAGES, "next", "60"),
+        (importing.PROBLEM, "all at once" if staged else "next", "60"),
+    )
+    for file, what, seconds in names:
+        if (path := place / file).is_file():
+            command = f"unrender run {shlex.quote(str(path))} --seconds {seconds}" if seconds else path
+            console.print(f"{what}: {command}", soft_wrap=True, markup=False)
+
+
+def _tell(console: Console, found: Imported) -> None:
+    from statistics import mean
+
+    for notice in found.notices:
+        console.print(f"note: {notice}", soft_wrap=True, markup=False)
+    counts = f"{found.views} photographs and {found.held_out} held out"
+    shape = f"; a mesh of {found.faces} faces" if found.faces else ""
+    console.print(f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}{shape}", markup=False)
+    if found.overlaps:
+        worst = min(found.overlaps)
+        console.print(
+            f"the mesh covers the masks with IoU {mean(found.overlaps):.3f}, {worst:.3f} at worst", markup=False
+        )

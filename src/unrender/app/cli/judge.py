@@ -1,0 +1,81 @@
+"""`unrender judge`: a run's result against photographs that were held out, or under another light."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import AllowOutside, Variant
+
+if TYPE_CHECKING:
+    from unrender.app.evaluation.judge import Judgement
+
+__all__ = ["judge"]
+
+
+def judge(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A run folder, or that of a run in stages, for its last one.")
+    ],
+    held_out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A problem file with other views. Default: held-out.toml beside the run's."),
+    ] = None,
+    environment: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Another light: a picture of all directions (.exr, .hdr).")
+    ] = None,
+    spp: Annotated[int, typer.Option(min=1, help="Samples per pixel.")] = 64,
+    out: Annotated[Path | None, typer.Option(help="The folder. Default: judge in DIR.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier judgement.")] = False,
+    variant: Variant = "auto",
+    allow_outside: AllowOutside = False,
+) -> None:
+    """Measure a run's result on photographs that it was not made from: PSNR, SSIM, LPIPS, a sheet, the light as a picture."""
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console = Console(highlight=False)
+    with Progress(console):
+        arguments.use_variant(variant)
+        from unrender.app.evaluation.judge import judge as measure
+
+        found = measure(arguments.finished_run(directory), held_out, environment, spp, out, overwrite)
+    _tell(console, found)
+
+
+def _tell(console: object, found: Judgement) -> None:
+    from rich.table import Table
+
+    from unrender.app.cli.comparison_table import plain
+    from unrender.display.terminal import Console
+
+    assert isinstance(console, Console)
+    if found.measures:
+        table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+        names = {"PSNR": "psnr", "SSIM": "ssim", "LPIPS": "lpips"}
+        names = {title: name for title, name in names.items() if found.mean[name] is not None}
+        for title in ("photograph", *names):
+            table.add_column(title, overflow="fold")
+        for photograph, each in zip(found.names, found.measures, strict=True):
+            table.add_row(plain(photograph), *(_number(getattr(each, name), name) for name in names.values()))
+        table.add_row("[bold]mean[/]", *(_number(found.mean[name], name) for name in names.values()))
+        console.print(table)
+    if found.albedo is not None:
+        factors = ", ".join(f"{factor:.3g}" for factor in found.albedo.factors)
+        console.print(
+            f"base colour: RMSE {found.albedo.rmse:.4f}, {found.albedo.scaled_rmse:.4f} after factors {factors}",
+            markup=False,
+        )
+    for notice in found.notices:
+        console.print(f"note: {notice}", soft_wrap=True, markup=False)
+    console.print(f"to look at: {found.folder / 'sheet.png'}", soft_wrap=True, markup=False)
+
+
+def _number(value: float | None, name: str) -> str:
+    if value is None:
+        return "–"
+    return "∞" if math.isinf(value) else f"{value:.2f}" if name == "psnr" else f"{value:.3f}"

@@ -1,0 +1,82 @@
+"""`unrender methods`: what there is, and which options they have."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.arguments import ProblemSettings, Variant
+from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from unrender.methods import Method
+
+__all__ = ["methods"]
+
+
+def methods(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(metavar="PROBLEM", help="Print what the method (auto) would do for this problem, as a plan file."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", metavar="NAME=VALUE", help="With --plan: an option of the method. Repeatable."),
+    ] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+) -> None:
+    """List the methods, their options and defaults.
+
+    With --plan, print all that a method decides for a problem. `unrender run PROBLEM --method FILE.toml` runs such a file.
+    """
+    from rich.markup import escape
+
+    if plan is not None:
+        _print_plan(plan, name or "auto", arguments.settings(settings, "--set"), problem_settings, variant)
+        return
+    if settings or problem_settings:
+        raise InputError("--set and --problem-set need --plan PROBLEM")
+
+    from unrender.display.terminal import Console
+    from unrender.methods import method
+    from unrender.methods import methods as registered
+
+    console = Console(highlight=False)
+    for one in [method(name)] if name else registered().values():
+        console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
+        console.print(_options(one))
+        console.print()
+
+
+def _print_plan(
+    problem: str, name: str, settings: dict[str, str], problem_settings: list[str] | None, variant: str
+) -> None:
+    from unrender.methods import method
+    from unrender.methods.plan_file import text
+
+    chosen, options = method(name), arguments.settings(problem_settings, "--problem-set")
+    chosen.start(settings)
+    arguments.check_problem(problem, options)
+    arguments.use_variant(variant)
+    print(text(chosen.plan(arguments.open_problem(problem, options), settings)), end="")
+
+
+def _options(one: Method) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, field in one.options.model_fields.items():
+        default = "none" if field.default is None else str(field.default)
+        about = f"{field.description} ({one.expected(name)})"
+        table.add_row(f"  {name}", escape(default), escape(about))
+    return table

@@ -1,0 +1,185 @@
+"""`unrender run`: recover one problem's parameters by one method."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.app.cli import arguments, dealing, stages
+from unrender.app.cli.arguments import (
+    AllowOutside,
+    CheckpointEvery,
+    FinalSpp,
+    Insecure,
+    NoCache,
+    Overwrite,
+    ProblemName,
+    ProblemSettings,
+    Seed,
+    Threads,
+    Variant,
+    WorkersOption,
+)
+from unrender.app.cli.dealing import Compress
+from unrender.app.cli.exit_status import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
+from unrender.core import phases
+from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    from unrender.display.terminal import Console
+    from unrender.methods import Method
+    from unrender.methods.plan_file import PlanFile
+    from unrender.runs.progress import Progress
+    from unrender.runs.result import Result
+    from unrender.scene.problem import Problem
+
+__all__ = ["conclude", "exit_status", "run"]
+
+
+_MethodName = Annotated[
+    str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
+]
+_Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
+]
+_Steps = Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")]
+_Seconds = Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")]
+_Out = Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")]
+
+
+def run(
+    context: typer.Context,
+    problem: ProblemName,
+    method_name: _MethodName = "auto",
+    settings: _Settings = None,
+    steps: _Steps = None,
+    seconds: _Seconds = None,
+    seed: Seed = 0,
+    out: _Out = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+    final_spp: FinalSpp = None,
+    overwrite: Overwrite = False,
+    checkpoint_every: CheckpointEvery = None,
+    threads: Threads = None,
+    no_cache: NoCache = False,
+    workers: WorkersOption = None,
+    compress: Compress = False,
+    allow_outside: AllowOutside = False,
+    insecure: Insecure = False,
+) -> None:
+    """Recover a problem's parameters, and write a run folder with a page that shows the result.
+
+    PROBLEM may also be a file of stages: a run folder for each, which begins with what the one before it found.
+    Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
+    """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console, command = Console(highlight=False), shlex.join(context.find_root().obj or ["unrender"])
+    given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    with Progress(console) as progress:
+        with phases.phase("loading"):
+            from unrender.app.cli.execute import RunOrder, execute, introduce
+
+            chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
+            steps, seconds = _budget_settings(given, steps, seconds)
+            if stages.is_stages(problem):
+                stages.refuse_settings(method_name, given, options, workers)
+                plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
+                return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
+            steps, seconds = arguments.budget(steps, seconds)
+            chosen.start(given)
+            arguments.check_problem(problem, options)
+        folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
+        try:
+            running = arguments.use_variant(variant, threads)
+            opened = arguments.open_problem(problem, options, not no_cache)
+            introduce(console, opened, running)
+            with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
+                task = RunOrder(
+                    dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every
+                )
+                result = execute(task, folder, console, progress)
+        finally:
+            arguments.remove_if_empty(folder)
+        conclude(console, opened, result, folder, progress)
+
+
+def _method(name: str) -> Method | PlanFile:
+    """Return the method of a name, or the plan of a TOML file. Raises `InputError`."""
+    from unrender.methods import method
+    from unrender.methods.plan_file import SUFFIX, PlanFile
+
+    return PlanFile(Path(name)) if name.endswith(SUFFIX) else method(name)
+
+
+def conclude(
+    console: Console,
+    problem: Problem,
+    result: Result,
+    folder: Path,
+    progress: Progress,
+    again: Path | None = None,
+    page: bool = True,
+) -> None:
+    """Write the page, say what came out, and leave with the status of an interrupted, failed or doubtful run where it is one.
+
+    Args:
+        console, problem, result, folder, progress: of the run.
+        again: what `unrender resume` is to be given then; None for the run folder.
+        page: whether it is written.
+    """
+    from rich.markup import escape
+
+    from unrender.app.cli.execute import summarise
+
+    written = None
+    if result.steps and page:
+        with phases.phase("page"):
+            from unrender.app import report
+
+            written = report.page(folder)
+    summarise(console, problem, result, progress)
+    if written is not None:
+        console.print(f"page: {escape(str(written))}", soft_wrap=True)
+    if status := exit_status(result.stopped):
+        why = "to go on" if result.status == "interrupted" else "to try once more from its last step"
+        console.print(f"{why}: unrender resume {escape(shlex.quote(str(again or folder)))}", soft_wrap=True)
+        raise typer.Exit(status)
+    if result.status != "finished":
+        raise typer.Exit(DOUBTFUL)
+
+
+def exit_status(stopped: str) -> int:
+    """Of a command whose run ended for that reason (`Result.stopped`)."""
+    from unrender.runs import result as results
+
+    statuses = {results.INTERRUPTED: INTERRUPTED, results.TERMINATED: TERMINATED, results.NON_FINITE: FAILED}
+    return statuses.get(stopped, 0)
+
+
+def _budget_settings(
+    given: dict[str, str], steps: int | None, seconds: float | None
+) -> tuple[int | None, float | None]:
+    """The budget, which may also stand among the settings (--set steps=300): it is taken from there."""
+    for name, option in (("steps", steps), ("seconds", seconds)):
+        if name in given and option is not None:
+            raise InputError(f"--set {name}={given[name]}: --{name} is given, too")
+    if "steps" in given:
+        text = given.pop("steps")
+        try:
+            steps = int(text)
+        except ValueError as error:
+            raise InputError(f"--set steps={text}: expected a whole number") from error
+    if "seconds" in given:
+        text = given.pop("seconds")
+        try:
+            seconds = float(text)
+        except ValueError as error:
+            raise InputError(f"--set seconds={text}: expected a number") from error
+    return steps, seconds

@@ -1,0 +1,103 @@
+"""Ctrl-C and SIGTERM: one line and an exit status of their own, at whatever instant and however often they come.
+
+A run takes both over while it goes, and ends in good order after its step (`runs.run.interruptible`). Elsewhere, and when they come a
+second time, the command is interrupted where it is; while it is still busy with that, one more ends the process at once. What a run had
+written remains, as after a kill.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType, TracebackType
+from typing import Any
+
+from unrender.app.cli.exit_status import WORDS
+from unrender.core.signals import GRACEFUL
+
+__all__ = ["Signals"]
+
+_LATER, _LONGEST = 0.02, 1.5
+"""Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
+_SHOW_CURSOR = b"\x1b[?25h"
+
+
+class Signals:
+    """Handles both signals, as a context manager, in the main thread.
+
+    Args:
+        process: whether the process ends with the command: then a Ctrl-C that comes after it is ignored.
+
+    Attributes:
+        status: the exit status of the signal that came; 0 for none.
+    """
+
+    def __init__(self, process: bool):
+        self.status = 0
+        self._process = process
+        self._before: dict[int, Any] = {}
+        self._deferred: set[int] = set()
+        self._first: dict[int, float] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, _Handler(self))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            ignored = self._process and number == signal.SIGINT
+            signal.signal(number, signal.SIG_IGN if ignored else handler)
+
+    def receive(self, number: int, frame: FrameType | None) -> None:
+        """End the command where it is; at once where it is busy with that already.
+
+        In the midst of an import the signal comes again a little later: compiled code that imports modules may abort at an exception.
+        """
+        waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
+        if self.status or number in self._deferred or waited > _LONGEST:
+            status = self.status or 128 + number
+            if sys.stderr.isatty():
+                os.write(2, _SHOW_CURSOR)
+            os.write(2, f"unrender: {WORDS[status]}\n".encode())
+            os._exit(status)
+        if _is_importing(frame):
+            self._deferred.add(number)
+            timer = threading.Timer(_LATER, self._send_again, (number,))
+            timer.daemon = True
+            with contextlib.suppress(RuntimeError):  # no memory for a thread: the next signal ends the command
+                timer.start()
+            return
+        self.status = 128 + number
+        raise KeyboardInterrupt
+
+    def _send_again(self, number: int) -> None:
+        self._deferred.discard(number)
+        os.kill(os.getpid(), number)
+
+
+class _Handler:
+    """A handler of signals in whose place a run may put its own."""
+
+    def __init__(self, signals: Signals):
+        self._signals = signals
+        setattr(self, GRACEFUL, True)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self._signals.receive(number, frame)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False

@@ -1,0 +1,283 @@
+"""`unrender run` and `resume` of a file of stages: a run folder for each, one after the other."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from unrender.app.cli import arguments
+from unrender.app.cli.exit_status import DOUBTFUL
+from unrender.core import phases
+from unrender.core.errors import InputError
+from unrender.core.random import check_seed
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from unrender.app.stages.stage_problem import Whole
+    from unrender.app.stages.stages_file import RunOptions, Stages
+    from unrender.display.terminal import Console
+    from unrender.runs.folder.lock import Lock
+    from unrender.runs.progress import Progress
+    from unrender.runs.result import Result
+    from unrender.scene.problem import Problem
+
+__all__ = ["StagesRun", "begin", "is_stages", "refuse_settings", "refuse_workers", "reopen", "run_remaining"]
+
+_SCENES = "scenes"
+
+
+@dataclass(frozen=True)
+class StagesRun:
+    """A descent in stages under way.
+
+    Attributes:
+        stages: with their budget and the options of their run.
+        whole: their problem.
+        out: the folder of the run folders.
+        variant: of Mitsuba.
+        command: what was typed, to be saved with the results.
+        lock: of `out`, held; `run_remaining` lets it go.
+    """
+
+    stages: Stages
+    whole: Whole
+    out: Path
+    variant: str
+    command: str
+    lock: Lock
+
+    @property
+    def options(self) -> RunOptions:
+        """How it was begun."""
+        assert self.stages.run is not None
+        return self.stages.run
+
+
+def is_stages(problem: str) -> bool:
+    """Whether what was given as PROBLEM is a file of stages."""
+    if not problem.endswith(".toml") or not Path(problem).is_file():
+        return False
+    from unrender.app.stages import stages_file
+
+    return stages_file.is_stages(Path(problem))
+
+
+def refuse_workers(workers: str | None) -> None:
+    """Raise `InputError` where --workers is given."""
+    if workers is not None:
+        raise InputError("--workers: not with stages, which run in this process")
+
+
+def refuse_settings(method: str, settings: Mapping[str, str], options: Mapping[str, str], workers: str | None) -> None:
+    """Raise `InputError` for options of the command line that stand in a file of stages, or that stages do not have."""
+    refuse_workers(workers)
+    given = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
+    given += ["--method"] * (method != "auto")
+    if given:
+        raise InputError(f"{given[0]}: not with stages, whose file has method and settings")
+
+
+def begin(
+    file: Path,
+    budget: tuple[int | None, float | None],
+    seed: int,
+    out: Path | None,
+    overwrite: bool,
+    variant: str,
+    threads: int | None,
+    command: str,
+    checkpoint_every: int | None,
+    final_spp: int | None,
+) -> StagesRun:
+    """Check a file of stages, and write the folder that its run begins with. Raises `InputError`.
+
+    Args:
+        file: exists.
+        budget: steps and seconds in place of the file's; both None for the file's.
+        seed: of the first stage, where it is not 0.
+        out: the folder; None for a new one.
+        overwrite: whether it may hold earlier results.
+        variant, threads, command, checkpoint_every, final_spp: of all stages.
+    """
+    from unrender.app.stages import stages_file
+    from unrender.methods import method
+
+    stages = stages_file.read(file)
+    if budget != (None, None):
+        stages = replace(stages, steps=budget[0], seconds=budget[1])
+    steps, seconds = arguments.budget(stages.steps, stages.seconds)
+    stages = replace(stages, steps=steps, seconds=seconds, seed=seed or stages.seed)
+    check_seed("seed", stages.seed, len(stages.stages))
+    for stage in stages.stages:
+        try:
+            method(stage.method or stages.method).start(stages.settings_of(stage))
+        except InputError as error:
+            raise InputError(f"{file}: stage {stage.name}: {error}") from error
+    if out is not None and out.resolve() == file.resolve().parent:
+        raise InputError(f"--out {out}: the folder of {file.name} itself; give another one")
+    if out is not None and (out / stages_file.FILE).is_file() and not stages_file.is_of_run(out / stages_file.FILE):
+        raise InputError(f"--out {out}: its {stages_file.FILE} is that of no run; give another folder")
+    folder = arguments.folder(out, f"{file.resolve().parent.name}-stages", overwrite, stages_file.FILE)
+    try:
+        running = arguments.use_variant(variant, threads)
+        whole = _read(stages)
+        with _held(folder) as lock:
+            _clear(folder)
+            options = stages_file.RunOptions(running, threads, checkpoint_every, final_spp)
+            stages = replace(stages, run=options)
+            stages_file.write(stages, folder)
+    finally:
+        arguments.remove_if_empty(folder)
+    return StagesRun(stages, whole, folder, running, command, lock)
+
+
+def reopen(
+    folder: Path, budget: tuple[int | None, float | None], variant: str | None, threads: int | None, command: str
+) -> StagesRun:
+    """A run in stages that was begun earlier: budget, variant, threads and checkpoints as it had, where they are not given."""
+    from unrender.app.stages import stages_file
+
+    file = folder / stages_file.FILE
+    stages = stages_file.read(file)
+    if not stages_file.is_of_run(file):
+        raise InputError(
+            f"{folder}: not a run in stages, whose {file.name} has the full path of its problem; begin one: unrender run {file}"
+        )
+    if budget != (None, None):
+        stages = replace(stages, steps=budget[0], seconds=budget[1])
+    options = stages.run or stages_file.RunOptions()
+    running = arguments.use_variant(variant or options.variant, threads or options.threads)
+    stages = replace(stages, run=options)
+    with _held(folder) as lock:
+        whole = _read(stages)
+        if budget != (None, None):
+            stages_file.write(stages, folder)
+    return StagesRun(stages, whole, folder, running, command, lock)
+
+
+def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
+    """Run the stages that are left, each to its end, or until one is interrupted or fails: leave with its status then.
+
+    A doubtful stage does not end the others: the next one begins with the parameters that it verified.
+    """
+    try:
+        _run_stages(run, console, progress)
+    finally:
+        run.lock.release()
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[Lock]:
+    """The folder's lock, which stays held unless the block fails. Raises `InputError` where another process holds it."""
+    from unrender.runs.folder.lock import Lock
+
+    lock = Lock(folder)
+    lock.acquire()
+    try:
+        yield lock
+    except BaseException:
+        lock.release()
+        raise
+
+
+def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
+    from rich.markup import escape
+
+    from unrender.app.cli.run import conclude
+    from unrender.app.stages import stages_file
+    from unrender.runs.folder import reader
+
+    values: dict[str, np.ndarray] = {}
+    doubtful = False
+    for index, stage in enumerate(run.stages.stages):
+        folder = stages_file.folder_of(run.stages, index, run.out)
+        console.print(f"[bold]stage {index + 1} of {len(run.stages.stages)}[/]: {escape(stage.name)}", soft_wrap=True)
+        if _is_finished(folder):
+            console.print(f"finished: {escape(str(folder))}", soft_wrap=True)
+        else:
+            problem, result = _run_stage(run, index, values, console, progress)
+            last = index == len(run.stages.stages) - 1
+            page = last or run.options.final_spp is not None
+            try:
+                conclude(console, problem, result, folder, progress, again=run.out, page=page)
+            except typer.Exit as left:
+                if left.exit_code != DOUBTFUL:
+                    raise
+                doubtful = True
+        # Of the file, so that a stage begins with the same whether the one before it was run just now or earlier.
+        values |= reader.read(folder).parameters
+    if doubtful:
+        raise typer.Exit(DOUBTFUL)
+
+
+def _run_stage(
+    run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
+) -> tuple[Problem, Result]:
+    """Begin a stage, or go on with it."""
+    from unrender.app.cli.execute import RunOrder, execute, introduce
+    from unrender.app.stages import stages_file
+    from unrender.methods import method
+    from unrender.runs import reopen as runs
+    from unrender.runs.folder import schema
+    from unrender.runs.live import Live
+    from unrender.runs.resume import load_run, resume_run
+
+    stages, stage = run.stages, run.stages.stages[index]
+    folder = stages_file.folder_of(stages, index, run.out)
+    if (folder / schema.RECORD).is_file():
+        found = load_run(folder, *stages_file.split(stages)[index])
+        problem = runs.problem_of(folder)
+        introduce(console, problem, run.variant)
+        live = Live(folder, problem.name, found.record.method, found.record.command)
+        result = resume_run(found, problem, False, [progress, live], earlier=progress.seconds)
+        live.clear()
+        return problem, result
+    with phases.phase("loading"):
+        problem = run.whole.of_stage(stage, values, run.out / _SCENES / folder.name)
+    introduce(console, problem, run.variant)
+    steps, seconds = stages_file.split(stages)[index]
+    settings = stages.settings_of(stage)
+    chosen = method(stage.method or stages.method)
+    last = index == len(stages.stages) - 1
+    spp = run.options.final_spp or (None if last else 1)  # those of many views take minutes
+    every = run.options.checkpoint_every
+    order = RunOrder(problem, chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
+    return problem, execute(order, folder, console, progress)
+
+
+def _read(stages: Stages) -> Whole:
+    from unrender.app.stages.stage_problem import Whole
+
+    with phases.phase("loading"):
+        return Whole.read(stages)
+
+
+def _is_finished(folder: Path) -> bool:
+    from unrender.runs.folder import reader, schema
+
+    return (folder / schema.RECORD).is_file() and reader.read_run_record(folder).status in schema.ENDED
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier run in stages left: scenes and run folders of stages. Raises `InputError` where a process holds one."""
+    from unrender.runs.folder import schema
+
+    old = [
+        path
+        for path in sorted(out.glob("[0-9]*-*"))
+        if (path / schema.RECORD).is_file() or (path / schema.LOCK).is_file()
+    ]
+    with contextlib.ExitStack() as stack:
+        for path in old:  # all before any is removed
+            stack.callback(stack.enter_context(_held(path)).release)
+        for path in old:
+            shutil.rmtree(path)
+        if (out / _SCENES).is_dir():
+            shutil.rmtree(out / _SCENES)

@@ -1,0 +1,234 @@
+"""Carrying out a sweep: trials to workers, what they found into sweep.json."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shlex
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import typer
+
+from unrender.app.cli import arguments, sweep_page, sweep_table, tasks
+from unrender.app.cli.execute import introduce
+from unrender.app.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
+from unrender.app.cli.task_display import TaskDisplay
+from unrender.app.cli.tasks import Job, RunTask
+from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorkers, Workers, connect
+from unrender.app.sweeps import folders
+from unrender.app.sweeps.record import SWEEP, RunOutcome, SweepPlan, SweepRecord, TrialRecord, write_sweep
+from unrender.app.sweeps.search import Search
+from unrender.app.sweeps.trials import Started, Trials, trial_record
+from unrender.backend.variant import check_threads
+from unrender.core.errors import InputError
+from unrender.display.terminal import Console
+from unrender.io import files
+from unrender.runs.folder.lock import Lock
+from unrender.runs.result import TERMINATED as TOLD_TO_TERMINATE
+from unrender.scene.problem import Problem
+
+__all__ = ["Session", "run_trials"]
+
+_POLL_SECONDS = 0.5
+_WINDOW = 4
+
+
+@dataclass(frozen=True)
+class Session:
+    """One call of the command.
+
+    Attributes:
+        folder: of the sweep.
+        workers: who carries out the trials; None for this process.
+        threads: of the processor for each run; None chooses.
+        fresh: whether the sweep begins, whatever the folder holds.
+    """
+
+    folder: Path
+    workers: Workers | None
+    threads: int | None
+    fresh: bool = False
+
+
+@dataclass
+class _State:
+    """What changes as the sweep goes: its record, the trials under way, and when the session began."""
+
+    record: SweepRecord
+    trials: Trials
+    under_way: dict[int, Started] = field(default_factory=dict)
+    began: float = field(default_factory=time.monotonic)
+    before: float = 0.0
+    stopped: str = ""
+
+    def save(self, folder: Path, status: str = "running") -> None:
+        """Write sweep.json as it is now."""
+        best = self.trials.best
+        ended = [trial for _, trial in sorted(self.trials.ended.items())]
+        changes = {
+            "status": status,
+            "trials": ended,
+            "best": None if best is None else best.number,
+            "best_line": "" if best is None else best.line,
+            "wall_seconds": self.before + time.monotonic() - self.began,
+        }
+        self.record = self.record.model_copy(update=changes)
+        write_sweep(folder, self.record)
+
+
+def run_trials(console: Console, session: Session, record: SweepRecord, search: Search) -> None:
+    """Carry out the trials that have not ended, write the page, say what was found.
+
+    Raises:
+        InputError: the folder is in use or cannot be written, or the problem cannot be opened.
+        typer.Exit: with the status of an interrupted sweep, or of one of which no trial came to its end.
+    """
+    plan = record.plan
+    trials = Trials(search, plan.prune, plan.window or _WINDOW)
+    trials.ended = {t.number: t for t in record.trials if trials.dependent or t.status != "failed"}  # tried once more
+    state = _State(record, trials, before=record.wall_seconds)
+    lock = Lock(session.folder)
+    lock.acquire()
+    try:
+        if session.fresh:
+            for path in session.folder.glob(folders.PATTERN):
+                files.remove(path)
+        if not trials.done:
+            with _executor(console, session, record) as (executor, job, problem, running):
+                introduce(console, problem, running)
+                _choose_window(state, executor)
+                _announce(console, session, state, executor)
+                state.save(session.folder)
+                _drive(console, session, state, executor, job)
+        state.save(session.folder, "finished" if trials.done else "interrupted")
+        sweep_table.show(console, state.record)
+        _page(console, session.folder, state)
+    finally:
+        if not trials.done and (session.folder / SWEEP).exists():
+            state.save(session.folder, "interrupted")
+            again = f"to go on: unrender sweep {shlex.quote(str(session.folder))}"
+            console.print(again, markup=False, highlight=False, soft_wrap=True)
+        lock.release()
+    if not trials.done:
+        raise typer.Exit(TERMINATED if state.stopped == TOLD_TO_TERMINATE else INTERRUPTED)
+    if state.trials.best is None:
+        raise typer.Exit(FAILED)
+
+
+def _choose_window(state: _State, executor: Executor) -> None:
+    """Unless it was given, or chosen when the sweep began: at least twice the workers, so that none waits for the slowest of the others."""
+    if state.record.plan.window is None:
+        state.trials.window = max(_WINDOW, 2 * executor.slots)
+        plan = state.record.plan.model_copy(update={"window": state.trials.window})
+        state.record = state.record.model_copy(update={"plan": plan})
+
+
+@contextlib.contextmanager
+def _executor(console: Console, session: Session, record: SweepRecord) -> Iterator[tuple[Executor, Job, Problem, str]]:
+    """Who carries out the trials, what they have in common, the problem, and the variant."""
+    plan = record.plan
+    with contextlib.ExitStack() as stack:
+        cluster = None
+        if session.workers is not None:
+            cluster = stack.enter_context(connect(session.workers, plan.variant))
+            if session.threads is not None and cluster.address is None:
+                check_threads(session.threads)
+        running = arguments.use_variant(plan.variant, None if cluster else session.threads)
+        problem = arguments.open_problem(plan.problem, plan.problem_settings, plan.cached)
+        job = Job(
+            plan.problem,
+            plan.problem_settings,
+            plan.cached,
+            record.command,
+            str(session.folder.resolve()),
+            secrets.token_hex(16),
+            running if cluster is None else cluster.variant,
+            1 if cluster is None else session.threads or cluster.share.threads,
+        )
+        stack.enter_context(tasks.open_job(job))
+        if cluster is not None:
+            yield OnWorkers(cluster, tasks.on_worker), job, problem, cluster.variant
+        else:
+            yield InProcess(partial(_here, problem)), job, problem, running
+
+
+def _here(problem: Problem, job: Job, given: list[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
+    """What `tasks.on_worker` does, in this process."""
+    return tasks.in_turn(job, given, problem), {}
+
+
+def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:
+    plan = state.record.plan
+    where = "in this process" if session.workers is None else f"on {executor.slots} workers"
+    seeds = f", {plan.seeds} seeds each" if plan.seeds > 1 else ""
+    left = state.trials.search.trials - len(state.trials.ended)
+    had = f", {len(state.trials.ended)} done before" if state.trials.ended else ""
+    console.print(f"{plan.method}, {plan.search}: {left} trials{seeds} {where}{had}", highlight=False, soft_wrap=True)
+
+
+def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
+    """Until all trials have ended, or one is interrupted."""
+    plan, trials = state.record.plan, state.trials
+    display = TaskDisplay(console, trials.search.trials, "trials", lambda: sweep_table.best_so_far(trials))
+    display.skip(len(trials.ended))
+    with display:
+        while not trials.done and not state.stopped:
+            while executor.pending < executor.slots and (started := trials.next()) is not None:
+                given = _tasks(plan, started)
+                label = ", ".join(f"{name}={value}" for name, value in started.settings.items())
+                display.begin(started.number, label, tuple(session.folder / task.name for task in given))
+                state.under_way[started.number] = started
+                executor.start(started.number, job, given)
+            for ended in executor.wait(_POLL_SECONDS):
+                record = _ended(session, state, ended)
+                if record is None:
+                    break
+                trials.end(record)
+                display.end(record.number, sweep_table.line(record))
+                state.save(session.folder)
+
+
+def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
+    """What became of a trial; None where this process was told to stop."""
+    started = state.under_way.pop(ended.key)
+    runs, message = [], ended.message
+    if not message:
+        runs, written = ended.value
+        try:
+            tasks.receive(session.folder, written)
+        except OSError as error:
+            raise InputError(f"sweep {session.folder}: cannot be written: {error.strerror or error}") from error
+        stopped = next((run.stopped for run in runs if run.status == "interrupted"), "")
+        if stopped and session.workers is None:
+            state.stopped = stopped
+            return None
+        message = f"{stopped} from outside" if stopped else ""
+    return trial_record(started.number, started.settings, runs, ended.attempts, message)
+
+
+def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
+    """The runs of a trial: the first one may be pruned."""
+    return [
+        RunTask(
+            folders.name(started.number, plan.seed + i),
+            plan.method,
+            {**plan.settings, **started.settings},
+            plan.steps,
+            plan.seconds,
+            plan.seed + i,
+            plan.final_spp,
+            (started.limits if i == 0 else {}) if plan.prune else None,
+        )
+        for i in range(plan.seeds)
+    ]
+
+
+def _page(console: Console, folder: Path, state: _State) -> None:
+    """A page that compares the best trials."""
+    if folders.best(folder, state.record):
+        page = sweep_page.write_page(folder, state.record)
+        console.print(f"page: {page}", markup=False, highlight=False, soft_wrap=True)

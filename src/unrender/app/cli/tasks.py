@@ -1,0 +1,234 @@
+"""Runs as tasks: what is sent to a worker, what it does, what comes back. `compare` and `sweep` carry out their runs so."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from unrender.app.cli import arguments
+from unrender.app.cli.execute import RunOrder, execute
+from unrender.app.distributed.cluster import prepare_worker
+from unrender.app.sweeps.pruning import RUNG_FILE, Pruning, read_rungs, stated_error
+from unrender.app.sweeps.record import RunOutcome
+from unrender.core.errors import InputError
+from unrender.display.terminal import Console
+from unrender.io import files
+from unrender.methods import method
+from unrender.runs.callbacks import Callback
+from unrender.runs.folder import reader
+from unrender.runs.folder.lock import holder
+from unrender.runs.folder.schema import CHECKPOINTS, ENDED, RECORD
+from unrender.runs.live import Live
+from unrender.runs.progress import Progress
+from unrender.runs.result import PRUNED
+from unrender.runs.resume import load_run, resume_run
+from unrender.scene.problem import Problem
+
+__all__ = ["Job", "RunTask", "carry_out", "discard_earlier", "in_turn", "on_worker", "open_job", "quiet", "receive"]
+
+_PATIENCE_SECONDS = 30.0
+"""For a run folder that a dying process still holds."""
+_MARK = ".unrender-folder"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all tasks of a command have in common. All of it can be sent to a worker.
+
+    Attributes:
+        problem, problem_settings, cached: see `arguments.open_problem`; a file's path is absolute.
+        command: what was typed.
+        folder: where results go: an absolute path.
+        token: that the file `.unrender-folder` in it holds: a worker that reads another, or none, sends its results back.
+        variant, threads: of the workers.
+    """
+
+    problem: str
+    problem_settings: Mapping[str, str]
+    cached: bool
+    command: str
+    folder: str
+    token: str = ""
+    variant: str = "auto"
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class RunTask:
+    """One run. All of it can be sent to a worker.
+
+    Attributes:
+        name: of its run folder, within the job's.
+        method, settings: as typed.
+        steps, seconds, seed, final_spp: see `Plan`.
+        limits: see `Pruning`; None for a run whose error on the way is not looked at.
+    """
+
+    name: str
+    method: str
+    settings: Mapping[str, str]
+    steps: int | None
+    seconds: float | None
+    seed: int
+    final_spp: int | None
+    limits: Mapping[float, float] | None = None
+
+
+def discard_earlier(folder: Path, tasks: Sequence[RunTask]) -> None:
+    """Let no task take an earlier run in its folder for its own."""
+    for task in tasks:
+        (folder / task.name / RECORD).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def open_job(job: Job) -> Iterator[None]:
+    """Mark the job's folder, so that workers can tell whether they see it."""
+    mark = Path(job.folder, _MARK)
+    files.write(mark, job.token.encode(), durable=False)
+    try:
+        yield
+    finally:
+        mark.unlink(missing_ok=True)
+
+
+def carry_out(
+    job: Job,
+    task: RunTask,
+    problem: Problem,
+    console: Console,
+    progress: Progress,
+    callbacks: Sequence[Callback] = (),
+) -> RunOutcome:
+    """One run, from where an earlier attempt left it. Raises `InputError` as `execute` and `resume_run` do."""
+    folder = Path(job.folder, task.name)
+    _wait_until_free(folder)
+    record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
+    started = time.perf_counter()
+    if record is None or record.status not in ENDED:
+        looking = [] if task.limits is None else [Pruning(folder, task.limits)]
+        listeners = [progress, *looking, *callbacks]
+        if record is None or record.steps == 0 or not _resumed(folder, problem, listeners, record.command):
+            chosen = method(task.method)
+            order = RunOrder(
+                problem, chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
+                job.problem_settings,
+            )  # fmt: skip
+            execute(order, folder, console, progress, listeners[1:])
+        return outcome(folder, task, time.perf_counter() - started)
+    return outcome(folder, task, 0.0)
+
+
+def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
+    """What a run folder says of the run's end. Raises `InputError`."""
+    run = reader.read(folder)
+    record = run.record
+    rungs = read_rungs(folder / RUNG_FILE)
+    error: float | None
+    standard_error: float | None
+    status = "pruned" if record.stopped == PRUNED else record.status
+    if status == "pruned" and rungs:
+        error, standard_error = rungs[max(rungs)], None
+    else:
+        try:
+            error, standard_error = stated_error(run)
+        except InputError:
+            error = standard_error = None
+    return RunOutcome(
+        folder=task.name,
+        seed=task.seed,
+        status="failed" if status == "running" else status,
+        stopped=record.stopped,
+        error=_finite(error),
+        standard_error=_finite(standard_error),
+        rungs={str(share): value for share, value in rungs.items()},
+        steps=record.steps,
+        samples=int(run.history.samples[-1]) if len(run.history) else 0,
+        seconds=record.seconds,
+        wall_seconds=wall_seconds,
+    )
+
+
+def quiet() -> tuple[Console, Progress]:
+    """A console that nobody reads, and a listener to phases that prints there."""
+    console = Console(file=io.StringIO(), force_terminal=False)
+    return console, Progress(console)
+
+
+# ---------------------------------------------------------------------- on a worker
+
+
+def on_worker(job: Job, tasks: Sequence[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
+    """Carry out runs one after the other, until one does not come to its end.
+
+    Returns:
+        How they ended; and, where the job's folder is not seen from here, {path within it: contents} of what they wrote.
+    """
+    prepare_worker(job.variant, job.threads)
+    problem = _problem(job.problem, tuple(job.problem_settings.items()), job.cached)
+    mark = Path(job.folder, _MARK)
+    if mark.is_file() and mark.read_text("utf-8", errors="replace") == job.token:
+        return in_turn(job, tasks, problem), {}
+    place = Path(tempfile.mkdtemp(prefix="unrender-"))
+    try:
+        found = in_turn(replace(job, folder=str(place)), tasks, problem)
+        written = (path for path in place.rglob("*") if path.is_file() and CHECKPOINTS not in path.parts)
+        return found, {str(path.relative_to(place)): path.read_bytes() for path in written}
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def receive(folder: Path, written: Mapping[str, bytes]) -> None:
+    """Write what a worker sent back. run.json comes last in each run folder. Raises `OSError`."""
+    for name in sorted(written, key=lambda name: name.endswith(RECORD)):
+        files.write(folder / name, written[name], durable=False)
+
+
+def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOutcome]:
+    """Carry out runs one after the other, silently, until one does not come to its end."""
+    found: list[RunOutcome] = []
+    console, progress = quiet()
+    with progress:
+        for task in tasks:
+            found.append(carry_out(job, task, problem, console, progress))
+            if found[-1].status not in ENDED:
+                break
+    return found
+
+
+@functools.lru_cache(maxsize=1)
+def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> Problem:
+    """Opened once a process."""
+    return arguments.open_problem(name, dict(options), cached)
+
+
+# ---------------------------------------------------------------------- the parts
+
+
+def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback], command: str) -> bool:
+    """Whether the run could go on from its last checkpoint, and did."""
+    try:
+        stored = load_run(folder)
+        live = Live(folder, problem.name, stored.record.method, command)
+        resume_run(stored, problem, callbacks=[*callbacks, live])
+        live.clear()
+    except InputError:
+        return False
+    return True
+
+
+def _wait_until_free(folder: Path) -> None:
+    until = time.monotonic() + _PATIENCE_SECONDS
+    while time.monotonic() < until and holder(folder) is not None:
+        time.sleep(0.2)
+
+
+def _finite(number: float | None) -> Any:
+    return number if number is not None and abs(number) < float("inf") else None

@@ -1,0 +1,87 @@
+"""`unrender watch`: a live page of runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from unrender.app.watch import server
+
+__all__ = ["watch"]
+
+_NICE = 10
+
+
+def watch(
+    directories: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DIR...",
+            help="Run folders: of runs under way, finished, or yet to begin; or folders of sweeps or stages.",
+        ),
+    ],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of 127.0.0.1; 0 takes a free one.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open nothing.")] = False,
+) -> None:
+    """Serve a page that shows runs as they go, with buttons to pause, resume and stop them.
+
+    It is served to this machine alone, under an address that holds a secret. Ctrl-C ends the page, not the runs.
+    """
+    from unrender.app.watch import server
+
+    directories = [run for directory in directories for run in _runs(directory)]
+    for directory in directories:
+        if directory.exists() and not directory.is_dir():
+            raise InputError(f"{directory}: a file, expected a run folder")
+    if len({directory.resolve() for directory in directories}) < len(directories):
+        raise InputError("watch: a run folder is given twice")
+    for directory in directories:
+        if not directory.is_dir():
+            typer.echo(f"{directory}: no such folder yet: waiting for a run to begin there{_similar(directory)}")
+    with server.listen(port) as opened:
+        address = server.Address(opened.getsockname()[1])
+        typer.echo(f"watching at {address.url}\nCtrl-C ends this page; the runs go on")
+        with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
+            found = None if no_browser else _open(address, stack)  # the socket listens already, and a browser waits
+            with contextlib.suppress(OSError):
+                os.nice(_NICE)  # what is watched goes first; only now, since the browser would inherit it
+            server.serve([directory.absolute() for directory in directories], address, opened, found)
+
+
+def _runs(directory: Path) -> list[Path]:
+    """The run folders of a folder of stages or of a sweep; of any other, itself."""
+    from unrender.app.stages import run_folders
+    from unrender.app.sweeps import folders
+
+    return [run for stage in run_folders.listed(directory) for run in folders.watched(stage)]
+
+
+def _similar(directory: Path) -> str:
+    """A hint at a run folder beside it whose name is nearly the same."""
+    siblings: list[str] = []
+    with contextlib.suppress(OSError):
+        siblings = [path.name for path in directory.parent.iterdir() if path.is_dir()]
+    return did_you_mean(directory.name, siblings)
+
+
+def _open(address: server.Address, stack: contextlib.ExitStack) -> Callable[[], object] | None:
+    """Open the page in a browser; returns what to call once the browser is there."""
+    from unrender.app.watch.redirect import Redirect
+
+    try:
+        redirect = stack.enter_context(Redirect(address.url))
+    except OSError as error:
+        typer.echo(f"no browser was opened: {error.strerror or error}; open the address by hand", err=True)
+        return None
+    webbrowser.open(redirect.path.as_uri())
+    return redirect.remove

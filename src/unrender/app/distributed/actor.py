@@ -1,0 +1,101 @@
+"""The process that holds shares of a problem's views. Imports nothing at first that imports Dr.Jit: the variant is chosen before."""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from unrender.app.distributed.cluster import load_ray, prepare_worker
+from unrender.backend import limits
+
+if TYPE_CHECKING:
+    from unrender.app.distributed.messages import Call, Reply
+    from unrender.app.distributed.share import ViewShare
+    from unrender.runs.folder.state import Packed
+
+__all__ = ["Place", "ViewWorker"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a worker runs.
+
+    Attributes:
+        machine: its name.
+        process: its number.
+        free: bytes of memory that it could have if it were alone: of the GPU, or of the machine.
+        gpu: which GPU, "" for none.
+    """
+
+    machine: str
+    process: int
+    free: int
+    gpu: str = ""
+
+
+class ViewWorker:
+    """A Ray actor: shares of a problem's views, one or more.
+
+    Args:
+        variant: of Mitsuba.
+        threads: of the processor.
+    """
+
+    def __init__(self, variant: str, threads: int):
+        self._variant = prepare_worker(variant, threads)
+        self._shares: dict[int, ViewShare] = {}
+
+    def place(self) -> Place:
+        """Where it runs. Its first answer says that it is ready."""
+        gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "") if self._variant.startswith("cuda") else ""
+        free = _free_gpu_memory() if gpu else limits.free_memory()
+        return Place(socket.gethostname(), os.getpid(), free, gpu)
+
+    def alive(self) -> bool:
+        """Answers while the others compute: it has a thread of its own."""
+        return True
+
+    def hold(self, share: int, views: tuple[int, ...], blob: bytes) -> None:
+        """Make a share of the problem, in place of an earlier one. Raises `InputError` where it cannot be made here."""
+        from unrender.app.distributed.share import ViewShare
+        from unrender.app.distributed.transfer import unpacked
+        from unrender.core.errors import InputError
+
+        try:
+            problem = unpacked(blob, load_ray())
+        except InputError as error:
+            raise InputError(f"worker on {socket.gethostname()}: {error}") from error
+        self._shares[share] = ViewShare(problem, views)
+
+    def drop(self, share: int) -> None:
+        """Hold it no more."""
+        self._shares.pop(share, None)
+
+    def run(self, share: int, call: Call, arrays: dict[int, Any]) -> Reply:
+        """See `ViewShare.run`; `arrays` are the call's."""
+        from dataclasses import replace
+
+        return self._shares[share].run(replace(call, arrays=arrays))
+
+    def store(self, share: int, number: int, packed: Packed) -> None:
+        """See `ViewShare.store`."""
+        self._shares[share].store(number, packed)
+
+    def fetch(self, share: int, number: int) -> Packed:
+        """See `ViewShare.fetch`."""
+        return self._shares[share].fetch(number)
+
+
+def _free_gpu_memory() -> int:
+    """Bytes that the visible GPU has left; 0 where that is unknown."""
+    import subprocess
+
+    device = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]
+    words = ["nvidia-smi", f"--id={device}", "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
+    try:
+        told = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
+        return int(told.split()[0]) << 20
+    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
+        return 0

@@ -1,0 +1,20 @@
+"""Worker processes on one machine or many, by Ray: which there are, what each may use, how one gets ready. Ray is imported on `connect`."""
+
+from unrender.app.distributed.cluster.connection import Cluster, connect, load_ray
+from unrender.app.distributed.cluster.tasks import Ended, Executor, InProcess, OnWorkers
+from unrender.app.distributed.cluster.worker import prepare_worker
+from unrender.app.distributed.cluster.workers import Share, Workers, share
+
+__all__ = [
+    "Cluster",
+    "Ended",
+    "Executor",
+    "InProcess",
+    "OnWorkers",
+    "Share",
+    "Workers",
+    "connect",
+    "load_ray",
+    "prepare_worker",
+    "share",
+]

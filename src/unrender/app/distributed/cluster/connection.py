@@ -1,0 +1,207 @@
+"""Starting Ray on this machine, or joining a cluster of it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from unrender.app.distributed.cluster.head import HeadNode, reach
+from unrender.app.distributed.cluster.private import check_private, private_cluster
+from unrender.app.distributed.cluster.trust import check_cluster, check_token, has_token
+from unrender.app.distributed.cluster.workers import Share, Workers, share
+from unrender.backend import limits, variant
+from unrender.core.errors import InputError, UnrenderError
+from unrender.core.text import one_line, reason_of
+
+__all__ = ["Cluster", "connect", "load_ray"]
+
+_SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_USAGE_STATS_PROMPT_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_enable_metrics_collection": "0",
+    "RAY_DISABLE_IMPORT_WARNING": "1",
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    "RAY_IGNORE_UNHANDLED_ERRORS": "1",
+}
+"""No telemetry, no metrics, nothing on standard error that is not an error; the environment's own settings win."""
+_STORE_BYTES = 256 << 20
+_ANSWER_SECONDS = 10.0
+_NAMESPACE = "unrender"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Ray, connected.
+
+    Attributes:
+        ray: the module.
+        variant: that the workers compute with: what `prepare_worker` is to be given.
+        share: how many workers there are to be, and what each may use.
+        address: of the cluster; None for one that was started here.
+        head: its head node.
+    """
+
+    ray: Any
+    variant: str
+    share: Share
+    address: str | None
+    head: HeadNode = field(default_factory=HeadNode)
+
+    @property
+    def resources(self) -> dict[str, float]:
+        """What to ask Ray for, for each worker: `task.options(**cluster.resources)`. CUDA_VISIBLE_DEVICES follows from it."""
+        return {"num_cpus": self.share.cpus, "num_gpus": self.share.gpus}
+
+
+def load_ray() -> Any:
+    """The module `ray`, told to be silent.
+
+    Raises:
+        InputError: it is not installed; one line that says what to install.
+    """
+    for name, value in _SETTINGS.items():
+        os.environ.setdefault(name, value)
+    if has_token() and "ray" not in sys.modules:  # which has read the mode by then, unlike the processes that it starts
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of its own dependencies
+            import ray
+    except ImportError as error:
+        raise InputError(f"workers need Ray ({error}): pip install 'unrender[ray]'") from error
+    _silence(ray)
+    return ray
+
+
+def _silence(ray: Any) -> None:
+    """No paragraphs about workers that died: who began their tasks says so. Ray has no setting for that, so what it lacks is no error."""
+    with contextlib.suppress(Exception):
+        ray._private.worker.print_to_stdstream = lambda *_, **__: None
+
+
+@contextlib.contextmanager
+def connect(
+    workers: Workers, name: str = "auto", store_bytes: int = _STORE_BYTES, most: int | None = None
+) -> Iterator[Cluster]:
+    """Start Ray on this machine, or join a cluster; leave it at the end, and stop what was started here.
+
+    A cluster that is started here lets in nobody but this user. One that was started elsewhere is joined where it looks closed, too.
+    Handlers of SIGTERM and SIGINT stay as they are. A process has one connection at a time.
+
+    Args:
+        workers: how many, and where. Without an address the cluster is the one that the environment variable RAY_ADDRESS names, if set.
+        name: of Mitsuba's variant; "auto" for CUDA where there are GPUs, else LLVM.
+        store_bytes: of shared memory for what workers pass to one another; of a cluster started here.
+        most: workers that there is work for, see `share`.
+
+    Raises:
+        InputError: Ray is not installed, there is no cluster at the address, it is open to other users, it has no GPU though `name` asks
+            for one, or the process is connected already.
+    """
+    ray = load_ray()
+    if ray.is_initialized():
+        raise InputError("workers: this process is connected to Ray already")
+    address = workers.address or os.environ.get("RAY_ADDRESS") or None
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            gpu = name == variant.CUDA or (name == "auto" and variant.gpu_problem() is None)
+            given = stack.enter_context(private_cluster(ray))
+            given |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
+            given |= {} if gpu else {"num_gpus": 0}
+        else:
+            gpu = name == variant.CUDA
+            given = {"address": address}
+            _check_answers(address)
+            if not workers.insecure:
+                check_token(address)
+                if _is_located(address):
+                    check_cluster(ray, address)
+        stack.callback(_leave, ray)
+        _init(ray, address, given)
+        gcs_address = ray.get_runtime_context().gcs_address
+        if address is None:
+            check_private(ray)
+        elif not workers.insecure and not _is_located(address):
+            check_cluster(ray, gcs_address)
+        machines = _machines(ray)
+        if name == "auto" and address is not None:
+            gpu = any(gpus >= 1 for _, gpus in machines)
+        yield Cluster(
+            ray,
+            variant.CUDA if gpu else variant.LLVM,
+            share(machines, workers.count, gpu, most),
+            workers.address or address,
+            HeadNode(gcs_address),
+        )
+
+
+def _init(ray: Any, address: str | None, given: dict[str, Any]) -> None:
+    """Start or join the cluster. Raises `InputError`."""
+    where = "cannot start on this machine" if address is None else f"cannot be reached at {address}"
+    quiet = {"logging_level": logging.ERROR, "log_to_driver": False, "configure_logging": True}
+    with _own_signals():
+        try:
+            ray.init(namespace=_NAMESPACE, **quiet, **given)
+        except Exception as error:  # of many kinds
+            reason = one_line(reason_of(error, 200))
+            raise InputError(f"workers: Ray {where}: {reason}") from error
+
+
+def _machines(ray: Any) -> list[tuple[float, float]]:
+    """(cores, GPUs) of each machine of the cluster."""
+    alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    return [(resources.get("CPU", 0.0), resources.get("GPU", 0.0)) for resources in alive]
+
+
+def _is_located(address: str) -> bool:
+    """Return whether an address is HOST:PORT. RAY_ADDRESS may hold "auto"."""
+    _, colon, port = address.rpartition(":")
+    return bool(colon) and port.isdigit()
+
+
+def _check_answers(address: str) -> None:
+    """Raise `InputError` where nobody listens, which Ray takes two minutes to say."""
+    if not _is_located(address):
+        return
+    try:
+        reach(address, _ANSWER_SECONDS)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"workers: no Ray cluster answers at {address}: {reason}") from error
+
+
+def _leave(ray: Any) -> None:
+    with contextlib.suppress(UnrenderError, Exception):
+        ray.shutdown()
+
+
+@contextlib.contextmanager
+def _own_signals() -> Iterator[None]:
+    """Handlers of signals are afterwards what they were before: Ray sets one of its own for SIGTERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    told = 0
+    try:
+        yield
+    except SystemExit as end:  # what Ray's handler makes of it
+        told = end.code if end.code == signal.SIGTERM else 0
+        if not told:
+            raise
+    finally:
+        for number, handler in before.items():
+            if handler is not None:
+                signal.signal(number, handler)
+    if told:
+        signal.raise_signal(signal.SIGTERM)
+        raise KeyboardInterrupt

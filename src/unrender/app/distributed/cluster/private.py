@@ -1,0 +1,170 @@
+"""A cluster of this machine that no other user can enter: its folder, its token and its network addresses."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from unrender.app.distributed.cluster.access import can_change
+from unrender.core.errors import InputError
+
+__all__ = ["check_private", "private_cluster", "private_folder"]
+
+_PREFIX, _LOCK = "unrender-ray-", "lock"
+_LONGEST = 107 - len("/unrender-ray-12345678/r/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store")
+"""Characters of the folder that holds the cluster's, at most: a socket's path has 107 bytes."""
+_YOUNG = 60.0
+"""Seconds until a folder without a lock counts as left over."""
+_WATCHER = """
+import os, shutil, sys, time
+os.read(0, 1)
+for _ in range(100):
+    shutil.rmtree(sys.argv[1], True)
+    if not os.path.lexists(sys.argv[1]):
+        break
+    time.sleep(0.1)
+"""
+"""A process that removes the folder when its standard input ends, which a killed parent's does, too."""
+_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
+
+
+@contextlib.contextmanager
+def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
+    """Prepare the start of a cluster that only this user's processes can enter.
+
+    The token lives in the environment of these processes, which other users cannot read, and is never written. All services listen on the
+    loopback interface. What Ray writes lies below a folder of mode 0700.
+
+    Args:
+        ray: the module.
+
+    Yields:
+        Arguments of `ray.init`.
+
+    Raises:
+        InputError: no folder is safe, or this version of Ray knows no token.
+    """
+    _clear_token_cache(ray)  # raises before anything is made
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    constants = ray._private.ray_constants
+    networked = constants.ENABLE_RAY_CLUSTER
+    with private_folder() as folder:
+        os.environ.pop("RAY_AUTH_TOKEN_PATH", None)
+        os.environ |= {
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": secrets.token_hex(32),
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # Ray's name for: use the loopback interface
+        }
+        constants.ENABLE_RAY_CLUSTER = False
+        _clear_token_cache(ray)
+        try:
+            yield {"address": "local", "_node_ip_address": "127.0.0.1", "_temp_dir": str(folder / "r")}
+        finally:
+            constants.ENABLE_RAY_CLUSTER = networked
+            for name, value in before.items():
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
+            _clear_token_cache(ray)
+
+
+def check_private(ray: Any) -> None:
+    """Check that a cluster that was just started listens on the loopback interface alone, and asks for the token.
+
+    Raises:
+        InputError: it does not.
+    """
+    address = ray.get_runtime_context().gcs_address
+    asks = ray._raylet.get_authentication_mode() == ray._raylet.AuthenticationMode.TOKEN
+    if not address.startswith(("127.", "[::1]")) or not asks:
+        where = f"listens at {address}" if asks else "asks for no token"
+        raise InputError(
+            f"workers: Ray {ray.__version__} {where}, open to other users; install another version: pip install 'ray>=2.52,<=2.60'"
+        )
+
+
+def _clear_token_cache(ray: Any) -> None:
+    """Let Ray read the environment's token and mode anew."""
+    try:
+        ray._raylet.Config.initialize("")
+        ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
+    except AttributeError as error:
+        raise InputError(
+            f"workers: Ray {ray.__version__} cannot ask for a token; install a newer one: pip install 'ray>=2.52'"
+        ) from error
+
+
+@contextlib.contextmanager
+def private_folder() -> Iterator[Path]:
+    """Make a folder of mode 0700 with a short path, and remove it at the end: also after this process was killed.
+
+    Raises:
+        InputError: there is no place for one that others cannot change.
+    """
+    base = _base()
+    _remove_left_over(base)
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
+    with (folder / _LOCK).open("wb") as lock, _watched(folder):
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _watched(folder: Path) -> Iterator[None]:
+    words = [sys.executable, "-I", "-S", "-c", _WATCHER, str(folder)]
+    with subprocess.Popen(
+        words,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        cwd="/",
+        start_new_session=True,
+    ):
+        yield
+
+
+def _base() -> Path:
+    """Return the folder for the cluster's: the temporary one, or the system's where that has a long name or is open."""
+    reasons = []
+    for name in dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")):
+        place = Path(os.path.realpath(name))
+        if not os.access(place, os.W_OK | os.X_OK):
+            reasons.append(f"{place} cannot be written")
+        elif len(os.fsencode(place)) > _LONGEST:
+            reasons.append(f"{place} has more than {_LONGEST} characters")
+        elif reason := can_change(place, shared=True):
+            reasons.append(reason)
+        else:
+            return place
+    raise InputError(
+        f"workers: no folder is safe for Ray's sockets ({'; '.join(reasons)}); set TMPDIR to a folder of your own with a short path"
+    )
+
+
+def _remove_left_over(base: Path) -> None:
+    """Remove folders of processes that were killed. Their locks are free."""
+    for folder in base.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            status = folder.lstat()
+            if status.st_uid != os.geteuid() or folder.is_symlink():
+                continue
+            if not (folder / _LOCK).exists():
+                if time.time() - status.st_mtime > _YOUNG:
+                    shutil.rmtree(folder, ignore_errors=True)
+                continue
+            with (folder / _LOCK).open("rb") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)

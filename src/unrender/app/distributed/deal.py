@@ -1,0 +1,101 @@
+"""`unrender.deal`: a problem whose views are dealt to workers."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from unrender.app.distributed.assignment import deal as dealt_views
+from unrender.app.distributed.cluster import Workers, connect
+from unrender.app.distributed.executor import DistributedExecutor
+from unrender.app.distributed.ray_hosts import RayHosts
+from unrender.app.distributed.transfer import packed
+from unrender.backend.limits import cores
+from unrender.backend.variant import check_threads
+from unrender.core.errors import InputError
+from unrender.scene.problem import Problem
+
+__all__ = ["deal"]
+
+_log = logging.getLogger("unrender")
+_LEAST_STORE = 256 << 20
+_GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5
+"""Gradients in a reply at most, bytes of a number, and what a store is larger than its contents by."""
+
+
+@contextlib.contextmanager
+def deal(
+    problem: Problem,
+    workers: int | str | Workers = "auto",
+    compress: bool = False,
+    variant: str = "auto",
+    threads: int | None = None,
+    tell: Callable[[str], None] = _log.warning,
+    insecure: bool = False,
+) -> Iterator[Problem]:
+    """The problem, its views dealt to workers: within the context, `optimize` and `resume` have them compute its gradients.
+
+        with unrender.deal(problem, workers=4) as dealt:
+            result = unrender.optimize(dealt, "rcv", steps=300)
+
+    Each worker is a process by Ray, with a GPU or some of the processor's threads, and keeps its views: their references, and what image
+    estimators remember of them. In each step it is sent the parameters that changed, and answers with gradient and loss, which are summed
+    in a fixed order in double precision. Random numbers do not depend on the number of workers, so results are those of one process up to
+    rounding, and to the bit for equal numbers of workers (with one thread each; with more, threads add to a gradient in the order
+    they finish). Optimizer, checkpoints and history stay in this process; a run folder can be resumed with any number of workers or none.
+
+    A worker that dies or answers no more costs no step: others take its views over, repeat its steps since what it remembered was last
+    collected, and the run goes on to the same result.
+
+    Args:
+        problem: with at least one view; there are no more workers than views.
+        workers: how many; "auto", one for each GPU or core; "HOST:PORT" of a Ray cluster, or "NUMBER@HOST:PORT".
+        compress: whether parameters are sent as float16 differences from what the workers have, and gradients come back in single, not
+            double, precision: half the bytes, and gradients at values that differ from the run's by up to 2⁻¹¹ of the last step.
+            Checkpoints of such a run can be resumed by such a run alone.
+        variant: Mitsuba's, of the workers.
+        threads: of the processor for each worker; None for its share.
+        tell: is told of workers that are lost or lag, a line each.
+        insecure: whether to join a cluster that other users can enter.
+
+    Raises:
+        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
+            has too few views, or does not fit a worker's memory; workers are lost again and again.
+    """
+    parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
+    parsed = replace(parsed, insecure=parsed.insecure or insecure)
+    views = len(problem.views)
+    if parsed.count is not None and parsed.count > 1 and views == 1:
+        raise InputError(
+            f"workers: {problem.name} has one view, which cannot be dealt to {parsed.count}; use one process"
+        )
+    if parsed.count is not None and parsed.count > views:
+        tell(f"workers: {views} for {views} views, in place of {parsed.count}")
+        parsed = replace(parsed, count=views)
+    with connect(parsed, variant, store_bytes=_store_bytes(problem, parsed), most=views) as cluster:
+        if threads is not None and cluster.address is None:
+            check_threads(threads)
+        resolutions = problem.renderer.resolutions()
+        pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
+        shares = dealt_views(pixels, cluster.share.count)
+        blobs = tuple(packed(problem, share, cluster.ray) for share in shares)
+        hosts = RayHosts(cluster, shares, blobs, threads, tell)
+        try:
+            yield problem.executed_by(DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
+        finally:
+            hosts.close()
+
+
+def _store_bytes(problem: Problem, workers: Workers) -> int:
+    """Of a cluster that is started here: room for the replies of all workers at once, within half of what shared memory has left."""
+    numbers = sum(math.prod(shape) for shape in problem.shapes().values())
+    count = workers.count or min(len(problem.views), cores())
+    try:
+        free = shutil.disk_usage("/dev/shm").free // 2
+    except OSError:
+        return _LEAST_STORE
+    return max(_LEAST_STORE, min(int(_SLACK * _GRADIENTS * _DOUBLE * numbers * (count + 1)), free))

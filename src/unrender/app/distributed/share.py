@@ -1,0 +1,176 @@
+"""A share of a problem's views where it lives: references, what image estimators remember of them, and the gradients of both."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from unrender.app.distributed.assignment import total
+from unrender.app.distributed.messages import Batch, Call, Difference, Pair, Pilot, References, Reply
+from unrender.core import arrays, trees
+from unrender.core.trees import Tree
+from unrender.estimators.sample_groups import TREES, GradientRequest, estimate_frame, leave_one_out_groups
+from unrender.images.base import PairRequest
+from unrender.images.recursive_control_variate import RecursiveControlVariateState
+from unrender.pixels.base import MiniBatch
+from unrender.pixels.pixel_statistics import PilotRequest
+from unrender.runs.folder.state import Packed, pack, unpack
+from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView
+from unrender.scene.problem import Problem
+
+__all__ = ["ViewShare"]
+
+
+class ViewShare:
+    """Some views of a problem, as a worker holds them. Mutable: it keeps what the driver numbers and has not told it to drop.
+
+    Equal calls on equal arrays and memories give equal replies, whichever worker holds the share.
+
+    Args:
+        problem: of these views alone.
+        views: their indices in the whole problem, by which their random numbers are drawn.
+    """
+
+    def __init__(self, problem: Problem, views: tuple[int, ...]):
+        self.problem, self.views = problem, views
+        self._host: dict[int, np.ndarray] = {}
+        self._arrays: dict[int, Any] = {}
+        self._memories: dict[int, tuple[Any, ...]] = {}
+        self._snapshot: tuple[int, Any] | None = None
+
+    def run(self, call: Call) -> Reply:
+        """The gradient of the share's views, and what is remembered after it."""
+        started = time.perf_counter()
+        self._receive(call)
+        if call.pilot is not None:
+            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, paths=self._pilot(call, call.pilot))
+        request = self._request(call)
+        if call.replay:
+            self._remember(call, self._replayed(call, request))
+            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started)
+        frames: list[tuple[int, Frame]] = self._whole()
+        if call.batch is not None:
+            sample = self._sample(call.batch)
+            frames = [(-1, PixelBatch(self.problem, sample))]
+            request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
+        parts = [estimate_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
+        kept = tuple(part.kept for part in parts)
+        found = {name: [getattr(part, name) for part in parts] for name in TREES}
+        arrays.evaluate(kept, found, [part.loss for part in parts])
+        if call.batch is None:
+            self._remember(call, kept)
+        sums = {name: total(map(trees.numpy, parts)) for name, parts in found.items()}
+        if call.single:
+            sums = {name: {key: value.astype(np.float32) for key, value in tree.items()} for name, tree in sums.items()}
+        shown = [(index, part) for (index, _), part in zip(frames, parts, strict=True) if call.pictures and index >= 0]
+        info: dict[str, dict[int, np.ndarray]] = {}
+        for index, part in shown:
+            for name, value in part.info.items():
+                info.setdefault(name, {})[index] = arrays.numpy(value)
+        return Reply(
+            sums["gradient"],
+            sums["previous"],
+            sums["fresh"],
+            {index: arrays.number(part.loss) for (index, _), part in zip(frames, parts, strict=True)},
+            sum(part.samples for part in parts),
+            {index: arrays.numpy(part.image) for index, part in shown},
+            info,
+            time.perf_counter() - started,
+            draws=parts[0].draws if call.batch is not None else None,
+            paired=sums["paired"],
+        )
+
+    def store(self, number: int, packed: Packed) -> None:
+        """Remember what another worker did."""
+        self._memories[number] = unpack(packed)
+
+    def fetch(self, number: int) -> Packed:
+        """What is remembered, to be stored elsewhere."""
+        return pack(self._memories[number])
+
+    # ------------------------------------------------------------------ the parts of a call
+
+    def _receive(self, call: Call) -> None:
+        for number, value in call.arrays.items():
+            found = value.applied(self._host[value.base]) if isinstance(value, Difference) else value
+            self._host[number], self._arrays[number] = found, self.problem.renderer.array(found)
+        for number in call.drop_arrays:
+            self._host.pop(number, None)
+            self._arrays.pop(number, None)
+        for number in call.drop_memories:
+            self._memories.pop(number, None)
+
+    def _tree(self, references: References) -> Tree:
+        return {key: self._arrays[number] for key, number in references.items()}
+
+    def _request(self, call: Call) -> GradientRequest:
+        parameters = self._tree(call.parameters)
+        state = call.image.init(self.problem, parameters)
+        if call.state is not None and call.state.memory is not None and call.state.parameters is not None:
+            views = self._memories[call.state.memory]
+            state = RecursiveControlVariateState(self._tree(call.state.parameters), views, None, call.state.step)
+            if call.state.snapshot and call.batch is not None:
+                if self._snapshot is None or self._snapshot[0] != call.state.memory:
+                    self._snapshot = call.state.memory, call.image.prepare(self.problem, state).snapshot
+                state = replace(state, snapshot=self._snapshot[1])
+        elif call.state is not None:
+            state = RecursiveControlVariateState(step=call.state.step)
+        pair = call.pair and self._pair_request(call.pair)
+        return GradientRequest(
+            parameters,
+            call.image,
+            state,
+            call.spp,
+            call.key,
+            call.adjoint_spp,
+            pair,
+            tolerance=call.tolerance,
+            fresh=call.fresh,
+        )
+
+    def _pair_request(self, pair: Pair) -> PairRequest:
+        return PairRequest(self._tree(pair.previous), pair.space, pair.step, difference_spp=pair.difference_spp)
+
+    def _whole(self) -> list[tuple[int, Frame]]:
+        return [(index, WholeView(self.problem, local)) for local, index in enumerate(self.views)]
+
+    def _sample(self, batch: Batch) -> PixelSample:
+        like = self.problem.renderer.array(batch.weights[:, None])
+
+        def integers(values: np.ndarray) -> Any:
+            return arrays.like_integers(values, like)
+
+        return PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
+
+    def _pilot(self, call: Call, asked: Pilot) -> tuple[np.ndarray, ...]:
+        assert call.batch is not None
+        references = tuple(self.problem.renderer.array(reference) for reference in asked.references)
+        sample, tangents = self._sample(call.batch), self._tree(call.tangents)
+        request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
+        return tuple(request.carry_out(self.problem))
+
+    def _replayed(self, call: Call, request: GradientRequest) -> tuple[Any, ...]:
+        """What a step of whole views leaves, without its gradient."""
+        groups = leave_one_out_groups(call.spp, call.adjoint_spp)
+        kept = tuple(
+            call.image.estimate(
+                self.problem,
+                request.parameters,
+                request.state,
+                frame,
+                call.spp,
+                groups,
+                call.key.fold(index).fold(0),
+                request.pair_request,
+            )[1]
+            for index, frame in self._whole()
+        )
+        arrays.evaluate(kept)
+        return kept
+
+    def _remember(self, call: Call, kept: tuple[Any, ...]) -> None:
+        if call.result is not None:
+            self._memories[call.result] = kept

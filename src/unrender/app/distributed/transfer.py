@@ -1,0 +1,124 @@
+"""A problem on its way to workers: each makes it again with its own views alone, and reads their references itself."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.rendering.photographs import scene_renderer, sensors_with_rows, with_photographs
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.validation import open_renderer
+from unrender.scene.view import View
+
+__all__ = ["packed", "unpacked"]
+
+_Given = TypeVar("_Given", View, Parameter)
+
+
+class _Parts(NamedTuple):
+    """The arguments of `Problem`, and the sensors that have exposures or corrected poses; None where these are no parameters."""
+
+    scene: Any
+    parameters: Any
+    views: Any
+    loss: Any
+    max_depth: int
+    name: str
+    sensors: tuple[int, ...] | None
+
+
+def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
+    """What `unpacked` makes the problem of these views of: references that were given as files go as names.
+
+    Args:
+        problem: the whole one.
+        views: indices of those that are to go.
+        ray: the module.
+
+    Raises:
+        InputError: it was made of what cannot be sent: a loaded scene, or a function or object tied to this process.
+    """
+    given = [_located(problem.given_views[view], "reference", "mask") for view in views]
+    parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
+    sensors = sensors_with_rows(problem.renderer)
+    parts = _Parts(_scene(problem), parameters, given, problem.loss, problem.max_depth, problem.name, sensors)
+    buffer = io.BytesIO()
+    try:
+        _pickler(ray)(buffer).dump(parts)
+    except (TypeError, ValueError, AttributeError, RecursionError, OSError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"workers: {problem.name} cannot be sent to them ({reason}); take a problem file with a scene in XML, or a "
+            "scene as a dictionary of plain values"
+        ) from error
+    except Exception as error:  # pickle.PicklingError, of cloudpickle's own kinds
+        raise InputError(f"workers: {problem.name} cannot be sent to them: {str(error)[:200]}") from error
+    return buffer.getvalue()
+
+
+def unpacked(blob: bytes, ray: Any) -> Problem:
+    """The problem again. The variant must be in use. Raises `InputError` where a file is missing here."""
+    parts: _Parts = ray.cloudpickle.loads(blob)
+    scene = parts.scene
+    if parts.sensors is not None:
+        keys = [parameter.key for parameter in parts.parameters]
+        scene = with_photographs(open_renderer(scene, parts.max_depth, keys), keys, parts.sensors)
+    return Problem(scene, parts.parameters, parts.views, parts.loss, parts.max_depth, name=parts.name)
+
+
+def _scene(problem: Problem) -> Any:
+    if "scene" in problem.origin:
+        return problem.origin["scene"]
+    renderer = scene_renderer(problem.renderer)
+    pair = getattr(renderer, "pair", None)
+    description = getattr(pair, "description", None)
+    if description is None:
+        return renderer  # one that is no Mitsuba scene
+    if getattr(pair, "single", False):
+        raise InputError(
+            "workers: a loaded scene cannot be sent to them; give its XML file, its dictionary, or a function that returns one"
+        )
+    return str(Path(description).resolve()) if isinstance(description, (str, Path)) else description
+
+
+def _located(given: _Given, *names: str) -> _Given:
+    """The same, its files named in full: workers have folders of their own."""
+    found = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
+    return replace(given, **{name: Path(value).absolute() for name, value in found.items()})
+
+
+def _pickler(ray: Any) -> Any:
+    """Pickles functions by value, and the objects of Mitsuba's that dictionaries hold by what they are made of."""
+
+    class Pickler(ray.cloudpickle.CloudPickler):
+        def reducer_override(self, obj: Any) -> Any:
+            kind = type(obj)
+            if kind.__module__.partition(".")[0] == "mitsuba":
+                if kind.__name__.startswith("ScalarAffineTransform") or kind.__name__.startswith("ScalarProjective"):
+                    return _transform, (kind.__name__, np.array(obj.matrix, np.float64))
+                if kind.__name__ == "Bitmap":
+                    return _bitmap, (np.array(obj), bool(obj.srgb_gamma()))
+            return super().reducer_override(obj)
+
+    return Pickler
+
+
+def _transform(kind: str, matrix: np.ndarray) -> Any:
+    import mitsuba as mi
+
+    return getattr(mi, kind)(matrix)
+
+
+def _bitmap(values: np.ndarray, gamma: bool) -> Any:
+    import mitsuba as mi
+
+    made = mi.Bitmap(values)
+    made.set_srgb_gamma(gamma)
+    return made

@@ -1,0 +1,303 @@
+"""A run's result against photographs that were held out."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from unrender.app.evaluation import held_out as held_out_photographs
+from unrender.app.evaluation import pictures, scenes, sheets
+from unrender.app.evaluation.measures import Albedo, Measures, best_factors, compare_albedo, mean, measure
+from unrender.app.evaluation.pictures import mask_of, names_of
+from unrender.app.exporting import ready_made
+from unrender.app.exporting.asset import read_environment
+from unrender.app.stages import run_folders, stages_file
+from unrender.backend import variant
+from unrender.core import arrays, phases
+from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
+from unrender.io import files
+from unrender.losses import lpips
+from unrender.rendering.camera_poses import POSES
+from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
+from unrender.rendering.response import RESPONSE, curve
+from unrender.rendering.vignetting import VIGNETTING, falloff
+from unrender.runs import reopen
+from unrender.runs.folder import reader as folders
+from unrender.runs.folder import schema
+from unrender.runs.folder.reader import RunFolder
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.render import render
+
+__all__ = ["RECORD", "Judgement", "judge"]
+
+RECORD, LIGHT = "judge.json", "environment"
+_OWN = {RECORD, pictures.SHEET, pictures.FOLDER, f"{LIGHT}.png", f"{LIGHT}.exr"}
+_ALBEDO = ("base_color", "reflectance")
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What was found.
+
+    Attributes:
+        folder: with judge.json, sheet.png, pictures/ and, where the scene has light from all around, environment.png and environment.exr.
+        names: of the photographs.
+        measures: of each; none under another light, which the photographs do not show.
+        albedo: where the true base colour is known.
+        notices: one line for each thing that its user should know of.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    measures: tuple[Measures, ...]
+    albedo: Albedo | None
+    notices: tuple[str, ...]
+
+    @property
+    def mean(self) -> dict[str, float | None]:
+        """Over the photographs: psnr, ssim, lpips."""
+        return mean(list(self.measures)) if self.measures else {}
+
+
+@exclusive("judge")
+def judge(
+    run: str | Path,
+    held_out: str | Path | None = None,
+    environment: str | Path | None = None,
+    spp: int = 64,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> Judgement:
+    """Render a run's result for photographs that it was not made from, and measure how near it is.
+
+    Args:
+        run: a run folder.
+        held_out: a problem file whose views are the photographs; None for held-out.toml beside the run's own problem file, or
+            that of its stages.
+        environment: a picture of light from all around, to render the result under. Nothing is measured then, unless `held_out` is given:
+            its photographs must have been taken under this light, which is then in the axes of the scene's world.
+        spp: samples per pixel.
+        out: the new folder; None for the folder judge in the run folder.
+        overwrite: whether an earlier judgement may be replaced.
+
+    Raises:
+        InputError: no result, no held-out problem, a scene without the run's parameters, or `out` cannot be written; nothing is left then.
+    """
+    variant.ensure()
+    if not isinstance(spp, int) or spp < 1:
+        raise InputError(f"judge: spp must be a whole number of at least 1, got {spp!r}")
+    place = Path(run) / "judge" if out is None else Path(out)
+    files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
+    light = None if environment is None else scenes.read_light(Path(environment))
+    problem, found = reopen.problem_of(run), folders.read(run)
+    given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
+    values, truth = _found(Path(run), problem, found)
+    of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
+    judged, values, notices = _problem(problem, given, values, found)
+    measured = light is None or held_out is not None
+    exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
+    notices += _unknown_of_photographs(problem) if measured else []
+
+    def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
+        with tempfile.TemporaryDirectory() as scratch:
+            images, relit, albedo = _render(judged, values, truth, light, not measured, spp, Path(scratch), folder)
+        if measured and light is not None:
+            images, relit = relit, []
+        if measured:
+            images = _photographed(judged, images, of_camera, exposed)
+        measures = _measure(judged, images) if measured else []
+        pictures.write(folder, judged, images, relit, measures)
+        record = _record(judged, measures, albedo, given, environment, spp, notices)
+        (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return measures, albedo
+
+    try:
+        measures, albedo = files.write_folder(place, fill)
+    except OSError as error:
+        raise InputError(f"judge: {place}: {error.strerror or error}") from error
+    if measured and not lpips.available():
+        notices.append(lpips.MISSING)
+    if not measured:
+        notices.append("nothing is measured: the photographs show another light; --held-out names ones that show this")
+    return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
+
+
+def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """What a run found, and the truth where it is known. Of a stage, with what it took over from those before it, as part of its scene."""
+    values, truth = problem.full(found.parameters), dict(found.truth)
+    staged = run_folders.stage_of(run)
+    if staged is None:
+        return values, truth
+    stages, last = staged
+    earlier = [key for stage in stages.stages[:last] for key in stage.unknowns if key not in values]
+    there = problem.renderer.parameters()
+    for key in earlier:
+        if key not in there:
+            raise InputError(f"{run}: the scene of this stage has no {key}, which an earlier one found")
+    for index in range(last):
+        folder = stages_file.folder_of(stages, index, run.resolve().parent)
+        if (folder / schema.RECORD).is_file():
+            truth = {key: value for key, value in folders.read(folder).truth.items() if key in earlier} | truth
+    own = problem.renderer.values(list(dict.fromkeys(earlier)))
+    return {key: arrays.numpy(value) for key, value in own.items()} | values, truth
+
+
+def _problem(
+    problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
+) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
+    """What was found with the held-out views, and its values."""
+    other = Problem.from_file(held_out)
+    known = set(other.renderer.parameters()).difference(OF_PHOTOGRAPHS)
+    kept = [key for key in parameters if key in known]
+    if not kept:
+        raise InputError(f"{held_out}: its scene has none of the run's parameters, such as {problem.parameters[0].key}")
+    left_out = [key for key in parameters if key not in known and key not in OF_PHOTOGRAPHS]
+    notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
+    bounds = {parameter.key: parameter.bounds for parameter in problem.parameters}
+    plain = [Parameter(key, bounds=bounds.get(key)) for key in kept]
+    judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
+    if not isinstance(judged.renderer, MitsubaRenderer):
+        raise InputError(f"{held_out}: it is not rendered by Mitsuba")
+    judged = reopen.with_meshes(judged, run)
+    values = {key: parameters[key] for key in kept}
+    for key, shape in judged.shapes().items():
+        if shape != np.shape(values[key]):
+            raise InputError(f"{held_out}: {key} has shape {shape}, the run's {np.shape(values[key])}")
+    return judged, values, notices
+
+
+def _render(
+    problem: Problem,
+    values: dict[str, np.ndarray],
+    truth: Mapping[str, np.ndarray],
+    light: np.ndarray | None,
+    upright: bool,
+    spp: int,
+    scratch: Path,
+    folder: Path,
+) -> tuple[list[np.ndarray], list[np.ndarray], Albedo | None]:
+    """Pictures of all views, those under another light, and how near the base colour is; the light's pictures are written.
+
+    `upright`: whether that light is turned so that its sky is where the cameras' up axes point.
+    """
+    with phases.phase("pictures") as advance:
+        images = []
+        for view in range(len(problem.views)):
+            images.append(render(problem, values, view, spp))
+            advance((view + 1) / len(problem.views))
+    renderer: Any = problem.renderer
+    if renderer.pair.emissive:
+        if light is not None:
+            raise InputError(f"{problem.name}: an emissive medium cannot be lit otherwise")
+        return images, [], None
+    path = scenes.export_scene(problem, values, scratch / "scene")
+    own, _ = read_environment(scenes.load_scene(path), [])
+    if own is not None:
+        (folder / f"{LIGHT}.png").write_bytes(sheets.environment_picture(own))
+        ready_made.write_bitmap(ready_made.as_bitmap(own), folder / f"{LIGHT}.exr")
+    relit = []
+    if light is not None:
+        up = scenes.turned_up(scenes.up_axis(scenes.sensors(problem))) if upright else None
+        scene = scenes.load_scene(path, light, up)
+        sensors = scene.sensors()
+        with phases.phase("other light") as advance:
+            for index, view in enumerate(problem.views):
+                relit.append(scenes.render(scene, sensors[view.sensor], spp, problem.max_depth)[..., :3])
+                advance((index + 1) / len(problem.views))
+    return images, relit, _albedo(problem, values, truth, path, scratch)
+
+
+def _albedo(
+    problem: Problem, values: dict[str, np.ndarray], truth: Mapping[str, np.ndarray], path: Path, scratch: Path
+) -> Albedo | None:
+    known = {key: value for key, value in truth.items() if key in values and any(name in key for name in _ALBEDO)}
+    if not known:
+        return None
+    other = scenes.export_scene(problem, values | known, scratch / "truth")
+    sensors, pixels = scenes.sensors(problem), []
+    integrator = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
+    for file in (path, other):
+        scene = scenes.load_scene(file)
+        images = [
+            np.array(mi.render(scene, sensor=sensors[view.sensor], integrator=integrator, spp=16))[..., -3:][mask > 0]
+            for view, mask in zip(problem.views, map(mask_of, problem.views), strict=True)
+        ]
+        pixels.append(np.concatenate(images))
+    return compare_albedo(*pixels)
+
+
+def _unknown_of_photographs(problem: Problem) -> list[str]:
+    """A line for each unknown that photographs held out have values of their own of."""
+    moved = {parameter.key for parameter in problem.parameters}
+    lines = {
+        EXPOSURE: "exposures of photographs were unknown: each rendering is measured after its best factors",
+        POSES: "poses of photographs were corrected; those that are held out have the ones that they were given",
+    }
+    return [line for key, line in lines.items() if key in moved]
+
+
+def _photographed(
+    problem: Problem, images: list[np.ndarray], of_camera: Mapping[str, np.ndarray], exposed: bool
+) -> list[np.ndarray]:
+    """Renderings as the photographs' lens, exposures and response would have them."""
+    if VIGNETTING in of_camera:
+        images = [image * falloff(of_camera[VIGNETTING], *image.shape[:2]) for image in images]
+    if exposed:
+        images = [_exposed(image, view) for image, view in zip(images, problem.views, strict=True)]
+    if RESPONSE in of_camera:
+        contrast, brightness = of_camera[RESPONSE].T
+        images = [curve(contrast, brightness, image).values for image in images]
+    return images
+
+
+def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
+    """A rendering times the factors of its channels that bring it nearest to the photograph inside the mask."""
+    mask = mask_of(view) > 0
+    return image * best_factors(image[mask], np.asarray(view.reference)[mask])
+
+
+def _measure(problem: Problem, images: list[np.ndarray]) -> list[Measures]:
+    found = []
+    for name, view, image in zip(names_of(problem), problem.views, images, strict=True):
+        try:
+            found.append(measure(image, np.asarray(view.reference), mask_of(view)))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    return found
+
+
+def _record(
+    problem: Problem,
+    measures: list[Measures],
+    albedo: Albedo | None,
+    held_out: Path,
+    environment: str | Path | None,
+    spp: int,
+    notices: list[str],
+) -> dict[str, Any]:
+    def plain(found: dict[str, Any]) -> dict[str, Any]:
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in found.items()}
+
+    return {
+        "held_out": str(held_out),
+        "environment": None if environment is None else str(environment),
+        "spp": spp,
+        "photographs": [
+            {"name": name, **plain(asdict(each))} for name, each in zip(names_of(problem), measures, strict=False)
+        ],
+        "mean": plain(mean(measures)) if measures else None,
+        "albedo": None if albedo is None else asdict(albedo),
+        "notices": notices,
+    }

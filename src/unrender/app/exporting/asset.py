@@ -1,0 +1,202 @@
+"""What other programs can take of a scene: meshes with their materials, the light around them, the cameras.
+
+Texture coordinates are Mitsuba's: (0, 0) is the upper left corner of a picture, v grows downwards, as in glTF. The world is Mitsuba's,
+right-handed; nothing is turned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from unrender.app.exporting.materials import Material, check_size, read_material
+from unrender.core.errors import InputError
+from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.mitsuba.description import load
+
+__all__ = ["Asset", "Camera", "Part", "read", "read_environment"]
+
+_CONSTANT_SIZE = (16, 32)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A mesh and its material.
+
+    Attributes:
+        name: of the shape; no two parts share one.
+        vertices: (V, 3) float32, in the world.
+        faces: (F, 3) uint32, counter-clockwise seen from the side that the normals point to.
+        normals: (V, 3) float32, unit; None where faces are flat.
+        uv: (V, 2) float32; None where there are none.
+        material: see there.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None
+    uv: np.ndarray | None
+    material: Material
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera.
+
+    Attributes:
+        name: of the sensor.
+        to_world: (4, 4), axes left, up, forwards, which are Mitsuba's.
+        x_fov: horizontal angle of view in degrees.
+        offset: `principal_point_offset_x` and `_y`: 0.5 - cx / width, 0.5 - cy / height.
+        size: width and height in pixels.
+        clip: distances of the near and far clipping planes.
+    """
+
+    name: str
+    to_world: np.ndarray
+    x_fov: float
+    offset: tuple[float, float]
+    size: tuple[int, int]
+    clip: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Asset:
+    """See the module.
+
+    Attributes:
+        parts: at least one.
+        environment: (H, W, 3) float32 radiance as `mitsuba.Emitter` envmap has it in a file; None where there is none.
+        environment_to_world: (3, 3), from the map's axes to the world's.
+        cameras: of the scene, in its order.
+        notices: one line for each thing that is not carried over.
+    """
+
+    parts: tuple[Part, ...]
+    environment: np.ndarray | None
+    environment_to_world: np.ndarray
+    cameras: tuple[Camera, ...]
+    notices: tuple[str, ...]
+
+
+def read(path: Path) -> Asset:
+    """The asset of a scene file.
+
+    Raises:
+        InputError: no mesh is in it, a material has maps but its mesh no texture coordinates, or a map is too large.
+    """
+    scene: Any = load(path)
+    notices: list[str] = []
+    parts = [part for shape in scene.shapes() if (part := _part(shape, notices)) is not None]
+    if not parts:
+        raise InputError("asset: the scene has no mesh that could be exported" + "".join(f"; {n}" for n in notices[:3]))
+    environment, turned = read_environment(scene, notices)
+    cameras = [camera for sensor in scene.sensors() if (camera := _camera(sensor, notices)) is not None]
+    return Asset(_with_different_names(parts), environment, turned, tuple(cameras), tuple(notices))
+
+
+def _part(shape: Any, notices: list[str]) -> Part | None:
+    name = shape.id()
+    if not isinstance(shape, mi.Mesh):
+        notices.append(f"{name}: a {shape.class_name()} is not a mesh and is left out")
+        return None
+    if shape.is_emitter():
+        notices.append(f"{name}: its light is not carried over")
+    vertices, faces, normals, uv = _geometry(shape)
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise InputError(f"asset: {name} has no faces, or vertices that are not finite")
+    material, notes = read_material(shape.bsdf())
+    notices += [f"{name}: {note}" for note in notes]
+    if material.textured and uv is None:
+        raise InputError(f"asset: {name} has maps but no texture coordinates; unwrap its mesh first")
+    if uv is not None and material.to_uv is not None:
+        uv = (uv @ material.to_uv[:2, :2].T + material.to_uv[:2, 2]).astype(np.float32)
+    if normals is not None:  # a mirrored to_world turns the winding, but not the normals
+        corners = vertices[faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        if np.sum(across * normals[faces].sum(1)) < 0:
+            faces = np.ascontiguousarray(faces[:, ::-1])
+    return Part(name, vertices, faces, normals, uv, replace(material, to_uv=None))
+
+
+def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Vertices, faces, normals, texture coordinates."""
+    found: Any = mi.traverse(shape)
+    if "vertex_positions" not in found:  # a rectangle, whose mesh is made when it is rendered
+        corners = np.array([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]])
+        vertices = corners @ np.array(found["to_world"].matrix, float).reshape(4, 4).T
+        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+        return vertices[:, :3].astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.uint32), None, uv
+    vertices = np.array(found["vertex_positions"], np.float32).reshape(-1, 3)
+    faces = np.array(found["faces"], np.uint32).reshape(-1, 3)
+    normals = np.array(found["vertex_normals"], np.float32).reshape(-1, 3) if shape.has_vertex_normals() else None
+    if normals is not None:
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    uv = np.array(found["vertex_texcoords"], np.float32).reshape(-1, 2) if shape.has_vertex_texcoords() else None
+    return vertices, faces, None if shape.has_face_normals() else normals, uv
+
+
+def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
+    """The light all around a live scene, as in `Asset`; adds a line for each light that is none. Raises `InputError` where too large.
+
+    That of a turntable is as the first camera had it.
+    """
+    found, turned = None, np.eye(3)
+    for emitter in scene.emitters():
+        before = np.eye(3)
+        if turntable_light.is_turntable(emitter):
+            notices.append(f"{emitter.id() or 'light'}: a turntable's, as it stood before the first camera")
+            before, emitter = turntable_light.turns(emitter)[0], emitter.map
+        values: Any = mi.traverse(emitter)
+        if emitter.class_name() == "EnvironmentMapEmitter":
+            pixels = np.array(values["data"])[:, 1:-1, :3]  # without the columns that Mitsuba repeats
+            check_size("environment map", pixels)
+            found = np.ascontiguousarray(pixels * float(np.array(values["scale"]).ravel()[0]), np.float32)
+            turned = before @ np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+        elif emitter.class_name() == "ConstantBackgroundEmitter" and "radiance.value" in values:
+            radiance = np.broadcast_to(np.array(values["radiance.value"], np.float32).ravel(), (3,))
+            found = np.broadcast_to(radiance, (*_CONSTANT_SIZE, 3)).copy()
+        elif emitter.class_name() != "AreaLight":  # of which its shape tells
+            notices.append(f"{emitter.id() or 'light'}: a {emitter.class_name()} is not carried over")
+    return found, turned
+
+
+def _camera(sensor: Any, notices: list[str]) -> Camera | None:
+    values: Any = mi.traverse(sensor)
+    if "x_fov" not in values:
+        notices.append(f"{sensor.id()}: a {sensor.class_name()} is not carried over")
+        return None
+    if sensor.class_name() != "PerspectiveCamera":
+        notices.append(f"{sensor.id()}: a {sensor.class_name()} becomes a pinhole camera")
+    number = {name: float(np.array(values[name]).ravel()[0]) for name in _NUMBERS if name in values}
+    width, height = (int(x) for x in np.array(values["film.size"]))
+    return Camera(
+        sensor.id(),
+        np.array(values["to_world"].matrix, float).reshape(4, 4),
+        number["x_fov"],
+        (number.get("principal_point_offset_x", 0.0), number.get("principal_point_offset_y", 0.0)),
+        (width, height),
+        (number.get("near_clip", 0.01), number.get("far_clip", 1e4)),
+    )
+
+
+_NUMBERS = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip")
+
+
+def _with_different_names(parts: Sequence[Part]) -> tuple[Part, ...]:
+    from unrender.app.exporting.ready_made import file_name
+
+    taken: set[str] = set()
+    found = []
+    for index, part in enumerate(parts):
+        name = file_name(part.name)
+        name = f"{name}-{index}" if name in taken or not part.name else name
+        taken.add(name)
+        found.append(replace(part, name=name))
+    return tuple(found)

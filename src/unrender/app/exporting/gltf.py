@@ -1,0 +1,144 @@
+"""glTF 2.0 binary: one file with meshes, materials and maps.
+
+Khronos Group, "glTF 2.0 specification". Texture coordinates and winding are Mitsuba's own, +Y is up, roughness is perceptual
+(α = roughness²). Base colour is sRGB; roughness and metallic are the green and blue channels of one map.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unrender.app.exporting import textures
+from unrender.app.exporting.asset import Asset, Part
+from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    import pygltflib
+
+__all__ = ["check_installed", "glb"]
+
+_FLOAT, _UNSIGNED = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963
+_LINEAR, _MIPMAPS, _CLAMP, _REPEAT = 9729, 9987, 33071, 10497
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+_USUAL_IOR = 1.5
+_ROUNDING = 1e-4
+
+
+def check_installed() -> None:
+    """Raise `InputError` where the package that writes glTF is missing."""
+    if importlib.util.find_spec("pygltflib") is None:
+        raise InputError("--format glb needs pygltflib: pip install 'unrender[capture]'")
+
+
+def glb(asset: Asset) -> bytes:
+    """The parts of an asset as a .glb file; light and cameras are not in it. Raises `InputError` where pygltflib is missing."""
+    check_installed()
+    import pygltflib
+
+    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="unrender")))
+    for part in asset.parts:
+        writer.add(part)
+    return writer.finish()
+
+
+class _Writer:
+    """Collects what goes into the binary part, and refers to it."""
+
+    def __init__(self, gltf: pygltflib.GLTF2):
+        self._gltf: Any = gltf
+        self._blob = bytearray()
+
+    def add(self, part: Part) -> None:
+        """A node, its mesh and its material."""
+        import pygltflib as kit
+
+        attributes = kit.Attributes(POSITION=self._array(part.vertices, _FLOAT, _VERTICES, bounds=True))
+        if part.normals is not None:
+            attributes.NORMAL = self._array(part.normals, _FLOAT, _VERTICES)
+        if part.uv is not None:
+            attributes.TEXCOORD_0 = self._array(part.uv, _FLOAT, _VERTICES)
+        indices = self._array(part.faces.reshape(-1, 1), _UNSIGNED, _INDICES)
+        primitive = kit.Primitive(attributes=attributes, indices=indices, material=self._material(part))
+        self._gltf.meshes.append(kit.Mesh(name=part.name, primitives=[primitive]))
+        self._gltf.nodes.append(kit.Node(name=part.name, mesh=len(self._gltf.meshes) - 1))
+
+    def finish(self) -> bytes:
+        """The file."""
+        import pygltflib as kit
+
+        self._gltf.scenes = [kit.Scene(nodes=list(range(len(self._gltf.nodes))))]
+        self._gltf.scene = 0
+        self._gltf.buffers = [kit.Buffer(byteLength=len(self._blob))]
+        self._gltf.set_binary_blob(bytes(self._blob))
+        return b"".join(self._gltf.save_to_bytes())
+
+    def _view(self, data: bytes, target: int | None = None) -> int:
+        import pygltflib as kit
+
+        self._blob += b"\0" * (-len(self._blob) % 4)
+        view = kit.BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
+        self._blob += data
+        self._gltf.bufferViews.append(view)
+        return len(self._gltf.bufferViews) - 1
+
+    def _array(self, values: np.ndarray, component: int, target: int, bounds: bool = False) -> int:
+        import pygltflib as kit
+
+        stored = np.ascontiguousarray(values, "<f4" if component == _FLOAT else "<u4")
+        view = self._view(stored.tobytes(), target)
+        kind = _KINDS[stored.shape[1]]
+        accessor = kit.Accessor(bufferView=view, componentType=component, count=len(stored), type=kind)
+        if bounds:
+            accessor.min, accessor.max = stored.min(0).tolist(), stored.max(0).tolist()
+        self._gltf.accessors.append(accessor)
+        return len(self._gltf.accessors) - 1
+
+    def _texture(self, pixels: np.ndarray, part: Part, name: str) -> int:
+        import pygltflib as kit
+
+        view = self._view(textures.png(pixels))
+        self._gltf.images.append(kit.Image(bufferView=view, mimeType="image/png", name=f"{part.name} {name}"))
+        inside = part.uv is not None and part.uv.min() >= 0 and part.uv.max() <= 1
+        wrap = _CLAMP if inside else _REPEAT
+        self._gltf.samplers.append(kit.Sampler(magFilter=_LINEAR, minFilter=_MIPMAPS, wrapS=wrap, wrapT=wrap))
+        count = len(self._gltf.samplers) - 1
+        self._gltf.textures.append(kit.Texture(sampler=count, source=len(self._gltf.images) - 1))
+        return len(self._gltf.textures) - 1
+
+    def _material(self, part: Part) -> int:
+        import pygltflib as kit
+
+        given = part.material
+        model = kit.PbrMetallicRoughness(baseColorFactor=[1.0] * 4, roughnessFactor=1.0, metallicFactor=1.0)
+        if given.base_colour.ndim == 3:
+            index = self._texture(textures.base_colour(part), part, "base colour")
+            model.baseColorTexture = kit.TextureInfo(index=index)
+        else:
+            model.baseColorFactor = [*map(float, given.base_colour), 1.0]
+        if given.roughness.ndim or given.metallic.ndim:
+            index = self._texture(textures.metallic_roughness(part), part, "metallic roughness")
+            model.metallicRoughnessTexture = kit.TextureInfo(index=index)
+        else:
+            model.roughnessFactor, model.metallicFactor = float(given.roughness), float(given.metallic)
+        material = kit.Material(name=part.name, pbrMetallicRoughness=model, doubleSided=given.two_sided)
+        material.alphaCutoff = None  # which pygltflib writes though alphaMode is OPAQUE
+        if (normals := textures.normal_map(part)) is not None:
+            material.normalTexture = kit.NormalMaterialTexture(index=self._texture(normals, part, "normal map"))
+        self._extend(material, given.ior)
+        self._gltf.materials.append(material)
+        return len(self._gltf.materials) - 1
+
+    def _extend(self, material: Any, ior: float) -> None:
+        """An index of refraction other than 1.5, by Khronos's extensions: a viewer that does not know them shows 1.5."""
+        if abs(ior - _USUAL_IOR) < _ROUNDING:
+            return
+        name, value = (
+            ("KHR_materials_specular", {"specularFactor": 0.0}) if ior <= 1 else ("KHR_materials_ior", {"ior": ior})
+        )
+        material.extensions = {name: value}
+        if name not in self._gltf.extensionsUsed:
+            self._gltf.extensionsUsed.append(name)

@@ -1,0 +1,304 @@
+"""A scene folder that plain Mitsuba loads: scene.xml, the files that it names, and the recovered values alone."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from unrender.app.exporting import asset, maps, ready_made
+from unrender.app.exporting.formats import MITSUBA, OWN
+from unrender.app.exporting.formats import check as check_formats
+from unrender.app.exporting.formats import write as write_formats
+from unrender.app.exporting.graph import SceneGraph
+from unrender.app.exporting.setters import store
+from unrender.backend import variant
+from unrender.core import arrays, periodic
+from unrender.core.errors import InputError
+from unrender.core.exclusive import exclusive
+from unrender.io import files
+from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.description import load
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
+from unrender.rendering.photographs import scene_renderer, scene_values
+from unrender.runs import reopen
+from unrender.runs.folder import reader as folders
+from unrender.scene.problem import Problem
+from unrender.scene.render import as_tree
+
+__all__ = ["SCENE", "Exported", "export"]
+
+SCENE = "scene.xml"
+_FOLDERS = {
+    mi.ObjectType.Shape: ready_made.MESHES,
+    mi.ObjectType.Volume: ready_made.VOLUMES,
+    mi.ObjectType.Texture: ready_made.BITMAPS,
+    mi.ObjectType.Emitter: ready_made.BITMAPS,
+}
+_OF_SCENE = {SCENE, *_FOLDERS.values(), "files"}
+_OWN = {maps.RECORD, maps.TABLE, maps.FOLDER, *_OF_SCENE, *OWN}
+_SPP = 256
+_POSITIONS = "vertex_positions"
+_ROUNDING = 1e-4
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        folder: where.
+        scene: the XML file; None where it was not asked for, or there is none, as plain Mitsuba has no emissive media.
+        notices: one line for each thing that its user should know of.
+        renamed: {key: its name in the scene that was written}, of all parameters of the scene that have another one there.
+    """
+
+    folder: Path
+    scene: Path | None
+    notices: tuple[str, ...]
+    renamed: Mapping[str, str] = field(default_factory=dict)
+
+
+@exclusive("export")
+def export(
+    what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
+    out: str | Path,
+    overwrite: bool = False,
+    spp: int = _SPP,
+    formats: Sequence[str] = (MITSUBA,),
+) -> Exported:
+    """Write a scene with its recovered parameters as a folder that plain Mitsuba loads, or for other programs.
+
+        ur.export("out/indirect-room-auto", "out/room")
+        ur.export((problem, result.parameters), "out/room-2")
+        ur.export("out/indirect-room-auto", "out/room-3", formats=["obj", "ply"])
+
+    The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
+    maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
+    integrator is `path`, or `volpath` where there are participating media, with the problem's depth; every film keeps its reconstruction
+    filter. Sensors come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not
+    have, only the recovered values are written.
+
+    The other formats take meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
+    the cameras; what they cannot take is a notice.
+
+    Args:
+        what: a run folder; a problem file, for its initial values; or a problem and {key: array} of all its parameters.
+        out: the new folder.
+        overwrite: whether an earlier export may be replaced.
+        spp: samples per pixel that scene.xml asks for.
+        formats: "mitsuba", "glb", "obj", "ply", "environment", "blender", "usd".
+
+    Raises:
+        InputError: the run folder or the problem cannot be read, `out` cannot be written, a parameter has no place in a description, the
+            scene has no mesh, a mesh with maps no texture coordinates, or a map is too large. Nothing is left behind then.
+
+    What is written is on the disk when this returns. An earlier export stands at its place until the new one does, which then takes its
+    place in one instant (where the system cannot exchange two names: in two, between which the next export sets right what was left).
+    """
+    variant.ensure()
+    out, asked = Path(out), check_formats(formats)
+    files.check_replaceable(out, _OWN, maps.RECORD, overwrite, f"export to {out}", "an earlier export")
+    problem, parameters = _opened(what)
+    renderer = scene_renderer(problem.renderer)
+    if not isinstance(renderer, MitsubaRenderer):
+        raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
+    as_tree(problem, parameters)
+    values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
+    try:
+        notices, renamed = files.write_folder(out, lambda folder: _write(folder, problem, renderer, values, asked, spp))
+    except OSError as error:
+        raise InputError(f"export to {out}: {error.strerror or error}") from error
+    has_scene = MITSUBA in asked and not renderer.pair.emissive
+    return Exported(out, out / SCENE if has_scene else None, tuple(notices), renamed)
+
+
+def _opened(
+    what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
+) -> tuple[Problem, Mapping[str, np.ndarray]]:
+    if not isinstance(what, (str, Path)):
+        return what
+    if Path(what).suffix.lower() == ".toml":
+        problem = Problem.from_file(what)
+        return problem, problem.initial_values()
+    run = folders.read(what)
+    return reopen.with_meshes(reopen.problem_of(what), run), run.parameters
+
+
+def _write(
+    folder: Path,
+    problem: Problem,
+    renderer: MitsubaRenderer,
+    values: dict[str, np.ndarray],
+    asked: Sequence[str],
+    spp: int,
+) -> tuple[list[str], dict[str, str]]:
+    """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
+    repeated = {key: measure.repeated for key, measure in problem.measures.items()}
+    notices = maps.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
+    others = [name for name in asked if name != MITSUBA]
+    if renderer.pair.emissive:
+        if others:
+            raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
+        why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
+        return [*notices, why], {}
+    of_scene = scene_values(problem.renderer, values)
+    renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
+    if MITSUBA in asked:
+        told = [f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene]
+        notices = told + notices
+    if others:
+        notices += write_formats(asset.read(folder / SCENE), folder, others)
+    if MITSUBA not in asked:
+        for name in _OF_SCENE:
+            files.remove(folder / name)
+    return notices, renamed
+
+
+def _fill(
+    folder: Path, renderer: MitsubaRenderer, values: dict[str, np.ndarray], max_depth: int, spp: int
+) -> dict[str, str]:
+    """Write scene.xml and the files that it names. Returns `Exported.renamed`."""
+    graph = SceneGraph(_description(renderer.pair.description, folder))
+    described = renderer.pair.as_described()
+    scene = described.scene
+    moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
+    own = {key: value for key, value in values.items() if key not in moved}
+    places = graph.places(described.parameters)
+    if deformed := next((key for key in own if key not in places), None):
+        raise InputError(f"parameter {deformed} cannot be exported: the scene has a sphere there, without vertices")
+    for key, value in own.items():
+        if (mesh := renderer.pair.replaced.get(key.rpartition(".")[0])) is not None and key.endswith(_POSITIONS):
+            name = places[key].key.removesuffix(_POSITIONS)
+            graph.live[f"{name}faces"] = mi.UInt32(mesh.faces.ravel().astype(np.uint32))
+            if mesh.uv is not None:
+                graph.live[f"{name}vertex_texcoords"] = mi.Float(mesh.uv.ravel().astype(np.float32))
+        live = graph.live[places[key].key]
+        graph.live[places[key].key] = from_tensor(renderer.array(value), live)
+    graph.live.update()
+    for key, value in own.items():
+        try:
+            store(graph, places[key], value, key, folder)
+        except InputError as error:
+            raise InputError(f"parameter {key} cannot be exported: {error}") from error
+    posed = [_move(graph, target, matrix) for target, matrix in poses.matrices(scene, moved).items()]
+    _set_up_rendering(graph, renderer, max_depth, spp)
+    _gather_files(graph, folder)
+    path = folder / SCENE
+    path.write_bytes(graph.xml())
+    names = _verify(graph, path, {key: places[key].key for key in own}, posed)
+    return {key: names[place.key] for key, place in places.items() if names[place.key] != key}
+
+
+def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
+    """An XML file, or a dictionary without ready-made objects."""
+    if isinstance(description, (str, Path)):
+        return Path(description)
+    given, recorded = ready_made.make(description) if callable(description) else (description, [])
+    return ready_made.FilesOnly(folder, recorded).dictionary(given)
+
+
+def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
+    """Put a pose before the `to_world` of a shape or sensor, and tell which node that is."""
+    index = next(
+        i for kind in (mi.ObjectType.Shape, mi.ObjectType.Sensor) for i in graph.of(kind) if graph.names[i] == target
+    )
+    props = graph.nodes[index].props
+    before = props["to_world"] if "to_world" in props else mi.ScalarTransform4d()
+    before = np.array(before.matrix, float).reshape(4, 4)
+    props["to_world"] = mi.ScalarTransform4d((matrix @ before).tolist())
+    return index
+
+
+def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: int, spp: int) -> None:
+    """What the run's pictures were rendered with: paths of that depth, independent samples, the films' own filters."""
+    integrator = graph.child(0, mi.ObjectType.Integrator, "volpath" if renderer.pair.volumetric else "path")
+    integrator["max_depth"], integrator["rr_depth"] = max_depth, renderer.light_paths.rr_depth
+    if renderer.light_paths.hide_emitters:
+        integrator["hide_emitters"] = True
+    films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
+    for index in graph.of(mi.ObjectType.Sensor):
+        graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
+        film = films[f"n{index}"]
+        rfilter = graph.descendant(index, mi.ObjectType.Film, mi.ObjectType.ReconstructionFilter)
+        props = graph.child(index, mi.ObjectType.Film, "hdrfilm")
+        for axis, (size, part, offset) in enumerate(
+            (("width", "crop_width", "crop_offset_x"), ("height", "crop_height", "crop_offset_y"))
+        ):
+            props[size] = int(film.size()[axis])
+            if tuple(film.size()) != tuple(film.crop_size()):
+                props[part], props[offset] = int(film.crop_size()[axis]), int(film.crop_offset()[axis])
+        props["pixel_format"], props["component_format"] = "rgb", "float32"
+        props["sample_border"] = bool(film.sample_border())
+        if rfilter is not None:
+            props["rfilter"] = mi.Properties.ResolvedReference(rfilter)
+
+
+def _gather_files(graph: SceneGraph, folder: Path) -> None:
+    """Copy what the description names into the folder, and name it from there."""
+    taken: dict[Path, str] = {}
+    for index in sorted(graph.used()):
+        node = graph.nodes[index]
+        if "filename" not in node.props:
+            continue
+        path = Path(node.props["filename"])
+        if path not in taken:
+            if path.is_relative_to(folder):
+                taken[path] = path.relative_to(folder).as_posix()
+            else:
+                kind = _FOLDERS.get(node.type, "files")
+                name = f"{ready_made.file_name(path.stem)}{path.suffix}"
+                if (folder / kind / name).exists():
+                    name = f"{ready_made.file_name(path.stem)}-{index}{path.suffix}"
+                (folder / kind).mkdir(exist_ok=True)
+                shutil.copyfile(path, folder / kind / name)
+                taken[path] = f"{kind}/{name}"
+        node.props["filename"] = taken[path]
+    for path in folder.glob("*/*"):  # what a recovered value took the place of
+        if path.parent.name != maps.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
+            path.unlink()
+
+
+def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> dict[str, str]:
+    """Load the exported scene and hold it to the values that it should have.
+
+    Args:
+        graph: with its live scene at these values.
+        path: of the XML file.
+        recovered: {the parameter's key: its key in the live scene}.
+        posed: nodes that were moved, which the live scene's are not.
+
+    Returns:
+        the name of each parameter of the live scene in the one that was written.
+    """
+    try:
+        found = ObjectGraph(load(path)).parameters()
+    except Exception as error:
+        raise InputError(
+            f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"
+        ) from error
+    ends = [[key.rpartition(".")[2] for key in scene.properties] for scene in (graph.live, found)]
+    if ends[0] != ends[1]:
+        raise InputError("export: the scene that was written has other parameters than the one it was made of")
+    names = dict(zip(graph.live.properties, found.properties, strict=True))
+    given = {own: key for key, own in recovered.items()}
+    moved = tuple(f"n{index}." for index in posed)
+    for own, name in names.items():
+        if own.startswith(moved):
+            continue
+        try:
+            before, after = (to_tensor(scene[key]).numpy() for scene, key in ((graph.live, own), (found, name)))
+        except TypeError:  # what is no array, such as a transformation
+            continue
+        key = given.get(own, name)
+        scale = max(1.0, float(np.max(np.abs(before), initial=0)))
+        if before.shape != after.shape or not np.allclose(before, after, rtol=0, atol=_ROUNDING * scale):
+            raise InputError(f"parameter {key} cannot be exported: the scene that was written has another value")
+    return names

@@ -1,0 +1,81 @@
+"""Maps as 8-bit pictures in the conventions of other programs."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from unrender.app.exporting.asset import Part
+from unrender.io.resampling import upsample
+from unrender.losses.metrics import srgb
+
+__all__ = ["base_colour", "grey", "metallic_roughness", "mirrored_texels", "normal_map", "png"]
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """(H, W, 3) or (H, W) bytes as a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def base_colour(part: Part) -> np.ndarray:
+    """(H, W, 3) bytes, sRGB; one texel of a constant."""
+    colour = part.material.base_colour
+    return _bytes(srgb(colour if colour.ndim == 3 else colour.reshape(1, 1, 3)))
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    """A number or (H, W) as (H, W) bytes, linear; one texel of a constant."""
+    return _bytes(values if values.ndim == 2 else values.reshape(1, 1))
+
+
+def metallic_roughness(part: Part) -> np.ndarray:
+    """(H, W, 3) bytes, linear: roughness in the green channel, metallic in the blue one, as glTF has them; the red one is white."""
+    maps = [part.material.roughness, part.material.metallic]
+    size = np.max([value.shape for value in maps if value.ndim == 2] or [(1, 1)], axis=0)
+    large = [upsample(np.broadcast_to(x, x.shape or (1, 1))[..., None], size)[..., 0] for x in maps]
+    return _bytes(np.stack([np.ones(tuple(size)), *large], -1))
+
+
+def normal_map(part: Part) -> np.ndarray | None:
+    """(H, W, 3) bytes, linear, green upwards along the picture (OpenGL's, which glTF, OBJ and Blender have); None where there is none.
+
+    Mitsuba's second tangent is n × ∂p/∂u. Others follow the picture, so green is turned around where a face lies mirrored in it.
+    """
+    values = part.material.normal_map
+    if values is None:
+        return None
+    found = values.copy()
+    mirrored = mirrored_texels(part, *values.shape[:2])
+    found[mirrored, 1] = 1 - found[mirrored, 1]
+    return _bytes(found)
+
+
+def mirrored_texels(part: Part, height: int, width: int) -> np.ndarray:
+    """(H, W), true where the nearest face lies mirrored in the picture: clockwise seen with v downwards upside down."""
+    if part.uv is None:
+        return np.zeros((height, width), bool)
+    corners = (part.uv * [width, height])[part.faces]
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]  # v grows downwards: above 0 is clockwise on the picture
+    kinds = (area > 0)[area != 0]
+    if not len(kinds) or kinds.all() or not kinds.any():
+        return np.full((height, width), bool(len(kinds) and kinds.all()))
+    from scipy import ndimage
+
+    picture = Image.new("L", (width, height), 0)
+    draw = ImageDraw.Draw(picture)
+    for triangle, value in zip(corners - 0.5, area, strict=True):
+        draw.polygon([tuple(corner) for corner in triangle.tolist()], fill=2 if value > 0 else 1)
+    label = np.array(picture)
+    nearest: Any = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    rows, columns = nearest
+    return label[rows, columns] == 2
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -1,0 +1,159 @@
+"""Several runs at equal time: compare.html, compare.png and compare.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.app.report import curves, html, image_metrics, panels
+from unrender.app.report import groups as grouping
+from unrender.app.report.equal_time import Comparison, compare_groups
+from unrender.display import plots
+from unrender.display.plots import Chart, Line
+from unrender.io.files import write
+from unrender.runs.folder.reader import RunFolder, read
+
+__all__ = ["compare", "load_comparison", "write_comparison"]
+
+_VIEWS = 4
+_MAPS = 8
+
+
+def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
+    """Compare runs of one problem, grouped by method over seeds; ratios are to the first one's method.
+
+    Args:
+        directories: run folders.
+        out: where compare.html, compare.png and compare.json go; made where it is missing.
+
+    Returns:
+        The path of compare.html.
+
+    Raises:
+        InputError: no folders, one that is malformed or of another problem, or `out` cannot be written to.
+    """
+    return write_comparison(*load_comparison(directories), out)
+
+
+def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
+    """The numbers of a comparison, and what makes it weaker, one line each. Raises `InputError`."""
+    runs = [read(directory) for directory in directories]
+    with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
+        notices = grouping.check_comparable(runs)
+        return compare_groups(grouping.group(runs)), notices
+
+
+def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
+    """Write the page, its picture and its numbers; returns the page's path. Raises `InputError`."""
+    from unrender.app.report.overview_figure import overview_figure  # matplotlib takes a second to import
+
+    folder = Path(out)
+    write(folder / "compare.json", _numbers(comparison, notices))
+    with np.errstate(over="ignore", invalid="ignore"):
+        write(folder / "compare.png", overview_figure(comparison))
+        return write(folder / "compare.html", _page(comparison, notices))
+
+
+def _page(comparison: Comparison, notices: list[str]) -> bytes:
+    representatives = comparison.representatives
+    first = next(iter(representatives.values()))
+    maps = [key for key, truth in first.truth.items() if panels.is_map(truth)]
+    views = list(first.views)
+    return html.render(
+        "compare.html",
+        comparison=comparison,
+        notices=notices,
+        first=comparison.groups[0].label,
+        measures=image_metrics.available(),
+        name=first.record.name,
+        facts=html.facts(first.record),
+        commands={str(run.path): run.record.command for group in comparison.groups for run in group.runs},
+        views=[
+            panels.view_of_methods(v, {name: run.views[v] for name, run in representatives.items()})
+            for v in views[:_VIEWS]
+        ],
+        more_views=max(0, len(views) - _VIEWS),
+        maps=[
+            panels.map_of_methods(k, {name: run.parameters[k] for name, run in representatives.items()}, first.truth[k])
+            for k in maps[:_MAPS]
+        ],
+        more_maps=max(0, len(maps) - _MAPS),
+        charts={axis: _charts(comparison, axis) for axis in plots.AXES},
+    )
+
+
+def _charts(comparison: Comparison, axis: str) -> list[Chart]:
+    found = []
+    for metric in comparison.metrics:
+        lines = []
+        for colour, (name, outcome) in enumerate(metric.methods.items()):
+            band = getattr(outcome, f"over_{axis}")
+            several = outcome.reached.runs > 1
+            low, high = (band.low, band.high) if several else (None, None)
+            lines.append(Line(name, band.x, band.median, low, high, colour))
+        found.append(plots.chart(metric.title, lines, axis, max(float(line.x[-1]) for line in lines)))
+    return [chart for chart in found if chart is not None]
+
+
+def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
+    """compare.json. What is not known or not finite is null."""
+    found = {
+        "problem": comparison.groups[0].runs[0].record.name,
+        "first": comparison.groups[0].label,
+        "seconds": comparison.seconds,
+        "samples": comparison.samples,
+        "notices": notices,
+        "methods": [
+            {
+                "label": group.label,
+                "method": group.runs[0].record.method,
+                "settings": group.runs[0].record.settings,
+                "runs": [_run(run) for run in group.runs],
+                "image_error": comparison.image_error[group.label],
+                "images": {name: of[group.label] for name, of in comparison.images.items()},
+            }
+            for group in comparison.groups
+        ],
+        "metrics": [
+            {
+                "name": metric.name,
+                "title": metric.title,
+                "best_of_first": metric.best_of_first,
+                "first_improves": metric.improves,
+                "methods": metric.methods,
+            }
+            for metric in comparison.metrics
+        ],
+    }
+    return (json.dumps(_plain(found), indent=1, allow_nan=False) + "\n").encode()
+
+
+def _run(run: RunFolder) -> dict[str, Any]:
+    return {
+        "directory": str(run.path),
+        "seed": run.record.seed,
+        "stopped": run.record.stopped,
+        "steps": run.record.steps,
+        "seconds": float(run.history.seconds[-1]),
+        "samples": float(run.history.samples[-1]),
+        "skipped": run.record.skipped,
+        "image_error": curves.image_error(run),
+    }
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(part) for part in value]
+    if isinstance(value, float):
+        return float(f"{value:.7g}") if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

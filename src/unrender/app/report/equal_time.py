@@ -1,0 +1,253 @@
+"""Several methods at equal time and at equal samples: errors, ratios, times to a target error, curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from unrender.app.report import curves, image_metrics
+from unrender.app.report.curves import Band, Series
+from unrender.app.report.groups import Group
+from unrender.app.report.image_metrics import ImageMetric
+from unrender.core.errors import InputError
+from unrender.display.plots import AXES
+from unrender.rendering import parameter_errors
+from unrender.runs.folder.reader import RunFolder
+
+__all__ = [
+    "LOSS_WINDOW",
+    "SHARES",
+    "Comparison",
+    "ErrorAtBudget",
+    "MethodResult",
+    "Metric",
+    "Spread",
+    "TimeToTarget",
+    "compare_groups",
+]
+
+SHARES = (0.25, 0.5, 1.0)
+"""Of the shortest run's time, or of the fewest samples: where methods are compared."""
+LOSS_WINDOW = 0.05
+"""Of the shortest run's time: over how long a loss is a median."""
+_POINTS = 200
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Over the runs of one method. None where nothing is known."""
+
+    median: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class ErrorAtBudget:
+    """One method's error at a fraction of the budget, in seconds or in samples.
+
+    Attributes:
+        share: of the shortest run's time, or of the fewest samples.
+        seconds, samples: when; one of the two, the other one is None.
+        error: of the metric.
+        ratio: of the median to the first method's, None where that is 0 or not finite.
+    """
+
+    share: float
+    seconds: float | None
+    samples: float | None
+    error: Spread
+    ratio: float | None
+
+
+@dataclass(frozen=True)
+class TimeToTarget:
+    """When one method reached the target: the lowest median error of the first method.
+
+    Attributes:
+        seconds: when the median over its runs reached it, None if never.
+        fastest, slowest: of the single runs that reached it.
+        count, runs: how many of how many runs reached it.
+        speedup: the first method's time over this one's; None where either is unknown or zero.
+    """
+
+    seconds: float | None
+    fastest: float | None
+    slowest: float | None
+    count: int
+    runs: int
+    speedup: float | None
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method by one metric.
+
+    Attributes:
+        moments: errors at `SHARES` of the time that all runs have.
+        at_samples: errors at `SHARES` of the samples that all runs have.
+        reached: the time to the target error.
+        over_seconds, over_samples: the error's median and range along both axes.
+    """
+
+    moments: tuple[ErrorAtBudget, ...]
+    at_samples: tuple[ErrorAtBudget, ...]
+    reached: TimeToTarget
+    over_seconds: Band
+    over_samples: Band
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What is compared.
+
+    Attributes:
+        name: "loss", "relative parameter error", or a parameter's key.
+        title: for people.
+        best_of_first: the lowest median over the first method's runs.
+        improves: whether that is less than where it began.
+        methods: {method's label: outcome}.
+    """
+
+    name: str
+    title: str
+    best_of_first: float
+    improves: bool
+    methods: dict[str, MethodResult]
+
+    def best_at(self, index: int, axis: str = "seconds") -> str | None:
+        """The method with the lowest median at `SHARES[index]` of the time or of the samples; None where there is only one."""
+        errors = {label: of.moments if axis == "seconds" else of.at_samples for label, of in self.methods.items()}
+        medians = {label: of[index].error.median for label, of in errors.items()}
+        known = {label: value for label, value in medians.items() if value is not None}
+        return min(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The comparison of several methods.
+
+    Attributes:
+        groups: the methods; the first one is the reference for the others.
+        seconds: of the shortest run.
+        samples: of the run that traced the fewest paths.
+        metrics: the first one counts most.
+        image_error: {label: root mean square error of the result's pictures}, each run at its own end.
+        images: {metric's name: {label: value}} of the same pictures.
+        representatives: {label: the run whose last value of the first metric is the (lower) median}.
+    """
+
+    groups: tuple[Group, ...]
+    seconds: float
+    samples: float
+    metrics: tuple[Metric, ...]
+    image_error: dict[str, Spread]
+    images: dict[str, dict[str, Spread]]
+    representatives: dict[str, RunFolder]
+
+    def best_image(self, metric: ImageMetric) -> str | None:
+        """The method with the best median of an image metric; None where there is only one, or nothing is known."""
+        medians = {label: of.median for label, of in self.images[metric.name].items()}
+        known = {label: value for label, value in medians.items() if value is not None}
+        best = max if metric.larger_is_better else min
+        return best(known, key=lambda label: known[label]) if len(medians) > 1 and known else None
+
+
+def compare_groups(groups: tuple[Group, ...]) -> Comparison:
+    """Compare methods up to the shortest run's time, and up to the fewest samples."""
+    ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
+    end = ends["seconds"]
+    first_run = groups[0].runs[0]
+    keys = [key for key in first_run.parameters if all(key in run.known for group in groups for run in group.runs)]
+    found = []
+    if len(keys) > 1:
+        found.append(
+            _metric(
+                "relative parameter error",
+                "Parameter error, relative to the start (mean over parameters)",
+                lambda run: curves.relative_error(run, keys),
+                groups,
+                ends,
+            )
+        )
+    for key in keys:
+        title = f"{parameter_errors.title([first_run.measure(key)])}: {key}"
+        found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, ends))
+    found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, ends))
+    # With several parameters the mean over them comes first, then the loss, then each on its own.
+    order = [found[0], found[-1], *found[1:-1]] if len(found) > 1 else found
+    metrics = tuple(metric for metric in order if metric is not None)
+    if not metrics:
+        raise InputError(
+            f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
+        )
+    images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
+    found_images = {g.label: [image_metrics.measure_run(run) for run in g.runs] for g in groups}
+    by_metric = {
+        metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in found_images.items()}
+        for metric in image_metrics.available()
+    }
+    representatives = {g.label: _median_run(g, keys) for g in groups}
+    return Comparison(groups, end, ends["samples"], metrics, images, by_metric, representatives)
+
+
+def _metric(
+    name: str, title: str, series: Callable[[RunFolder], Series | None], groups: Sequence[Group], ends: dict[str, float]
+) -> Metric | None:
+    """None where some method has no value of it."""
+    found = {group.label: [s for run in group.runs if (s := series(run)) is not None] for group in groups}
+    if not all(found.values()):
+        return None
+    full = {label: curves.band(of, "seconds", min(float(s.seconds[-1]) for s in of)) for label, of in found.items()}
+    first = next(iter(full.values()))
+    level = float(first.median.min())
+    improves = level < float(first.median[0])
+    at_first = first.time_to(level)
+    methods = {}
+    for label, of in found.items():
+        moments, at_samples = (
+            tuple(_error_at(share, axis, ends[axis], of, next(iter(found.values()))) for share in SHARES)
+            for axis in AXES
+        )
+        reached = _time_to_target(of, full[label], level, at_first if improves else None)
+        longest = min(float(s.samples[-1]) for s in of)
+        over_seconds = curves.band(of, "seconds", float(full[label].x[-1]), _POINTS)
+        methods[label] = MethodResult(
+            moments, at_samples, reached, over_seconds, curves.band(of, "samples", longest, _POINTS)
+        )
+    return Metric(name, title, level, improves, methods)
+
+
+def _error_at(share: float, axis: str, end: float, of: Sequence[Series], first: Sequence[Series]) -> ErrorAtBudget:
+    position = share * end
+    own, reference = ([float(s.at(np.array([position]), axis)[0]) for s in runs] for runs in (of, first))
+    a, b = median(own), median(reference)
+    ratio = a / b if b > 0 and math.isfinite(a) and math.isfinite(b) else None
+    seconds, samples = (position, None) if axis == "seconds" else (None, position)
+    return ErrorAtBudget(share, seconds, samples, _spread(own), ratio)
+
+
+def _time_to_target(of: Sequence[Series], median_run: Band, level: float, at_first: float | None) -> TimeToTarget:
+    when, each = median_run.time_to(level), [t for s in of if (t := s.time_to(level)) is not None]
+    speedup = at_first / when if when and at_first else None
+    return TimeToTarget(when, min(each, default=None), max(each, default=None), len(each), len(of), speedup)
+
+
+def _spread(values: Sequence[float | None]) -> Spread:
+    known = [value for value in values if value is not None]
+    return Spread(median(known), min(known), max(known)) if known else Spread(None, None, None)
+
+
+def _median_run(group: Group, keys: Sequence[str]) -> RunFolder:
+    def last(run: RunFolder) -> float:
+        found = curves.relative_error(run, keys)
+        if found is not None:
+            return float(found.values[-1])
+        image = curves.image_error(run)
+        return image if image is not None else math.inf
+
+    return sorted(group.runs, key=last)[(len(group.runs) - 1) // 2]

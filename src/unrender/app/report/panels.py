@@ -1,0 +1,296 @@
+"""Pictures that belong together: views and recovered maps of one run, or of several methods beside one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.app.report import tone_mapping
+from unrender.app.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
+from unrender.core import periodic
+from unrender.display import formatting, maps
+from unrender.display.maps import is_map
+from unrender.runs.folder.reader import RunFolder, ViewPictures
+from unrender.runs.sensitivity import around, hardly_seen
+
+__all__ = [
+    "ColourScale",
+    "Figure",
+    "Panel",
+    "Slider",
+    "is_map",
+    "map_of_methods",
+    "map_of_run",
+    "view_of_methods",
+    "view_of_run",
+]
+
+
+_TENS = -3.0
+"""Where the colours of a sensitivity end, as a power of ten of the greatest."""
+
+
+@dataclass(frozen=True)
+class Slider:
+    """Two pictures on one place, and a handle between them."""
+
+    left: Picture
+    right: Picture
+    left_label: str
+    right_label: str
+    caption: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One picture and what it is; `bar` where its colours stand for numbers."""
+
+    picture: Picture
+    caption: str
+    note: str = ""
+    bar: ColourBar | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Stacks of pictures, side by side where the screen is wide.
+
+    Attributes:
+        title: of all of them.
+        note: on their exposure or scale.
+        stacks: each from top to bottom.
+        first_is_large: whether the first stack is larger than the others.
+        independent: whether pictures of different stacks show different places.
+    """
+
+    title: str
+    note: str
+    stacks: tuple[tuple[Slider | Figure, ...], ...]
+    first_is_large: bool
+    independent: bool = False
+
+
+def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
+    """Reference against result, the start, what is left of the error, and where the method looks or what it keeps.
+
+    Args:
+        view: its index.
+        shown: its pictures.
+        encoder: makes them.
+        name: of the result, "Current" while the run goes on.
+    """
+    factor = tone_mapping.exposure(shown.reference)
+    what = name.lower()
+    error = tone_mapping.absolute_error(shown.result, shown.reference)
+    before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference)
+    high = tone_mapping.colour_limit(error if before is None else before)
+    result = encoder.colour(shown.result, factor, f"View {view}: the {what}")
+    stacks: list[tuple[Slider | Figure, ...]] = [
+        (Slider(encoder.colour(shown.reference, factor, f"View {view}: the reference"), result, "Reference", name),)
+    ]
+    if shown.initial is not None and before is not None:
+        picture = encoder.colour(shown.initial, factor, f"View {view}: before the first step")
+        stacks.append((Figure(picture, "Start"),))
+        stacks.append(
+            (_error(encoder, before, high, "Error at the start", f"View {view}: error before the first step"),)
+        )
+    maps = _maps_of_view(view, shown, encoder)
+    stacks += [(figure,) for figure in maps or [Figure(result, name)]]
+    stacks.append((_error(encoder, error, high, f"Error of the {what}", f"View {view}: error of the {what}"),))
+    return Panel(f"View {view}", _exposure_note(factor), tuple(stacks), True)
+
+
+def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> list[Figure]:
+    """What the method keeps of the past, and where it looks."""
+    found = []
+    if shown.control_weight is not None:
+        weight = np.mean(shown.control_weight, axis=-1)
+        picture = encoder.false_colour(
+            weight, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"View {view}: control weight per pixel"
+        )
+        bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Control weight")
+        note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
+        found.append(Figure(picture, "Control weight", note, bar))
+    if shown.pixel_probability is not None:
+        density = shown.pixel_probability
+        high = tone_mapping.colour_limit(density)
+        picture = encoder.false_colour(
+            density, 0.0, high, tone_mapping.VALUE_COLORMAP, f"View {view}: probability of each pixel"
+        )
+        bar = tone_mapping.colour_bar(0.0, high, tone_mapping.VALUE_COLORMAP, "Probability that a pixel is drawn")
+        found.append(Figure(picture, "Pixel probability", f"mean {formatting.number(_finite_mean(density))}", bar))
+    return found
+
+
+def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: PictureEncoder = INLINE) -> Panel:
+    """Each method's result against the reference, and its error, all on one exposure and one scale."""
+    reference = next(iter(shown.values())).reference
+    factor = tone_mapping.exposure(reference)
+    errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
+    high = max(tone_mapping.colour_limit(error) for error in errors.values())
+    stacks = tuple(
+        (
+            Slider(
+                encoder.colour(reference, factor, f"View {view}: the reference"),
+                encoder.colour(of.result, factor, f"View {view}: the result of {label}"),
+                "Reference",
+                label,
+            ),
+            _error(encoder, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
+        )
+        for label, of in shown.items()
+    )
+    return Panel(f"View {view}", _exposure_note(factor), stacks, False)
+
+
+def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Panel:
+    """A recovered texture or volume against its truth, or against its start where the truth is unknown; and how much the images tell."""
+    known = (of.get(key) for of in (run.parameters, run.initial, run.truth, run.sensitivity))
+    columns = run.measure(key).repeated
+    result, initial, truth, sensitivity = (
+        x if x is None or not is_map(x) else periodic.interior(x, columns) for x in known
+    )
+    assert result is not None
+    scale = ColourScale(result if truth is None or not is_map(truth) else truth)
+    stacks: list[tuple[Slider | Figure, ...]] = []
+    planes = maps.planes(result)
+    for label, plane in planes.items():
+        start, wanted = maps.planes(initial).get(label), maps.planes(truth).get(label)
+        errors = {
+            caption: tone_mapping.absolute_error(one, wanted)
+            for caption, one in (("Error at the start", start), ("Error", plane))
+            if one is not None and wanted is not None and one.shape == wanted.shape
+        }
+        high = tone_mapping.colour_limit(next(iter(errors.values()))) if errors else 1.0
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, start, wanted)]
+        if wanted is not None and start is not None:
+            column.append(
+                Figure(scale.picture(encoder, start, f"{key} {label}: before the first step"), "Start", "", scale.bar)
+            )
+        for what, error in errors.items():
+            if what == "Error":
+                column.append(
+                    Figure(scale.picture(encoder, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
+                )
+            column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
+        if sensitivity is not None and (told := maps.planes(sensitivity).get(label)) is not None:
+            column.append(
+                _sensitivity(encoder, told, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
+            )
+        if len(planes) == 1:
+            stacks += [(item,) for item in column]
+        else:
+            stacks.append(tuple(column))
+    return Panel(key, _map_note(result, scale), tuple(stacks), len(planes) == 1, len(planes) > 1)
+
+
+def map_of_methods(
+    key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, encoder: PictureEncoder = INLINE
+) -> Panel:
+    """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
+    scale = ColourScale(truth)
+    label, wanted = next(iter(maps.planes(truth).items()))
+    found = {name: maps.planes(result).get(label) for name, result in results.items()}
+    errors = {
+        name: tone_mapping.absolute_error(plane, wanted)
+        for name, plane in found.items()
+        if plane is not None and plane.shape == wanted.shape
+    }
+    high = max([tone_mapping.colour_limit(error) for error in errors.values()], default=1.0)
+    stacks = []
+    for name, plane in found.items():
+        if plane is None:
+            continue
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, None, wanted, name)]
+        if name in errors:
+            column.append(_error(encoder, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
+        stacks.append(tuple(column))
+    return Panel(key, _map_note(truth, scale), tuple(stacks), False)
+
+
+class ColourScale:
+    """How one parameter's values become colours; fixed by one array, used for all that are compared with it.
+
+    One channel: false colour over the range of `fixed_by`. Three: sRGB, exposed only where a value passes 1.
+    """
+
+    def __init__(self, fixed_by: np.ndarray):
+        finite = fixed_by[np.isfinite(fixed_by)]
+        self.low, self.high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        self.scalar = fixed_by.ndim == 2 or fixed_by.shape[-1] == 1
+        self.factor = 1.0 if self.scalar or self.high <= 1.0 else tone_mapping.exposure(fixed_by[..., :3])
+        if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
+            self.low, self.high = min(0.0, self.low), max(1.0, self.high)
+
+    def colours(self, plane: np.ndarray) -> np.ndarray:
+        """(H, W, C) values as (H, W, 3) in [0, 1], ready to be seen."""
+        if plane.shape[-1] == 1:
+            return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP)
+        return tone_mapping.srgb(plane[..., :3] * self.factor)
+
+    def picture(self, encoder: PictureEncoder, plane: np.ndarray, alt: str) -> Picture:
+        """The same as a picture of the page."""
+        if plane.shape[-1] == 1:
+            return encoder.false_colour(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP, alt)
+        return encoder.colour(plane[..., :3], self.factor, alt)
+
+    @property
+    def bar(self) -> ColourBar | None:
+        """The legend, where there is one channel."""
+        return (
+            tone_mapping.colour_bar(self.low, self.high, tone_mapping.VALUE_COLORMAP, "Value") if self.scalar else None
+        )
+
+
+def _compare_map(
+    encoder: PictureEncoder,
+    scale: ColourScale,
+    key: str,
+    label: str,
+    plane: np.ndarray,
+    start: np.ndarray | None,
+    wanted: np.ndarray | None,
+    name: str = "Recovered",
+) -> Slider | Figure:
+    found = scale.picture(encoder, plane, f"{key} {label}: {name}")
+    caption = label.capitalize()
+    if wanted is not None:
+        return Slider(scale.picture(encoder, wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
+    if start is not None:
+        return Slider(scale.picture(encoder, start, f"{key} {label}: start"), found, "Start", name, caption)
+    return Figure(found, caption or name, "", scale.bar)
+
+
+def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
+    note = f"mean {formatting.number(_finite_mean(error))}"
+    return Figure(encoder.error(error, high, alt), caption, note, tone_mapping.error_bar(high))
+
+
+def _sensitivity(encoder: PictureEncoder, told: np.ndarray, greatest: float, alt: str) -> Figure:
+    """Of the images to each texel, in powers of ten below the greatest."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tens = np.nan_to_num(np.log10(around(told) / greatest), nan=_TENS, neginf=_TENS)
+    bar = tone_mapping.colour_bar(
+        _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
+    )
+    note = f"{hardly_seen(told).mean():.0%} of the texels hardly change the images"
+    return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
+
+
+def _finite_mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def _exposure_note(factor: float) -> str:
+    return f"Exposure ×{formatting.number(factor)}"
+
+
+def _map_note(array: np.ndarray, scale: ColourScale) -> str:
+    shape = " × ".join(str(n) for n in array.shape)
+    if scale.scalar:
+        return f"{shape}; colours from {formatting.number(scale.low)} to {formatting.number(scale.high)}"
+    return f"{shape}; in sRGB" + (f" at exposure ×{formatting.number(scale.factor)}" if scale.factor != 1.0 else "")

@@ -1,0 +1,111 @@
+"""Meshes that turn on the page: start, result and truth beside one another, by WebGL, or as a picture where there is none."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.display import formatting
+from unrender.runs.folder.reader import RunFolder
+from unrender.scene.surfaces import area_normals
+
+__all__ = ["MOST_FACES", "ShapePanel", "Solid", "panel"]
+
+MOST_FACES = 200_000
+"""Of the meshes of a panel together; more are not shown."""
+_STEPS = (1 << 16) - 1
+"""Of positions, along each side of a cube around all meshes."""
+_SIZE = 280
+"""Pixels along a side of each mesh in the picture."""
+_TURN, _TILT = 0.6, 0.35
+"""Of the picture, and of the first view, in radians: about the vertical, and downwards."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A mesh as the page has it.
+
+    Attributes:
+        label: what it is.
+        positions: base64 of uint16 (V, 3), little-endian: 0 to 65535 along each side of the cube that all meshes share.
+        faces: base64 of uint32 (F, 3).
+    """
+
+    label: str
+    positions: str
+    faces: str
+
+
+@dataclass(frozen=True)
+class ShapePanel:
+    """Meshes that turn together.
+
+    Attributes:
+        title, note: above them.
+        solids: from left to right; none where they are too large.
+        picture: data URI of a PNG: all of them side by side from the first point of view.
+        width, height: of the picture.
+    """
+
+    title: str
+    note: str
+    solids: tuple[Solid, ...]
+    picture: str = ""
+    width: int = 0
+    height: int = 0
+
+
+def panel(run: RunFolder, key: str) -> ShapePanel:
+    """Start, result and, where it is known, truth of the mesh whose vertex positions are a parameter."""
+    mesh = run.meshes[key]
+    shown = {"Start": (run.initial[key], mesh.first_faces), "Recovered": (run.parameters[key], mesh.faces)}
+    if mesh.truth is not None:
+        shown["Truth"] = (mesh.truth.vertices, mesh.truth.faces)
+    solids = {label: (np.asarray(x, np.float64).reshape(-1, 3), faces) for label, (x, faces) in shown.items()}
+    count = f"{len(run.parameters[key]) // 3} vertices, {len(mesh.faces)} faces"
+    if sum(len(faces) for _, faces in solids.values()) > MOST_FACES:
+        return ShapePanel(key, f"{count}: too large to be shown here; see meshes/", ())
+    if not all(np.isfinite(vertices).all() for vertices, _ in solids.values()):
+        return ShapePanel(key, f"{count}; not finite", ())
+    before, after = run.error_before.get(key), run.error_after.get(key)
+    if before is not None and after is not None:
+        count += (
+            f"; distance from the truth {formatting.number(after)}, from {formatting.number(before)} (root mean square)"
+        )
+    every = np.concatenate([vertices for vertices, _ in solids.values()])
+    low, high = every.min(axis=0), every.max(axis=0)
+    middle, half = (low + high) / 2, max(float((high - low).max()) / 2, 1e-12)
+    placed = {label: ((vertices - middle) / half, faces) for label, (vertices, faces) in solids.items()}
+    packed = tuple(
+        Solid(label, _packed((vertices + 1) / 2 * _STEPS + 0.5, "<u2"), _packed(faces, "<u4"))
+        for label, (vertices, faces) in placed.items()
+    )
+    return ShapePanel(key, count, packed, _picture(list(placed.values())), _SIZE * len(placed), _SIZE)
+
+
+def _packed(values: np.ndarray, kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
+
+
+def _picture(solids: list[tuple[np.ndarray, np.ndarray]]) -> str:
+    from PIL import Image, ImageDraw
+
+    image = Image.new("RGBA", (_SIZE * len(solids), _SIZE))
+    draw = ImageDraw.Draw(image)
+    c, s, d, t = np.cos(_TURN), np.sin(_TURN), np.cos(_TILT), np.sin(_TILT)
+    turn = np.array([[1, 0, 0], [0, d, -t], [0, t, d]]) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    for number, (vertices, faces) in enumerate(solids):
+        seen = vertices @ turn.T
+        normals = area_normals(seen, faces)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        shade = 0.25 + 0.65 * np.abs(normals @ np.array([0.36, 0.48, 0.8]))
+        at = _SIZE * (0.5 + seen[:, :2] * [0.29, -0.29]) + [_SIZE * number, 0]
+        for face in np.argsort(seen[faces][:, :, 2].sum(axis=1)):  # the farthest first
+            grey = int(255 * shade[face])
+            draw.polygon([tuple(p) for p in at[faces[face]].tolist()], fill=(grey, grey, grey, 255))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,0 +1,182 @@
+"""What the page of a run tells in words and numbers: its head, its parameters, its views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.app.report import curves, image_metrics, tone_mapping
+from unrender.display import formatting
+from unrender.runs.folder.reader import RunFolder, root_mean_square
+from unrender.runs.folder.schema import DOUBTFUL, RunRecord
+from unrender.runs.sensitivity import seen_cells
+from unrender.statistics import debiased
+
+__all__ = ["STOP_REASONS", "ParameterRow", "Tile", "ViewRow", "ending", "parameter_row", "tiles", "view_rows"]
+
+STOP_REASONS = {
+    "steps": "all steps done",
+    "seconds": "stopped when time was up",
+    "interrupted": "interrupted: this is what was reached",
+    "terminated": "terminated: this is what was reached",
+    "pruned": "pruned: its error was above the median of the sweep's trials",
+    "callback": "stopped by a callback",
+    "non-finite": "failed, given up: gradients were not finite; this is what was finite",
+}
+"""How a run may end, in words."""
+_LISTED_VALUES = 4
+
+
+def ending(record: RunRecord) -> str:
+    """Return how a run ended, in words, and what fresh pictures say where they contradict it; "" while it goes on."""
+    reason = STOP_REASONS.get(record.stopped, record.stopped)
+    return "; ".join(part for part in (record.status if record.status in DOUBTFUL else "", reason) if part)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure of the page's head: what it was, what it became."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One line of the table of parameters. Values as text, errors as numbers, None where not known.
+
+    Attributes:
+        unit: of the errors, "" for that of the values.
+        error_seen: at the end, over the cells that the pictures tell of.
+        seen: the share of these cells.
+    """
+
+    key: str
+    shape: str
+    truth: str
+    start: str
+    recovered: str
+    swatch: str
+    error_before: float | None
+    error_after: float | None
+    unit: str = ""
+    error_seen: float | None = None
+    seen: float | None = None
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """One line of the table of views.
+
+    Attributes:
+        view: its index.
+        before, after: root mean square errors over pixels and channels, at the start and of the result.
+        measures: {name: value} of the result, by the other measures; empty beyond the first views.
+    """
+
+    view: int
+    before: float | None
+    after: float | None
+    measures: dict[str, float | None]
+
+
+def tiles(run: RunFolder) -> list[Tile]:
+    """The head of a run's page."""
+    found = []
+    series = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
+    if len(series) == 1:
+        key, errors = series[0]
+        first, last = float(errors.values[0]), float(errors.values[-1])
+        measure = run.measure(key)
+        found.append(_tile("Parameter error", first, last, measure.name, measure.unit))
+    elif (relative := curves.relative_error(run, run.known)) is not None:
+        found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
+    after = curves.image_error(run)
+    if (measured := _image_error(run)) is not None:
+        found.append(measured)
+    elif after is not None:
+        views = run.views.values()
+        before = [root_mean_square(of.initial, of.reference) for of in views if of.initial is not None]
+        known = [error for error in before if error is not None]
+        start = float(np.mean(known)) if len(known) == len(views) else None
+        found.append(_tile("Image error", start, after, "RMSE"))
+    loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
+    if loss is not None:
+        found.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
+    note = f"and {formatting.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
+    found.append(Tile("Time", formatting.duration(run.record.seconds), note))
+    skipped = f"{run.record.skipped} skipped, not finite" if run.record.skipped else ""
+    found.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
+    if len(run.history):
+        samples, seconds = float(run.history.samples[-1]), float(run.history.seconds[-1])
+        rate = f"{formatting.count(samples / seconds)} per second" if seconds > 0 else ""
+        found.append(Tile("Samples", formatting.count(samples), rate))
+    return found
+
+
+def _image_error(run: RunFolder) -> Tile | None:
+    """The error of the last pictures without the noise of their rendering; None where it was not measured."""
+    known = run.record.image_errors
+    errors = {
+        which: [known[name] for view in run.views if (name := f"view{view}/{which}") in known]
+        for which in ("initial", "result")
+    }
+    if not run.views or any(len(found) != len(run.views) for found in errors.values()):
+        return None
+    before, after = (formatting.with_error(*debiased.mean(found)) for found in errors.values())
+    return Tile("Image error", after, f"RMSE without the pictures' noise, from {before}")
+
+
+def _tile(label: str, before: float | None, after: float, what: str, unit: str = "") -> Tile:
+    note = f"{what}, from {formatting.number(before)}{unit}" if before is not None else what
+    return Tile(label, f"{formatting.number(after)}{unit}", note)
+
+
+def parameter_row(run: RunFolder, key: str) -> ParameterRow:
+    """One parameter."""
+    measure, told = run.measure(key), run.sensitivity.get(key)
+    result, initial, truth = run.parameters[key], run.initial[key], run.truth.get(key)
+    return ParameterRow(
+        key,
+        " × ".join(str(n) for n in run.shape(key)) or "number",
+        _values(truth) if truth is not None else "",
+        _values(initial),
+        _values(result),
+        _swatch(result),
+        run.error_before.get(key),
+        run.error_after.get(key),
+        measure.unit,
+        None if told is None or truth is None else measure.error(result, truth, seen_cells(told)),
+        None if told is None or (where := seen_cells(told)) is None else float(where.mean()),
+    )
+
+
+def _values(array: np.ndarray) -> str:
+    if array.size == 0:
+        return ""
+    if array.size > _LISTED_VALUES:
+        return " … ".join(formatting.number(float(value)) for value in (array.min(), array.max()))
+    return ", ".join(formatting.number(float(value)) for value in array.reshape(-1))
+
+
+def _swatch(array: np.ndarray) -> str:
+    """The colour of a parameter of three values within [0, 1], as #rrggbb; empty for others."""
+    if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
+        return ""
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in tone_mapping.srgb(array.reshape(-1)))
+
+
+def view_rows(run: RunFolder) -> list[ViewRow]:
+    """All views."""
+    measured = image_metrics.measure_views(run)
+    return [
+        ViewRow(
+            view,
+            None if of.initial is None else root_mean_square(of.initial, of.reference),
+            root_mean_square(of.result, of.reference),
+            measured.get(view, {}),
+        )
+        for view, of in run.views.items()
+    ]

@@ -1,0 +1,225 @@
+"""What the live page shows, from snapshots of runs: with the panels, tables and charts of a report."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader
+
+from unrender.app.report import convergence, html, panels, tables
+from unrender.app.report.tone_mapping import PictureData, PictureEncoder
+from unrender.app.watch import monitor
+from unrender.app.watch.monitor import Snapshot
+from unrender.display import formatting, plots
+from unrender.runs.folder.reader import RunFolder
+
+__all__ = ["PictureCache", "RunRow", "environment", "render", "source"]
+
+_COLOURS = 6
+_MAPS = 8
+_CACHED_PAGES = 8
+_STATES = {
+    monitor.WAITING: "waiting for the run to begin",
+    monitor.RUNNING: "running",
+    monitor.PAUSED: "paused",
+    monitor.SAVING: "done, saving",
+    monitor.FINISHED: "finished",
+    monitor.LOST: "ended unexpectedly",
+    monitor.VANISHED: "the folder is gone",
+}
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One run among those that are watched; all of it text.
+
+    Attributes:
+        number: its index, from 0.
+        label, state, state_text: its name, what it does (see `monitor`), and that for people.
+        step, seconds, samples, loss, error: its progress.
+        accepts_commands, paused: whether its buttons are shown, and which of them.
+    """
+
+    number: int
+    label: str
+    state: str
+    state_text: str
+    step: str
+    seconds: str
+    samples: str
+    loss: str
+    error: str
+    accepts_commands: bool
+    paused: bool
+    path: str
+
+    @property
+    def colour(self) -> int:
+        """Of its curves."""
+        return self.number % _COLOURS
+
+
+class PictureCache:
+    """The pictures that a page may ask for, by names that this class gives; of the last few pages."""
+
+    def __init__(self) -> None:
+        self._entries: dict[str, tuple[int, PictureData]] = {}
+        self.pages = 0
+
+    def start_page(self) -> None:
+        """Start a page: drop the pictures that only pages before the last few show."""
+        self.pages += 1
+        self._entries = {name: of for name, of in self._entries.items() if self.has_page(of[0])}
+
+    def has_page(self, page: int) -> bool:
+        """Whether the pictures of a page, numbered as `pages` was, are still cached."""
+        return page > self.pages - _CACHED_PAGES
+
+    def add(self, picture: PictureData) -> str:
+        """Cache a picture; returns its address, the same for the same picture."""
+        values = np.ascontiguousarray(picture.values)
+        fields = (
+            values.shape,
+            zlib.crc32(values.data),
+            picture.factor,
+            picture.low,
+            picture.high,
+            picture.map,
+            picture.root,
+        )
+        name = hashlib.blake2b(repr(fields).encode(), digest_size=12).hexdigest()
+        self._entries[name] = self.pages, picture
+        return f"picture/{name}"
+
+    def get(self, name: str) -> PictureData | None:
+        """The picture of this name, while it is cached."""
+        return self._entries[name][1] if name in self._entries else None
+
+
+def render(template: str, snapshots: Sequence[Snapshot], pictures: PictureCache, chosen: int = 0, view: int = 0) -> str:
+    """The page or the part of it that changes, as HTML with everything that comes from the runs escaped.
+
+    Args:
+        template: "watch.html", or "watch_main.html" for the part.
+        snapshots: the runs, at least one.
+        pictures: where the pictures go.
+        chosen, view: the run and the view whose pictures are shown; the first ones where there are no such.
+    """
+    pictures.start_page()
+    labels = _labels([snapshot.path for snapshot in snapshots])
+    chosen = chosen if 0 <= chosen < len(snapshots) else 0
+    run = snapshots[chosen].run
+    with np.errstate(all="ignore"):  # pictures of a run that diverges overflow, and are shown all the same
+        context: dict[str, Any] = {
+            "rows": [_row(i, labels[i], snapshot) for i, snapshot in enumerate(snapshots)],
+            "name": next((s.run.record.name for s in snapshots if s.run is not None), labels[0]),
+            "chosen": chosen,
+            "labels": labels,
+            "charts": _charts(snapshots, labels),
+            "notices": _notices(snapshots, labels),
+            **_of_run(snapshots[chosen], run, pictures, view),
+        }
+        return environment().get_template(template).render(context)
+
+
+def _of_run(snapshot: Snapshot, run: RunFolder | None, pictures: PictureCache, view: int) -> dict[str, Any]:
+    if run is None:
+        return {
+            "run": None,
+            "panel": None,
+            "views": [],
+            "view": 0,
+            "parameters": [],
+            "maps": [],
+            "more_maps": 0,
+            "facts": {},
+        }
+    encoder = PictureEncoder(pictures.add)
+    now = "Result" if snapshot.state == monitor.FINISHED else "Current"
+    view = view if view in run.views else next(iter(run.views), 0)
+    maps = [key for key, value in run.parameters.items() if panels.is_map(value)]
+    return {
+        "run": run,
+        "panel": panels.view_of_run(view, run.views[view], encoder, now) if run.views else None,
+        "views": list(run.views),
+        "view": view,
+        "parameters": [tables.parameter_row(run, key) for key in run.parameters],
+        "maps": [panels.map_of_run(run, key, encoder) for key in maps[:_MAPS]],
+        "more_maps": max(0, len(maps) - _MAPS),
+        "command": run.record.command,
+        "facts": html.facts(run.record),
+    }
+
+
+def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
+    run, status = snapshot.run, snapshot.status
+    step = seconds = samples = loss = error = ""
+    if run is not None:
+        live = None if snapshot.state == monitor.FINISHED else status
+        of = f" / {live.steps}" if live is not None and live.steps else ""
+        budget = f" of {formatting.duration(live.budget_seconds)}" if live is not None and live.budget_seconds else ""
+        step, seconds = f"{run.record.steps}{of}", formatting.duration(run.record.seconds) + budget
+        known = run.history.loss[np.isfinite(run.history.loss)]
+        loss = formatting.number(float(np.median(known[-9:]))) if known.size else ""
+        samples = formatting.count(float(run.history.samples[-1])) if len(run.history) else ""
+        error = ", ".join(formatting.number(value) for value in list(run.error_after.values())[:3])
+    paused = snapshot.state == monitor.PAUSED
+    state_text = _STATES[snapshot.state]
+    if run is not None and snapshot.state in (monitor.FINISHED, monitor.SAVING):
+        reason = tables.ending(run.record)
+        if snapshot.state == monitor.FINISHED and run.record.status in ("interrupted", "failed"):
+            state_text = reason or run.record.status
+        elif reason:
+            state_text += f": {reason}"
+    return RunRow(
+        number, label, snapshot.state, state_text, step, seconds, samples, loss, error, snapshot.accepts_commands, paused,
+        str(snapshot.path),
+    )  # fmt: skip
+
+
+def _charts(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> dict[str, list[plots.Chart]]:
+    runs = {label: s.run for label, s in zip(labels, snapshots, strict=True) if s.run is not None}
+    if len(snapshots) == 1 and runs:
+        found = {axis: convergence.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
+    else:
+        colours = {label: i % _COLOURS for i, label in enumerate(labels)}
+        found = {axis: convergence.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
+    return found
+
+
+def _notices(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> list[str]:
+    found = []
+    for label, snapshot in zip(labels, snapshots, strict=True):
+        who = f"{label}: " if len(labels) > 1 else ""
+        fields = [*snapshot.problems, *(snapshot.run.record.warnings if snapshot.run is not None else ())]
+        found += [who + line for line in fields]
+    return found
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """The folders' names; their whole paths where names repeat."""
+    names = [path.resolve().name or str(path) for path in paths]
+    return [str(path) if names.count(name) > 1 else name for name, path in zip(names, paths, strict=True)]
+
+
+@cache
+def environment() -> Environment:
+    """The report's templates and those of the live page."""
+    return html.environment(_loader())
+
+
+def source(name: str) -> str:
+    """The text of a style sheet or script among the templates."""
+    return _loader().get_source(environment(), name)[0]
+
+
+@cache
+def _loader() -> ChoiceLoader:
+    return ChoiceLoader([PackageLoader("unrender.app.watch", "templates"), html.loader()])

@@ -1,1 +1,0 @@
-"""How far a picture is from its reference, and pictures without their noise."""

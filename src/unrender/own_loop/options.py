@@ -1,0 +1,132 @@
+"""What a `Renderer` is made of: its options, checked, and the problems without references that stand for its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.core import checks
+from unrender.core.errors import InputError
+from unrender.estimators.sample_groups import check_pixels
+from unrender.images.base import ImageEstimator
+from unrender.losses import L2
+from unrender.pixels.adaptive_counts import AdaptiveCounts
+from unrender.pixels.all import All
+from unrender.pixels.base import PixelSampler
+from unrender.pixels.uniform import Uniform
+from unrender.rendering.renderer import Renderer as RendererPort
+from unrender.rendering.renderer import format_of
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.validation import open_renderer
+from unrender.scene.view import View
+
+__all__ = ["Options", "open_scene", "problem_of"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of a `Renderer`, see there. Raises `InputError` for those that make no sense, or do not go together."""
+
+    keys: tuple[str, ...]
+    image: ImageEstimator
+    pixels: PixelSampler
+    spp: int
+    adjoint_spp: int | None
+    groups: int
+    coupled: bool
+    sensors: tuple[int, ...]
+    single: bool
+    """Whether one sensor was given by itself, so that its image stands for itself too."""
+    max_depth: int
+    seed: int
+    references: tuple[Any, ...] = field(default=(), compare=False)
+    loss: Any = field(default=None, compare=False)
+
+    def __post_init__(self):
+        owner = "Renderer"
+        checks.integer(owner, "spp", self.spp, at_least=1)
+        if self.adjoint_spp is not None:
+            checks.integer(owner, "adjoint_spp", self.adjoint_spp, at_least=1)
+        checks.integer(owner, "groups", self.groups, at_least=1)
+        checks.integer(owner, "seed", self.seed, at_least=0)
+        if isinstance(self.image, type) or not callable(getattr(self.image, "estimate", None)):
+            raise InputError(f"{owner}: image must be one of unrender.images, such as Plain(), got {self.image!r}")
+        check_pixels(owner, self.pixels, self.image, self.spp)
+        if isinstance(self.pixels, AdaptiveCounts):
+            raise InputError(
+                f"{owner}: AdaptiveCounts needs the loss derivative of each sample, which only optimize() knows; "
+                "use pixels=unrender.pixels.All()"
+            )
+        if self.spp % self.groups:
+            raise InputError(f"{owner}: groups must divide spp, {self.spp}, got {self.groups}")
+        if self.groups > 1 and self.adjoint_spp is not None:
+            raise InputError(
+                f"{owner}: adjoint_spp is for groups=1; with more groups the adjoint is on the image's paths"
+            )
+        if self.coupled and self.groups > 1:
+            raise InputError(f"{owner}: coupled=True goes with groups=1, since its adjoint has paths of its own")
+        if self.coupled and not self.all_pixels:
+            raise InputError(
+                f"{owner}: coupled=True needs the loss derivative of the last step at every pixel; use pixels=unrender.pixels.All()"
+            )
+        if not self.all_pixels and not isinstance(self.pixels, Uniform) and not self.references:
+            raise InputError(
+                f"{owner}: {type(self.pixels).__name__} draws pixels by their loss derivative; give references=, the image that "
+                "each sensor should see, or use unrender.pixels.Uniform"
+            )
+
+    @property
+    def all_pixels(self) -> bool:
+        """Whether every step renders whole images."""
+        return isinstance(self.pixels, All)
+
+    def describe(self) -> dict[str, Any]:
+        """What must be equal for a saved state to fit, in JSON's types."""
+        return {
+            "keys": list(self.keys),
+            "image": repr(self.image),
+            "pixels": repr(self.pixels),
+            "spp": self.spp,
+            "adjoint_spp": self.adjoint_spp,
+            "groups": self.groups,
+            "coupled": self.coupled,
+            "sensors": list(self.sensors),
+            "max_depth": self.max_depth,
+        }
+
+
+def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPort, tuple[str, ...]]:
+    """The renderer port of a scene, and the keys as a tuple. Raises `InputError` where either makes no sense."""
+    names = (keys,) if isinstance(keys, str) else keys
+    if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
+        raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
+    if max_depth is not None:
+        checks.integer("Renderer", "max_depth", max_depth, at_least=1)
+    keys = [name for name in names if isinstance(name, str)]
+    return open_renderer(scene, max_depth, keys), tuple(names)
+
+
+def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...], scene: Any) -> Problem:
+    """A problem whose views are these sensors, with black references where there are none: for the parts that ask for one."""
+    sizes = renderer.resolutions()
+    given = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
+    for sensor in sensors:
+        if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
+            have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
+            raise InputError(f"Renderer: sensor must be {have}, got {sensor!r}")
+
+    def channels(sensor: int) -> int:
+        return 1 if format_of(renderer, sensor).colour == "luminance" else 3
+
+    views = [
+        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], channels(sensor)), np.float32), sensor)
+        for sensor in sensors
+    ]
+    name = Path(scene).stem if isinstance(scene, (str, Path)) else "scene"
+    parameters = [Parameter(key) for key in options.keys]
+    return Problem(renderer, parameters, views, options.loss or L2(), options.max_depth, name=name)

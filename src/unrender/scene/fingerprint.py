@@ -1,0 +1,120 @@
+"""Hashes of a problem, part by part: two problems can be compared, and their differences named."""
+
+from __future__ import annotations
+
+import hashlib
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.io import scene_files
+from unrender.scene.problem import Problem
+
+__all__ = ["differences", "digest", "fingerprint"]
+
+_DIGEST = "sha256:"
+_MOST_OBJECTS = 64
+_known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDictionary()
+
+
+def fingerprint(problem: Problem) -> dict[str, str]:
+    """{part of the problem: its text, or the SHA-256 of its numbers}.
+
+    Parts: the loss, the longest path, each unknown with its start, each view, the numbers of the scene (but for the unknown ones) by
+    object, and, for a scene in XML, every file that it is made of. Computed once per problem and cached.
+    """
+    if problem not in _known:
+        _known[problem] = _take(problem)
+    return dict(_known[problem])
+
+
+def differences(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """What changed, one phrase each: "loss was L1(), is L2()", "file room.xml has changed"."""
+    found = []
+    for part in dict.fromkeys([*before, *now]):
+        old, new = before.get(part), now.get(part)
+        if old == new:
+            continue
+        if old is None or new is None:
+            found.append(f"{part} is {'gone' if new is None else 'new'}")
+        elif old.startswith(_DIGEST) or new.startswith(_DIGEST):
+            found.append(f"{part} has changed")
+        else:
+            found.append(f"{part} was {old}, is {new}")
+    return found
+
+
+def digest(*parts: bytes) -> str:
+    """The SHA-256 of bytes, in words that `differences` knows."""
+    state = hashlib.sha256()
+    for part in parts:
+        state.update(part)
+    return _DIGEST + state.hexdigest()[:32]
+
+
+def _take(problem: Problem) -> dict[str, str]:
+    found = {"loss": repr(problem.loss), "max_depth": str(problem.max_depth)}
+    start = problem.initial()
+    for parameter in problem.parameters:
+        key = parameter.key
+        found[f"parameter {key}: initial"] = _of_array(arrays.numpy(start[key]))
+        found[f"parameter {key}: bounds"] = str(problem.bounds[key])
+        found[f"parameter {key}: learning_rate"] = str(problem.learning_rates.get(key))
+        found[f"parameter {key}: preconditioner"] = repr(problem.preconditioners.get(key))
+        if key in problem.parameterisations:
+            found[f"parameter {key}: parameterisation"] = repr(problem.parameterisations[key])
+        if key in problem.regularizers:
+            found[f"parameter {key}: regularizer"] = repr(problem.regularizers[key])
+        if key in problem.remeshings:
+            found[f"parameter {key}: remeshing"] = repr(problem.remeshings[key])
+        if parameter.self_intersection == "prevent":
+            found[f"parameter {key}: self_intersection"] = "prevent"
+        if key in problem.coarse_to_fine:
+            found[f"parameter {key}: coarse_to_fine"] = repr(problem.coarse_to_fine[key])
+    for index, view in enumerate(problem.views):
+        found[f"view {index}: sensor"] = str(view.sensor)
+        found[f"view {index}: weight"] = str(view.weight)
+        found[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
+        found[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
+    return found | _of_scene(problem) | _of_files(problem)
+
+
+def _of_array(array: np.ndarray) -> str:
+    return digest(f"{array.dtype} {array.shape}".encode(), np.ascontiguousarray(array).tobytes())
+
+
+def _of_scene(problem: Problem) -> dict[str, str]:
+    unknown = {parameter.key for parameter in problem.parameters}
+    known = problem.renderer.parameters()
+    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in unknown)
+    objects: dict[str, list[bytes]] = {}
+    for key, value in problem.renderer.values(keys).items():
+        name = key.partition(".")[0]
+        objects.setdefault(name, []).append(f"{key} {_of_array(arrays.numpy(value))}".encode())
+    if len(objects) > _MOST_OBJECTS:
+        return {"scene": digest(*(part for parts in objects.values() for part in parts))}
+    return {f"scene: {name}": digest(*parts) for name, parts in objects.items()}
+
+
+def _of_files(problem: Problem) -> dict[str, str]:
+    scene = problem.origin.get("scene")
+    if scene is None:
+        return {}
+    root = Path(scene).parent
+    return {f"file {_shown(path, root)}": _of_file(path) for path in scene_files.of(Path(scene))}
+
+
+def _shown(path: Path, root: Path) -> str:
+    return str(path.relative_to(root)) if path.is_relative_to(root) else str(path)
+
+
+def _of_file(path: Path) -> str:
+    state: Any = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            state.update(block)
+    return _DIGEST + state.hexdigest()[:32]

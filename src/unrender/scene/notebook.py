@@ -1,0 +1,62 @@
+"""How a problem is shown: one line of text, and a block of HTML in a notebook."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unrender.display import notebook
+from unrender.display.pictures import shown_image, shown_map
+
+if TYPE_CHECKING:
+    from unrender.scene.problem import Problem
+
+__all__ = ["describe_views", "html", "line"]
+
+_VIEWS, _MAPS = 4, 3
+
+
+def line(problem: Problem) -> str:
+    """Problem('indirect-room': back.bsdf.reflectance.data (64, 64, 3); 1 view of 128x128; L1())."""
+    shapes = problem.shapes()
+    keys = [f"{key} {shapes[key]}" for key in shapes]
+    more = [f"and {len(keys) - 3} more"] if len(keys) > 3 else []
+    return f"Problem({problem.name!r}: {', '.join([*keys[:3], *more])}; {describe_views(problem)}; {_loss(problem)})"
+
+
+def html(problem: Problem) -> str:
+    """References, starts and truths as pictures; the unknowns; what is to be known of the input."""
+    shown = {
+        f"reference {index}": shown_image(np.asarray(view.reference))
+        for index, view in enumerate(problem.views[:_VIEWS])
+    }
+    for key in list(problem.shapes())[:_MAPS]:
+        truth = problem.truth.get(key)
+        for what, values in (("start", problem.initial_values()[key]), ("truth", truth)):
+            colours = None if values is None else shown_map(values, truth)
+            if colours is not None:
+                shown[f"{what}: {key}"] = colours
+    rows = {}
+    for key, shape in problem.shapes().items():
+        low, high = ("open" if side is None else f"{side:g}" for side in problem.bounds[key])
+        about = [f"shape {shape}" if shape else "a number", f"bounds {low} to {high}"]
+        about += [f"learning rate {problem.learning_rates[key]:g}"] if key in problem.learning_rates else []
+        about += [f"{problem.preconditioners[key]!r:.80}"] if key in problem.preconditioners else []
+        about += [f"{problem.parameterisations[key]!r:.80}"] if key in problem.parameterisations else []
+        rows[key] = ", ".join(about)
+    title = f"Problem {problem.name}: {describe_views(problem)}, {_loss(problem)}, up to {problem.max_depth} segments"
+    return notebook.block(
+        title, notebook.picture_row(shown), notebook.facts(rows), notebook.lines(problem.notices, "note: ")
+    )
+
+
+def describe_views(problem: Problem) -> str:
+    """How many views there are, and of which sizes: 2 views of 128x128."""
+    sizes = sorted({(width, height) for height, width in problem.sizes})
+    size = ", ".join(f"{width}x{height}" for width, height in sizes)
+    return f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"
+
+
+def _loss(problem: Problem) -> str:
+    return f"{problem.loss!r:.60}".replace("\n", " ")

@@ -1,0 +1,118 @@
+"""Images of a problem's views as NumPy arrays, for display, reports and comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.errors import InputError, UnrenderError
+from unrender.core.exclusive import exclusive
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import SampleRequest
+from unrender.scene.problem import Problem
+
+__all__ = ["as_tree", "render", "render_pair", "view_request"]
+
+_PATHS_PER_PASS = 1 << 21
+"""Paths per pass, within the memory of a small machine."""
+_MANY_SENSORS = 4
+"""From so many on, all views share one kernel: recording one for each would take longer than rendering."""
+
+
+@exclusive("render")
+def render(
+    problem: Problem,
+    parameters: Mapping[str, np.ndarray] | None = None,
+    view: int = 0,
+    spp: int = 64,
+    seed: int = 0,
+) -> np.ndarray:
+    """Render one view, in as many passes as memory requires. Unbiased, with the film's reconstruction filter.
+
+    Args:
+        problem: whose scene.
+        parameters: {key: array} of all the problem's parameters, also at one of the coarser resolutions that they have in the course of
+            a descent; None for the initial ones.
+        view: index of the view.
+        spp: samples per pixel, >= 1.
+        seed: of the random numbers.
+
+    Returns:
+        float32 (H, W, 3), linear RGB.
+    """
+    if not isinstance(spp, int) or spp < 1:
+        raise InputError(f"render: spp must be a whole number of at least 1, got {spp!r}")
+    if not 0 <= view < len(problem.views):
+        raise InputError(f"render: view must be 0 to {len(problem.views) - 1}, got {view!r}")
+    point = as_tree(problem, parameters)
+    session = problem.renderer.prepare(list(point), None, derivatives=False)
+    sensor = problem.views[view].sensor
+    height, width = problem.renderer.resolutions()[sensor]
+    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width)))
+    total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
+    while done < spp:
+        take = min(per_pass, spp - done)
+        request = view_request(problem, view, take, key.fold(done).uint32())
+        total += take * arrays.numpy(session.image(point, request).images[0]).reshape(total.shape)
+        done += take
+    return (total / spp).astype(np.float32)
+
+
+def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequest:
+    """The request for a view: of its sensor or, where there are many, of all pixels of its film, each with the sensor's index. Images are
+    then (groups, H * W, 3), and all views of one size share their kernels.
+    """
+    sensor, sensors = problem.views[view].sensor, {other.sensor for other in problem.views}
+    known = problem.renderer.parameters()
+    if len(sensors) < _MANY_SENSORS or any(known[parameter.key].rigid for parameter in problem.parameters):
+        return SampleRequest(sensor, spp, seed)
+    height, width = problem.renderer.resolutions()[sensor]
+    like = problem.renderer.array(np.zeros(1))
+    of_pixels = arrays.like_integers(np.full(height * width, sensor), like)
+    return SampleRequest(min(sensors), spp, seed, 1, arrays.arange(like, height * width), of_pixels)
+
+
+@exclusive("render_pair")
+def render_pair(
+    problem: Problem,
+    current: Mapping[str, np.ndarray],
+    previous: Mapping[str, np.ndarray],
+    spp: int,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both images of view 0, on one set of paths traced in the current state. Each unbiased.
+
+    Args:
+        problem: whose scene; its parameters must share paths (`ParameterInfo.shares_paths`).
+        current, previous: {key: array} of all the problem's parameters.
+        spp: samples per pixel, >= 1.
+        seed: of the random numbers.
+
+    Returns:
+        float32 (H, W, 3) of the current state, and of the previous one.
+    """
+    points = as_tree(problem, current), as_tree(problem, previous)
+    session = problem.renderer.prepare(list(points[0]), "path")
+    request = SampleRequest(problem.views[0].sensor, spp, Key(seed).uint32())
+    rendering = session.image_pair(*points, request, "path")
+    current_image, previous_image = rendering.images, rendering.previous
+    if previous_image is None:
+        raise UnrenderError("render_pair: the renderer returned one image of the two")
+    return arrays.numpy(current_image[0]), arrays.numpy(previous_image[0])
+
+
+def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:
+    """`parameters` as the renderer's arrays; None for the initial ones. Raises `InputError` where keys or shapes differ."""
+    point = problem.initial()
+    if parameters is None:
+        return point
+    if set(parameters) != set(point):
+        raise InputError(f"parameters: expected {sorted(point)}, got {sorted(parameters)}")
+    parameters = problem.full(parameters)
+    for key, value in parameters.items():
+        if np.shape(value) != arrays.shape(point[key]):
+            raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
+    return {key: problem.renderer.array(np.asarray(parameters[key])) for key in point}

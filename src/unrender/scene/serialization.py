@@ -1,0 +1,125 @@
+"""A problem as a run folder stores it: problem.toml and arrays beside it, from which it can be made again.
+
+A problem whose scene is XML becomes a problem file with absolute paths and its arrays in the folder `problem`. One of the gallery
+becomes its name and options. Others, made in Python, are described as far as TOML can.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from unrender.core import tables
+from unrender.io import files, toml_lines
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+
+__all__ = ["ARRAYS", "FILE", "origin", "save"]
+
+FILE, ARRAYS = "problem.toml", "problem"
+_INLINE = 64
+"""The most elements of an array that is written into the file itself."""
+
+
+def save(problem: Problem, folder: Path) -> None:
+    """Write problem.toml and what it needs beside it. Raises `InputError` where they cannot be written."""
+    if "gallery" in problem.origin:
+        options = {key: _option(value) for key, value in problem.origin["options"].items()}
+        document, note = {"gallery": problem.origin["gallery"], "options": options}, "The problem, of the gallery"
+    elif "scene" in problem.origin:
+        document, note = _described(problem, folder), "The problem as it was when the run began"
+    else:
+        document = _described(problem, folder)
+        note = "A description of a problem made in Python; resume(..., problem=) needs the problem itself"
+    if (folder / ARRAYS).is_dir():
+        files.sync_folder(folder / ARRAYS)
+    files.write(folder / FILE, toml_lines.encode(f"# {note}\n{tomli_w.dumps(document)}", str(folder / FILE)))
+
+
+def origin(problem: Problem) -> dict[str, Any]:
+    """`Problem.origin` in JSON's types."""
+    options = problem.origin.get("options")
+    return problem.origin | ({} if options is None else {"options": {k: _option(v) for k, v in options.items()}})
+
+
+def _described(problem: Problem, folder: Path) -> dict[str, Any]:
+    rebuilt = "scene" in problem.origin
+    store = _Arrays(folder if rebuilt else None)
+    parameters = [_parameter(problem, index, one, store) for index, one in enumerate(problem.parameters)]
+    views = []
+    for index, view in enumerate(problem.given_views):
+        table: dict[str, Any] = {"sensor": int(view.sensor), "weight": float(view.weight)}
+        for name, picture in (("reference", view.reference), ("mask", view.mask)):
+            if picture is not None:
+                table |= store.field(name, picture, f"view{index}-{name}", inline=False)
+        views.append(table)
+    scene = {"scene": problem.origin["scene"]} if rebuilt else {}
+    head = {"name": problem.name, **scene, "max_depth": problem.max_depth, "loss": _component(problem.loss)}
+    return {**head, "parameters": parameters, "views": views}
+
+
+def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Arrays) -> dict[str, Any]:
+    table: dict[str, Any] = {"key": parameter.key}
+    if parameter.initial is not None:
+        table |= store.field("initial", parameter.initial, f"parameter{index}-initial")
+    if parameter.bounds is not None:
+        low, high = parameter.bounds
+        table["bounds"] = [-np.inf if low is None else float(low), np.inf if high is None else float(high)]
+    if parameter.learning_rate is not None:
+        table["learning_rate"] = float(parameter.learning_rate)
+    if parameter.preconditioner is not None:
+        table["preconditioner"] = _component(parameter.preconditioner)
+    if parameter.key in problem.parameterisations:
+        table["parameterisation"] = _component(problem.parameterisations[parameter.key])
+    if parameter.key in problem.coarse_to_fine:
+        table["coarse_to_fine"] = tables.fields(problem.coarse_to_fine[parameter.key])
+    if parameter.key in problem.regularizers:
+        table["regularizer"] = tables.fields(problem.regularizers[parameter.key])
+    if parameter.key in problem.remeshings:
+        table["remeshing"] = tables.fields(problem.remeshings[parameter.key])
+    if parameter.self_intersection != "warn":
+        table["self_intersection"] = parameter.self_intersection
+    if parameter.key in problem.truth:
+        table |= store.field("truth", problem.truth[parameter.key], f"parameter{index}-truth")
+    return table
+
+
+@dataclasses.dataclass(frozen=True)
+class _Arrays:
+    """The folder of arrays that are too long for the file; None where they are not stored."""
+
+    folder: Path | None
+
+    def field(self, name: str, value: Any, file: str, inline: bool = True) -> dict[str, Any]:
+        """{name: the entry for `value`}; empty where it is not stored."""
+        if isinstance(value, (str, Path)):
+            return {name: str(Path(value).resolve())}
+        array = np.asarray(value)
+        if inline and array.size <= _INLINE and array.ndim <= 1:
+            return {name: array.tolist()}
+        if self.folder is None:
+            return {}
+        buffer = io.BytesIO()
+        np.save(buffer, array, allow_pickle=False)
+        files.write(self.folder / ARRAYS / f"{file}.npy", buffer.getvalue(), name_too=False)
+        return {name: f"{ARRAYS}/{file}.npy"}
+
+
+def _option(value: Any) -> Any:
+    return value if isinstance(value, (bool, int, float, str)) else _component(value)
+
+
+def _component(value: Any) -> Any:
+    """The table of a loss, a preconditioner or a parameterisation; of an unregistered one its `repr`, which no reader accepts."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    try:
+        return tables.table(value)
+    except tables.NotStorable:
+        return repr(value)

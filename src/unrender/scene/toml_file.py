@@ -1,0 +1,161 @@
+"""Problems as TOML files.
+
+    name = "wall"
+    scene = "room.xml"
+    max_depth = 6                              # left out: that of the scene's integrator
+    loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors" }
+
+    [[parameters]]
+    key = "wall.bsdf.reflectance.data"
+    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), a mesh, an array (.npy)
+    bounds = [0.0, 1.0]                        # inf and -inf are open
+    learning_rate = 0.01
+    preconditioner = { type = "LargeSteps", strength = 10.0 }
+    coarse_to_fine = [200, 400]                # steps before which the resolution doubles, see CoarseToFine
+    parameterisation = "logit"                 # what the optimizer moves: identity, log, logit, softplus
+    truth = "wall.exr"                         # where it is known, to measure the error
+
+    [[views]]
+    reference = "photo.exr"
+    sensor = 0
+    weight = 1.0
+    mask = "mask.png"
+
+Paths are relative to the file. Only `scene`, `key` and `reference` are required.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, StrictFloat, StrictInt, StrictStr
+
+from unrender.core import tables
+from unrender.core.errors import InputError
+from unrender.io import confinement, toml_models
+from unrender.io.toml_models import Table
+from unrender.scene import coarse_to_fine
+from unrender.scene.errors import FieldError
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
+
+__all__ = ["read"]
+
+_Number = StrictFloat | StrictInt
+
+
+class _Parameter(Table):
+    key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
+    initial: _Number | StrictStr | list[Any] | None = Field(
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
+    )
+    bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is open)")
+    learning_rate: _Number | None = Field(None, description="a number above 0")
+    preconditioner: StrictStr | dict[str, Any] | None = Field(
+        None, description='a table such as { type = "LargeSteps", strength = 10.0 }'
+    )
+    coarse_to_fine: list[StrictInt] | dict[str, Any] | None = Field(
+        None,
+        description='a list of steps such as [200, 400], or a table such as { steps = [200, 400], states = "reset" }',
+    )
+    parameterisation: StrictStr | dict[str, Any] | None = Field(
+        None,
+        description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
+    )
+    regularizer: dict[str, Any] | None = Field(
+        None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
+    )
+    remeshing: list[StrictInt] | dict[str, Any] | None = Field(
+        None,
+        description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
+    )
+    self_intersection: Literal["warn", "prevent", "ignore"] = Field(
+        "warn", description='of vertex positions, "warn", "prevent" or "ignore"'
+    )
+    truth: _Number | StrictStr | list[Any] | None = Field(
+        None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
+    )
+
+
+class _View(Table):
+    reference: StrictStr = Field(description="the path of a picture (.exr, .hdr, .png, .jpg, .npy)")
+    sensor: StrictInt = Field(0, description="the index of a sensor of the scene, from 0")
+    weight: _Number = Field(1.0, description="a number above 0")
+    mask: StrictStr | None = Field(None, description="the path of a picture with values from 0 to 1")
+
+
+class _Problem(Table):
+    scene: StrictStr = Field(description="the path of a Mitsuba .xml file")
+    parameters: list[_Parameter] = Field(description="at least one [[parameters]] table", min_length=1)
+    views: list[_View] = Field(description="at least one [[views]] table", min_length=1)
+    name: StrictStr | None = Field(None, description="a string of at most 200 characters", max_length=200)
+    max_depth: StrictInt | None = Field(None, description="a whole number of at least 1")
+    loss: StrictStr | dict[str, Any] = Field(
+        "L2", description='a name such as "L1", or a table such as { type = "Huber", delta = 0.1 }'
+    )
+
+
+def read(path: str | Path) -> Problem:
+    """The problem that a TOML file describes.
+
+    Raises:
+        InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
+    """
+    file = Path(path)
+    model, text = toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
+    try:
+        with confinement.within(file.parent):
+            problem = _build(model, file)
+        problem.origin["file"] = str(file.resolve())
+        return problem
+    except FieldError as error:
+        place = error.place
+        if place[0] == "truth":  # in a file it stands with the parameter
+            keys = [parameter.key for parameter in model.parameters]
+            place = ("parameters", keys.index(str(place[1])), "truth")
+        raise toml_models.error_at(file, text, place, error.what) from error
+
+
+def _build(model: _Problem, file: Path) -> Problem:
+    folder = file.parent
+    try:
+        loss = tables.component(model.loss, "loss", folder=folder)
+    except InputError as error:
+        raise FieldError(("loss",), str(error)) from error
+    return Problem(
+        folder / model.scene,
+        [_parameter(index, parameter, folder) for index, parameter in enumerate(model.parameters)],
+        [
+            View(folder / view.reference, view.sensor, view.weight, None if view.mask is None else folder / view.mask)
+            for view in model.views
+        ],
+        loss,
+        model.max_depth,
+        truth={p.key: _value(p.truth, folder) for p in model.parameters if p.truth is not None},
+        name=model.name or file.stem,
+    )
+
+
+def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
+    preconditioner = None
+    if model.preconditioner is not None:
+        try:
+            preconditioner = tables.component(model.preconditioner, "preconditioner", folder=folder)
+        except InputError as error:
+            raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
+    way = None
+    if model.coarse_to_fine is not None:
+        try:
+            way = coarse_to_fine.of(model.coarse_to_fine)
+        except InputError as error:
+            raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
+    start = _value(model.initial, folder)
+    given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
+    given["self_intersection"] = model.self_intersection
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
+
+
+def _value(value: Any, folder: Path) -> Any:
+    return folder / value if isinstance(value, str) else value

@@ -1,0 +1,366 @@
+"""What the user gives to a `Problem`, checked and read: parameters, views, truth, bounds, the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from unrender.core import arrays, tables
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.core.text import shorten
+from unrender.io import bounded_files, confinement, parameter_values, scene_files
+from unrender.losses import FunctionLoss, Loss
+from unrender.parameterisations.base import Bounds, Parameterisation, Transform
+from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
+from unrender.preconditioners.mesh import MeshTopology
+from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.scene import coarse_to_fine
+from unrender.scene.bounds import check_bounds, clip_to_bounds, project
+from unrender.scene.coarse_to_fine import CoarseToFine
+from unrender.scene.errors import FieldError
+from unrender.scene.key_hints import instead_of, near_key
+from unrender.scene.mesh_checks import check_regularizer
+from unrender.scene.mesh_regularizer import MeshRegularizer
+from unrender.scene.parameter import Parameter
+
+__all__ = [
+    "CheckedParameter",
+    "check_loss",
+    "check_loss_function",
+    "check_max_depth",
+    "check_parameter",
+    "check_parameterisation",
+    "check_preconditioner",
+    "check_sequence",
+    "check_truth",
+    "is_number",
+    "mesh_topology",
+    "open_renderer",
+    "renderer_notices",
+]
+
+_DEEPEST = 1 << 20
+_LONGEST_KEY = 200
+
+
+@runtime_checkable
+class _Renderer(Renderer, Protocol): ...
+
+
+@runtime_checkable
+class _Noticing(Protocol):
+    notices: Sequence[str]
+
+
+@runtime_checkable
+class _Preconditioner(Preconditioner, Protocol): ...
+
+
+@runtime_checkable
+class _Parameterisation(Parameterisation, Protocol): ...
+
+
+@runtime_checkable
+class _Loss(Loss, Protocol): ...
+
+
+@dataclass(frozen=True)
+class CheckedParameter:
+    """A parameter with its defaults filled in.
+
+    Attributes:
+        key: of the scene.
+        bounds: (low, high); None is open.
+        learning_rate: None for the optimizer's.
+        preconditioner: None for none.
+        coarse_to_fine: None where its resolution is constant.
+        parameterisation: None where none was given.
+        transform: of that; None for the identity.
+        regularizer: bound to the mesh; None for none.
+        initial: float32, inside the bounds, of the scene's shape.
+        notices: one line for each change made to the input.
+    """
+
+    key: str
+    bounds: Bounds
+    learning_rate: float | None
+    preconditioner: Preconditioner | None
+    coarse_to_fine: CoarseToFine | None
+    parameterisation: Parameterisation | None
+    transform: Transform | None
+    regularizer: MeshRegularizer | None
+    initial: np.ndarray
+    notices: tuple[str, ...]
+
+
+def check_max_depth(max_depth: Any) -> None:
+    """Raise `FieldError` for what is neither a longest path length nor None."""
+    if max_depth is None:
+        return
+    if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
+        hint = "; Mitsuba's -1, no limit, is a number that light hardly reaches, such as 64" if max_depth == -1 else ""
+        given = shorten(repr(max_depth), 60)
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {given}{hint}")
+    if max_depth > _DEEPEST:
+        raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(max_depth), 60)}")
+
+
+def longest_path(renderer: Renderer) -> int:
+    """The longest light path of a renderer in segments; 6 of one that does not tell."""
+    return int(getattr(scene_renderer(renderer), "max_depth", 6))
+
+
+def check_loss(loss: Any) -> Loss:
+    """A loss, made of a function where one is given. Raises `FieldError` for what is neither."""
+    if isinstance(loss, _Loss) and not isinstance(loss, type):
+        return loss
+    try:
+        return FunctionLoss(loss)
+    except InputError as error:
+        raise FieldError(("loss",), str(error)) from error
+
+
+def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
+    """Raise `FieldError` for a function that is no loss of images such as this one (H, W, 3)."""
+    if isinstance(loss, FunctionLoss):
+        try:
+            loss.prepare(reference)
+        except InputError as error:
+            raise FieldError(("loss",), str(error)) from error
+
+
+def check_parameter(
+    index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
+) -> CheckedParameter:
+    """The parameter with its defaults. Raises `FieldError` for the field that is wrong.
+
+    Args:
+        index: of the parameter in the problem, for messages.
+        parameter: as given.
+        known: the scene's parameters.
+        renderer: gives the scene's own value where there is no initial one.
+    """
+    key, info = parameter.key, _known(index, parameter.key, known)
+
+    @contextmanager
+    def checking(field: str) -> Iterator[None]:
+        try:
+            yield
+        except InputError as error:
+            raise FieldError(("parameters", index, field), str(error), f"parameter {key}: {field}") from error
+
+    with checking("initial"):
+        start, notice = _initial(parameter, info, renderer)
+    with checking("bounds"):
+        bounds, narrowed = check_bounds(parameter.bounds, info, start)
+    rate = parameter.learning_rate
+    with checking("learning_rate"):
+        if rate is not None and (not is_number(rate) or rate <= 0):
+            raise InputError(f"expected a number above 0, got {rate!r}")
+    preconditioner, parameterisation, transform, regularizer = None, None, None, None
+    with checking("preconditioner"):
+        if parameter.preconditioner is not None:
+            preconditioner = check_preconditioner(key, parameter.preconditioner, info)
+    with checking("coarse_to_fine"):
+        schedule = _coarse_to_fine(parameter, info)
+    initial, clipped = clip_to_bounds(start, bounds)
+    initial.flags.writeable = False
+    with checking("parameterisation"):
+        if parameter.parameterisation is not None:
+            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
+    with checking("regularizer"):
+        if parameter.regularizer is not None:
+            regularizer = check_regularizer(parameter.regularizer, info)
+    notices = [f"parameter {key}: initial {notice}"] * bool(notice)
+    notices += [f"parameter {key}: {line}" for line in (narrowed, clipped) if line]
+    notices += _at_bounds(key, parameterisation, transform, initial, bounds)
+    own_rate = None if rate is None else float(rate)
+    return CheckedParameter(
+        key,
+        bounds,
+        own_rate,
+        preconditioner,
+        schedule,
+        parameterisation,
+        transform,
+        regularizer,
+        initial,
+        tuple(notices),
+    )
+
+
+def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
+    """What the renderer says of a parameter. Raises `FieldError` for a key that it does not have, or cannot recover."""
+    if not isinstance(key, str) or key not in known:
+        raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
+    if len(key) > _LONGEST_KEY:  # files are named by it
+        raise FieldError(
+            ("parameters", index, "key"), f"{key}: expected at most {_LONGEST_KEY} characters, got {len(key)}"
+        )
+    info = known[key]
+    if not info.differentiable and not info.perturbable:
+        raise FieldError(
+            ("parameters", index, "key"), f"{key} cannot be recovered: {info.reason}{instead_of(key, known)}"
+        )
+    return info
+
+
+def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
+    """A line where values start on a bound that a parameterisation leaves slowly; none otherwise."""
+    count = 0 if transform is None else int(np.sum(project(initial, *bounds) != initial))
+    slowly = f"at a bound, which {type(given).__name__.lower()} leaves slowly"
+    return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
+
+
+def check_parameterisation(
+    given: Any, bounds: Bounds, initial: np.ndarray
+) -> tuple[Parameterisation, Transform | None]:
+    """A parameterisation, made of its name or table, and its φ. Raises `InputError`."""
+    try:
+        made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
+    except InputError as error:
+        raise InputError(str(error).removeprefix("parameterisation: ")) from error
+    if isinstance(made, type) or not isinstance(made, _Parameterisation):
+        raise InputError(f"expected one of unrender.parameterisations, or its name, got {shorten(repr(given), 60)}")
+    return made, made.transform(bounds, initial)
+
+
+def mesh_topology(info: ParameterInfo) -> MeshTopology | None:
+    """Of the mesh at whose vertices a parameter has values; None where it has none."""
+    return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
+
+
+def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
+    """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
+    if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
+        raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
+    if isinstance(preconditioner, MeshPreconditioner) and (topology := mesh_topology(info)) is not None:
+        preconditioner = preconditioner.on_mesh(topology)
+    elif isinstance(preconditioner, PeriodicPreconditioner) and info.conversion.repeated:
+        preconditioner = preconditioner.on_repeated(info.conversion.repeated)
+    try:
+        preconditioner.check(key, info.shape)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{key}: preconditioner ")) from error
+    return preconditioner
+
+
+def _coarse_to_fine(parameter: Parameter, info: ParameterInfo) -> CoarseToFine | None:
+    if parameter.coarse_to_fine is None:
+        return None
+    schedule = coarse_to_fine.of(parameter.coarse_to_fine)
+    _check_resolutions(schedule, info)
+    if parameter.preconditioner is not None:
+        parameter.preconditioner.check(parameter.key, schedule.shape(info.shape, 0))
+    return schedule
+
+
+def check_resolutions(key: str, schedule: CoarseToFine, info: ParameterInfo) -> None:
+    """Raise `InputError` for a parameter that cannot have these resolutions."""
+    try:
+        _check_resolutions(schedule, info)
+    except InputError as error:
+        raise InputError(f"parameter {key}: coarse_to_fine: {error}") from error
+
+
+def _check_resolutions(schedule: CoarseToFine, info: ParameterInfo) -> None:
+    if not info.resizable:
+        raise InputError("its resolution is fixed; expected the data of a bitmap texture or a grid volume")
+    schedule.check(info.shape)
+
+
+def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> tuple[np.ndarray, str]:
+    """The initial value, float32, and what was changed to make it fit, "" for nothing."""
+    if parameter.initial is not None:
+        return parameter_values.fill(parameter.initial, info.shape, info.conversion)
+    # On a CPU the scene's own memory, which nobody writes to: grids and textures can be as large as all else.
+    start = np.asarray(arrays.view(renderer.values([parameter.key])[parameter.key]), np.float32)
+    if not np.isfinite(start).all():
+        raise InputError("the scene's own value is not finite; give another")
+    return start, ""
+
+
+def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:
+    """Return the true value of a parameter, float32, and what was changed to make it fit, "" for nothing.
+
+    Args:
+        key: of the parameter.
+        value: as given.
+        known: the problem's parameters.
+
+    Raises:
+        FieldError: it does not suit.
+    """
+    if key not in known:
+        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, known)}")
+    try:
+        return parameter_values.fill(value, known[key].shape, known[key].conversion)
+    except InputError as error:
+        raise FieldError(("truth", key), str(error)) from error
+
+
+def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
+    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. `keys`:
+    parameters that will be asked for. Raises `FieldError`."""
+    if isinstance(scene, _Renderer) and not isinstance(scene, type):
+        return scene
+    loaded = type(scene).__module__.partition(".")[0] == "mitsuba"
+    if not isinstance(scene, (str, Path, dict)) and not callable(scene) and not loaded:
+        got = type(scene).__name__
+        raise FieldError(("scene",), f"expected an .xml file, a Mitsuba dictionary or a function, got {got}")
+    from unrender.backend.variant import ensure
+
+    try:
+        if isinstance(scene, (str, Path)) and bounded_files.kind(Path(scene)) == "file":
+            _check_files(Path(scene))
+    except InputError as error:
+        raise FieldError(("scene",), str(error).removeprefix("scene ")) from error
+    ensure()
+    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+
+    try:
+        return MitsubaRenderer(scene, max_depth, keys)
+    except InputError as error:
+        raise FieldError(("scene",), str(error).removeprefix("scene: ").removeprefix("scene ")) from error
+
+
+def _check_files(scene: Path) -> None:
+    """Raise `InputError` where an XML scene of a problem file names files outside of both folders.
+
+    A scene that a script names itself is trusted as the script is.
+    """
+    if not confinement.is_confined():
+        return
+    for path in dict.fromkeys(scene_files.read(scene).named):
+        confinement.check(path, [scene.absolute().parent], f"scene {scene.name}: it names")
+
+
+def renderer_notices(renderer: Renderer) -> Sequence[str]:
+    """What a renderer does otherwise than its scene asks for, one line each; a renderer need not tell."""
+    return renderer.notices if isinstance(renderer, _Noticing) else ()
+
+
+def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
+    """A tuple of at least one `kind`. Raises `FieldError`."""
+    items = (given,) if isinstance(given, kind) else given
+    if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
+        raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(given).__name__}")
+    if not items:
+        raise FieldError((name,), f"expected at least one {kind.__name__}, got none")
+    for index, item in enumerate(items):
+        if not isinstance(item, kind):
+            what = f"expected a {kind.__name__}, got {type(item).__name__}"
+            raise FieldError((name, index), what)
+    return tuple(items)
+
+
+def is_number(x: Any) -> bool:
+    return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)

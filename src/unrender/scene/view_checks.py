@@ -1,0 +1,126 @@
+"""Checks of views, and their pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.io import images
+from unrender.io.stored_pictures import PictureStore, StoredPicture
+from unrender.losses import Censored, Loss
+from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.renderer import Renderer, format_of
+from unrender.scene.errors import FieldError
+from unrender.scene.reference_formats import read_reference
+from unrender.scene.references import ON_DEVICE
+from unrender.scene.validation import is_number
+from unrender.scene.view import View
+
+__all__ = ["check_views"]
+
+_WHITE = 0.001
+"""Share of saturated pixels that is told."""
+
+
+def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
+    """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
+
+    Args:
+        given: as the problem was given them.
+        renderer: of the scene, whose films tell sizes and formats.
+        loss: one that knows of saturated pixels needs no notice of them.
+    """
+    found, notices, resolutions = [], [], renderer.resolutions()
+    films = scene_renderer(renderer)
+    known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
+    store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
+    for number, one in enumerate(given):
+        view, notes = _check_view(number, one, resolutions, films, not isinstance(loss, Censored))
+        found.append(view if store is None else _stored(view, store))
+        notices += notes
+    return tuple(found), notices
+
+
+def _check_view(
+    index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
+) -> tuple[View, list[str]]:
+    """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
+
+    Args:
+        index: of the view in the problem, for messages.
+        view: as given.
+        resolutions: (height, width) of each sensor's film.
+        films: the renderer that may tell their formats.
+        tell_saturated: whether a reference with saturated pixels is worth a notice.
+    """
+    owner = f"view {index}"
+
+    def wrong(field: str, what: str | Exception) -> FieldError:
+        return FieldError(("views", index, field), str(what), f"{owner}: {field}")
+
+    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(resolutions):
+        have = f"0 to {len(resolutions) - 1}" if len(resolutions) > 1 else "0, the only sensor"
+        raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
+    if not is_number(view.weight) or view.weight <= 0:
+        raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
+    height, width = resolutions[view.sensor]
+    notices: list[str] = []
+    limited, alpha = None, None  # in values, to a white
+    try:
+        if isinstance(view.reference, StoredPicture):
+            _check_size(view.reference, height, width, view.sensor)
+            reference = view.reference
+        else:
+            read = read_reference(view.reference, format_of(films, view.sensor))
+            reference, alpha = read.values, read.alpha
+            _check_size(reference, height, width, view.sensor)
+            notices += [f"{owner}: reference {notice}" for notice in read.notices]
+            limited = reference if read.limited else None
+    except InputError as error:
+        raise wrong("reference", error) from error
+    mask = view.mask
+    if view.mask is not None and not isinstance(view.mask, StoredPicture):
+        try:
+            mask = images.read(view.mask, linearise=False).values
+            _check_size(mask, height, width, view.sensor)
+            mask = mask.mean(axis=2)
+            if mask.min() < 0 or mask.max() > 1:
+                raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
+            if not mask.any():
+                raise InputError("it is 0 everywhere: no pixel would count")
+        except InputError as error:
+            raise wrong("mask", error) from error
+    if alpha is not None:
+        mask = alpha if mask is None else np.asarray(mask) * alpha
+        if not mask.any():
+            raise wrong("reference", "its alpha, with the mask, is 0 everywhere: no pixel would count")
+    counted = None if mask is None else np.asarray(mask) > 0
+    if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
+        notices.append(
+            f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+        )
+    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
+
+
+def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
+    """The share of pixels that are white in a channel, among those that count; None for all."""
+    white = np.any(reference >= 1, axis=2)
+    return float(np.mean(white if counted is None else white[counted]))
+
+
+def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sensor: int) -> None:
+    if values.shape[:2] != (height, width):
+        raise InputError(
+            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
+            f"but the film of sensor {sensor} is {width}x{height}"
+        )
+
+
+def _stored(view: View, store: PictureStore) -> View:
+    """A view that was checked, with its pictures in a file."""
+    kept = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
+    return replace(view, **kept)
