@@ -38,7 +38,7 @@ def scaled(optimizer: Callable[..., Optimizer], schedule: Schedule | None = None
     return lambda rate: optimizer(UNIT, schedule=Scaled(rate / UNIT, schedule or Constant()))
 
 
-class ErrorRecorder(ur.Callback):
+class ErrorRecorder(ur.protocols.Callback):
     """Keeps (seconds, samples, error) as a run goes, and at its end, for each error; its own time is not the run's."""
 
     def __init__(self, measure: Measure, start: dict[str, float], every: float):

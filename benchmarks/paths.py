@@ -42,7 +42,7 @@ def straight(problem: ur.Problem, steps: int) -> list[Tree]:
     return path
 
 
-class _Recorder(ur.Callback):
+class _Recorder(ur.protocols.Callback):
     """Keeps the parameters of every step of a run."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ POINTS = 40
 _PICTURE_SPP = 64
 
 
-class Kept(ur.Callback):
+class Kept(ur.protocols.Callback):
     """Parameters along a run of ours, over the processor time of its steps; ends it when that is used up.
 
     Args:

@@ -46,7 +46,7 @@ def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], 
         *(() if KNOWN in nuisances else ("light",)),
         *(name for name in ("exposure", "vignetting", "response", "poses") if name in models),
     )
-    options = ur.ImportOptions(
+    options = ur.app.ImportOptions(
         mesh=folder / "photographs" / "body.ply",
         masks=folder / "photographs" / "masks",
         resolution=size,
@@ -56,7 +56,7 @@ def imported(folder: Path, nuisances: tuple[str, ...], models: tuple[str, ...], 
         band=BAND if "masks" in models else 0,
         turntable=capture.TURNTABLE in nuisances,
     )
-    ur.import_capture(folder / "photographs", folder / "problem", options)
+    ur.app.import_capture(folder / "photographs", folder / "problem", options)
     if KNOWN in nuisances:
         mi.Bitmap(made.sky.astype(np.float32)).write(str(folder / "problem" / "textures" / "light.exr"))
     return ur.Problem.from_file(folder / "problem" / "problem.toml"), made

@@ -133,14 +133,14 @@ def stock(
     return {key: np.array(dr.ravel(optimizer[key])).reshape(shape) for key, shape in shapes.items()}, step
 
 
-class Clock(ur.Callback):
+class Clock(ur.protocols.Callback):
     """Ends a run after so many seconds of the processor. Its first step, which compiles, does not count."""
 
     def __init__(self, seconds: float):
         self.seconds, self.spent, self.steps = seconds, 0.0, 0
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `ur.Callback`."""
+        """See `ur.protocols.Callback`."""
         del record
         now = time.process_time()
         self.spent += now - self._since if self.steps else 0.0

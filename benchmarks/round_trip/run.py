@@ -58,7 +58,7 @@ def pictures(kind: str, folder: Path, held_out: ur.Problem, spp: int) -> list[np
 def compare(problem: ur.Problem, held_out: ur.Problem, values: dict[str, np.ndarray], folder: Path, spp: int) -> dict:
     """{format: PSNR of each held-out photograph, and of the run's own pictures}."""
     formats = ["mitsuba", "environment", *READERS]
-    ur.export((problem, values), folder, formats=formats)
+    ur.app.export((problem, values), folder, formats=formats)
     known = held_out.renderer.parameters()
     shown = {key: value for key, value in values.items() if key in known}
     judged = ur.Problem(
@@ -115,8 +115,8 @@ def run(
     for name in unknowns:
         folder = scratch("round_trip/asset")
         shutil.rmtree(folder, ignore_errors=True)
-        options = ur.ImportOptions(resolution=size, texture=texture, faces=faces, unknowns=UNKNOWNS[name])
-        ur.import_capture(given, folder, options)
+        options = ur.app.ImportOptions(resolution=size, texture=texture, faces=faces, unknowns=UNKNOWNS[name])
+        ur.app.import_capture(given, folder, options)
         problem = ur.Problem.from_file(folder / "problem.toml")
         choice = method("auto").configure({"pixels": pixels}).plan(problem)
         result = ur.optimize(problem, choice, steps=steps, seed=seed)

@@ -75,7 +75,7 @@ def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
     return lambda values: total_error(errors(values), start)
 
 
-class Curve(ur.Callback):
+class Curve(ur.protocols.Callback):
     """(seconds, error) along a run, as often as the loop's."""
 
     def __init__(self, error: Callable[[dict[str, Any]], float], every: float):

@@ -112,7 +112,7 @@ def estimator(problem: ur.Problem, combination: tuple[bool, ...], sigma: float) 
         return path
     annealed = ur.schedules.Exponential(25, 0.1)
     smoothed = ur.SmoothedDerivatives(sigma, SAMPLES, spp=SPP, schedule=annealed, debiased=True)
-    return ur.HybridGradient(path, smoothed, poses, averaged=gradients)
+    return ur.estimators.HybridGradient(path, smoothed, poses, averaged=gradients)
 
 
 def entrants(problem: ur.Problem, name: str, only: tuple[str, ...] | None) -> list[Entrant]:
@@ -133,7 +133,7 @@ def entrants(problem: ur.Problem, name: str, only: tuple[str, ...] | None) -> li
     return found
 
 
-class ProcessorBudget(ur.Callback):
+class ProcessorBudget(ur.protocols.Callback):
     """Ends a run after so many seconds of the process; its own time is not the run's.
 
     Args:

@@ -15,6 +15,7 @@ from unrender.core.signals import end_at_once as _end_at_once
 
 _end_at_once()  # before anything that takes time
 
+import warnings
 from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,8 @@ from unrender.core.errors import InputError, UnrenderError, VariantError
 
 if TYPE_CHECKING:
     from unrender import (
+        app,
+        estimators,
         gallery,
         images,
         losses,
@@ -33,73 +36,44 @@ if TYPE_CHECKING:
         pixels,
         preconditioners,
         protocols,
+        runs,
+        scene,
         schedules,
         statistics,
     )
-    from unrender.app import report as report
-    from unrender.app.capture.importing import ImportOptions, import_capture
-    from unrender.app.cli.sweep_function import sweep
-    from unrender.app.distributed.deal import deal
-    from unrender.app.evaluation.judge import judge
-    from unrender.app.evaluation.turntable import turntable
-    from unrender.app.exporting.scene_folder import export
-    from unrender.core.random import Key
+    from unrender import io as io
     from unrender.core.registry import register
     from unrender.estimators import smoothing as smoothed
     from unrender.estimators.base import Estimate
-    from unrender.estimators.filtered import FilteredGradient
     from unrender.estimators.gauss_newton import GaussNewton
-    from unrender.estimators.hybrid import HybridGradient
-    from unrender.estimators.loss_values import LossValues
     from unrender.estimators.meta import MetaEstimator
     from unrender.estimators.path import PathGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
     from unrender.estimators.smoothing import grey_box as grey_box
-    from unrender.estimators.stock import StockGradient
-    from unrender.io.volumes import Grid, read_grid, write_grid
     from unrender.losses import metrics
     from unrender.own_loop.renderer import Renderer
-    from unrender.runs.callbacks import Callback
-    from unrender.runs.live import Live
     from unrender.runs.optimize import estimate, optimize
     from unrender.runs.reopen import resume
     from unrender.runs.result import Result
     from unrender.runs.sensitivity import sensitivity
-    from unrender.runs.tensorboard import TensorBoard
-    from unrender.scene.coarse_to_fine import CoarseToFine
     from unrender.scene.parameter import Parameter
     from unrender.scene.problem import Problem
     from unrender.scene.render import render, render_pair
     from unrender.scene.view import View
 
 _MODULES = {
-    "gallery": "gallery",
+    **{
+        name: name
+        for name in ("app", "estimators", "gallery", "images", "io", "losses", "optimizers", "parameterisations")
+    },
+    **{name: name for name in ("pixels", "preconditioners", "protocols", "runs", "scene", "schedules", "statistics")},
     "grey_box": "estimators.smoothing.grey_box",
-    "images": "images",
-    "losses": "losses",
     "metrics": "losses.metrics",
-    "optimizers": "optimizers",
-    "parameterisations": "parameterisations",
-    "pixels": "pixels",
-    "preconditioners": "preconditioners",
-    "protocols": "protocols",
-    "report": "app.report",
-    "schedules": "schedules",
     "smoothed": "estimators.smoothing",
-    "statistics": "statistics",
 }
 _HOMES = {
-    "Callback": "runs.callbacks",
-    "CoarseToFine": "scene.coarse_to_fine",
     "Estimate": "estimators.base",
-    "FilteredGradient": "estimators.filtered",
     "GaussNewton": "estimators.gauss_newton",
-    "Grid": "io.volumes",
-    "HybridGradient": "estimators.hybrid",
-    "ImportOptions": "app.capture.importing",
-    "Key": "core.random",
-    "Live": "runs.live",
-    "LossValues": "estimators.loss_values",
     "MetaEstimator": "estimators.meta",
     "Parameter": "scene.parameter",
     "PathGradient": "estimators.path",
@@ -107,43 +81,47 @@ _HOMES = {
     "Renderer": "own_loop.renderer",
     "Result": "runs.result",
     "SmoothedDerivatives": "estimators.smoothed",
-    "StockGradient": "estimators.stock",
-    "TensorBoard": "runs.tensorboard",
     "View": "scene.view",
-    "deal": "app.distributed.deal",
     "estimate": "runs.optimize",
-    "export": "app.exporting.scene_folder",
-    "import_capture": "app.capture.importing",
-    "judge": "app.evaluation.judge",
     "optimize": "runs.optimize",
-    "read_grid": "io.volumes",
     "register": "core.registry",
     "render": "scene.render",
     "render_pair": "scene.render",
     "resume": "runs.reopen",
     "sensitivity": "runs.sensitivity",
-    "sweep": "app.cli.sweep_function",
-    "turntable": "app.evaluation.turntable",
-    "write_grid": "io.volumes",
 }
+_MOVED = {
+    "Callback": "protocols.Callback",
+    "CoarseToFine": "scene.CoarseToFine",
+    "FilteredGradient": "estimators.FilteredGradient",
+    "Grid": "io.Grid",
+    "HybridGradient": "estimators.HybridGradient",
+    "ImportOptions": "app.ImportOptions",
+    "Key": "core.random.Key",
+    "Live": "runs.Live",
+    "LossValues": "estimators.LossValues",
+    "StockGradient": "estimators.StockGradient",
+    "TensorBoard": "runs.TensorBoard",
+    "deal": "app.distribute",
+    "export": "app.export",
+    "import_capture": "app.import_capture",
+    "judge": "app.judge",
+    "read_grid": "io.read_grid",
+    "report": "app.report",
+    "sweep": "app.sweep",
+    "turntable": "app.turntable",
+    "write_grid": "io.write_grid",
+}
+"""Names of the first drafts of this version, and where they are now. They go with version 0.2."""
 
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
     _variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
 
-# Without grey_box, which needs PyTorch: `from unrender import *` and `help(unrender)` must work where that is missing.
+# Without grey_box, which needs PyTorch, and without io, whose name the standard library has: `from unrender import *` must do no harm.
 __all__ = [
-    "Callback",
-    "CoarseToFine",
     "Estimate",
-    "FilteredGradient",
     "GaussNewton",
-    "Grid",
-    "HybridGradient",
-    "ImportOptions",
     "InputError",
-    "Key",
-    "Live",
-    "LossValues",
     "MetaEstimator",
     "Parameter",
     "PathGradient",
@@ -151,18 +129,14 @@ __all__ = [
     "Renderer",
     "Result",
     "SmoothedDerivatives",
-    "StockGradient",
-    "TensorBoard",
     "UnrenderError",
     "VariantError",
     "View",
-    "deal",
+    "app",
     "estimate",
-    "export",
+    "estimators",
     "gallery",
     "images",
-    "import_capture",
-    "judge",
     "losses",
     "metrics",
     "optimize",
@@ -171,31 +145,35 @@ __all__ = [
     "pixels",
     "preconditioners",
     "protocols",
-    "read_grid",
     "register",
     "render",
     "render_pair",
-    "report",
     "resume",
+    "runs",
+    "scene",
     "schedules",
     "sensitivity",
     "smoothed",
     "statistics",
-    "sweep",
-    "turntable",
     "use",
-    "write_grid",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES or name in _HOMES:
+    if name in _MODULES:
         _variant.prepare()
-        if name in _MODULES:
-            return import_module(f"unrender.{_MODULES[name]}")
+        return import_module(f"unrender.{_MODULES[name]}")
+    if name in _HOMES:
+        _variant.prepare()
         value = getattr(import_module(f"unrender.{_HOMES[name]}"), name)
         globals()[name] = value
         return value
+    if name in _MOVED:
+        warnings.warn(f"unrender.{name} is now unrender.{_MOVED[name]}", DeprecationWarning, stacklevel=2)
+        module, _, own = _MOVED[name].rpartition(".")
+        _variant.prepare()
+        home = import_module(f"unrender.{module}")
+        return getattr(home, own) if hasattr(home, own) else import_module(f"unrender.{_MOVED[name]}")
     raise AttributeError(f"module 'unrender' has no attribute {name!r}")
 
 

@@ -78,6 +78,8 @@ GIVEN = {
         def f(points, items): return (points**2).sum(axis=1)
     """,
 }
+GROUPS = ("app", "estimators", "io", "runs", "scene")
+"""Packages whose public names the reference lists one by one."""
 SLOW_EXAMPLES = {
     "unrender.app.exporting.scene_folder.export",
     "unrender.own_loop.renderer.Renderer",
@@ -87,7 +89,7 @@ ILLUSTRATIONS = {
     "unrender.optimizers.chain.Chain": "the names are not imported; docs/reference/optimizers.md runs such one",
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
-    "unrender.app.distributed.deal.deal": "it starts worker processes, as tests/render/test_dealt_runs.py does",
+    "unrender.app.distributed.distribute.distribute": "it starts worker processes, as tests/render/test_dealt_runs.py does",
     "unrender.app.cli.sweep_function.sweep": "it starts worker processes; tests/cli/test_sweep_command.py has a sweep from Python",
 }
 
@@ -236,7 +238,25 @@ def test_the_reference_has_every_public_name():
     whole = set(re.findall(r"automodule:: ([\w.]+)$", text, re.MULTILINE))
     for name in ur.__all__:
         protocol = name in getattr(ur.protocols, "__all__")  # noqa: B009
-        assert name in single or protocol or PUBLIC_MODULES.get(name) in whole, name
+        assert name in single or protocol or name in GROUPS or PUBLIC_MODULES.get(name) in whole, name
+    for group in GROUPS:
+        for name in getattr(ur, group).__all__:
+            assert name in single or re.search(
+                rf"auto(?:class|function):: unrender\.{group}\.{name}$", text, re.MULTILINE
+            ), name
+
+
+def test_names_that_have_moved_warn_and_are_the_same() -> None:
+    for name, home in ur._MOVED.items():
+        with pytest.warns(DeprecationWarning, match=rf"unrender\.{name} is now unrender\.{home}"):
+            found = getattr(ur, name)
+        module, _, own = home.rpartition(".")
+        place = importlib.import_module(f"unrender.{module}")
+        assert found is (getattr(place, own) if hasattr(place, own) else importlib.import_module(f"unrender.{home}")), (
+            name
+        )
+    with pytest.raises(AttributeError):
+        _ = ur.nothing
 
 
 def test_names_in_the_pages_exist():
@@ -287,6 +307,6 @@ def test_the_stub_has_every_public_name():
         for alias in node.names
     }
     plain = {"use", "InputError", "UnrenderError", "VariantError"}
-    assert seen | plain == {*ur.__all__, "grey_box"}
+    assert seen | plain == {*ur.__all__, "grey_box", "io"}
     assert all(hasattr(ur, name) for name in ur.__all__)
     assert (ROOT / "src/unrender/py.typed").is_file()

@@ -115,15 +115,15 @@ def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.Monke
 
     for home in ("sweep_function", "sweep_driver"):
         monkeypatch.setattr(f"unrender.app.cli.{home}.run_trials", run_trials)
-    found = ur.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
+    found = ur.app.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
     words = ["--method", "plain", "--over", "learning_rate=0.01:0.1:log", "--over", "spp=1,4", "--steps", 3]
     assert unrender("sweep", "quad", *words, "--trials", 5, "-s", "beta_2=0.9", "--threads", 1).status == 0
     assert plans[0] == plans[1]
     assert found.plan == plans[0][0]
     with pytest.raises(ur.InputError, match="nothing to vary"):
-        ur.sweep("quad", "plain")
+        ur.app.sweep("quad", "plain")
     with pytest.raises(ur.InputError, match="holds earlier results"):
-        ur.sweep("quad", "plain", over, out="python")
+        ur.app.sweep("quad", "plain", over, out="python")
 
 
 def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant: str) -> None:

@@ -60,7 +60,7 @@ CASES: dict[str, Callable[[], tuple[Any, Any]]] = {
     "smoothed-newton-cg": lambda: (ur.SmoothedDerivatives(0.03, 16, "hvp"), _optimizers.NewtonCG()),
     "smoothed-lbfgs": lambda: (ur.SmoothedDerivatives(0.03, 16), _optimizers.LBFGS(trust_radius=0.5)),
     "smoothed-adam": lambda: (ur.SmoothedDerivatives(0.03, 16), _optimizers.Adam(0.02)),
-    "cma-es": lambda: (ur.LossValues(2), _optimizers.CMAES(0.1)),
+    "cma-es": lambda: (ur.estimators.LossValues(2), _optimizers.CMAES(0.1)),
 }
 
 

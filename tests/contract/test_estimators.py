@@ -32,9 +32,9 @@ Denoised = ur.images.Denoised
 CV = ur.images.RecursiveControlVariate
 
 
-def hybrid(path: Any) -> ur.HybridGradient:
+def hybrid(path: Any) -> ur.estimators.HybridGradient:
     """Path gradients of the map, perturbed renders for the colour."""
-    return ur.HybridGradient(path, ur.SmoothedDerivatives(0.03, samples=16, debiased=True), keys=("colour",))
+    return ur.estimators.HybridGradient(path, ur.SmoothedDerivatives(0.03, samples=16, debiased=True), keys=("colour",))
 
 
 ESTIMATORS: dict[str, Callable[[], Any]] = {
@@ -83,7 +83,7 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "smoothed products, joint diagonal": lambda: ur.SmoothedDerivatives(
         0.03, 32, "hvp", hessian_rate=0.5, hessian_form="diagonal", orthogonal=True
     ),
-    "loss values": lambda: ur.LossValues(spp=4),
+    "loss values": lambda: ur.estimators.LossValues(spp=4),
     "Gauss-Newton": lambda: ur.GaussNewton(spp=8, derivative_spp=4),
     "coupled, own paths": lambda: ur.MetaEstimator(coupled=True, spp=1),
     "coupled, other statistics": lambda: ur.MetaEstimator(coupled=True, spp=2, statistics="independent"),
@@ -95,10 +95,10 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
     "hybrid, all four": lambda: hybrid(
         ur.MetaEstimator(coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none"))
     ),
-    "stock": lambda: ur.StockGradient(spp=2),
-    "filtered": lambda: ur.FilteredGradient(ur.PathGradient(spp=2)),
-    "filtered, control variate": lambda: ur.FilteredGradient(ur.PathGradient(CV(), spp=2)),
-    "filtered, coupled": lambda: ur.FilteredGradient(ur.MetaEstimator(coupled=True, spp=3)),
+    "stock": lambda: ur.estimators.StockGradient(spp=2),
+    "filtered": lambda: ur.estimators.FilteredGradient(ur.PathGradient(spp=2)),
+    "filtered, control variate": lambda: ur.estimators.FilteredGradient(ur.PathGradient(CV(), spp=2)),
+    "filtered, coupled": lambda: ur.estimators.FilteredGradient(ur.MetaEstimator(coupled=True, spp=3)),
     "denoised": lambda: ur.PathGradient(Denoised(by="variation"), spp=4),
     "denoised control variate": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=6),
     "denoised, own paths": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=1),
@@ -433,7 +433,7 @@ def test_the_noise_that_history_tells_is_the_share_that_the_variance_has() -> No
     asked = problem(noise=0.9)
     told: list[float] = []
 
-    class Listener(ur.Callback):
+    class Listener(ur.protocols.Callback):
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
             variance = sum(v.sum() for v in run.estimate.variance.values())
             energy = sum((g * g).sum() for g in run.estimate.gradient.values())
@@ -692,7 +692,7 @@ def test_samples_form_as_many_leave_one_out_groups_as_divide_them(spp: int, grou
 def test_callbacks_hear_and_can_stop() -> None:
     heard: list[str] = []
 
-    class Listener(ur.Callback):
+    class Listener(ur.protocols.Callback):
         def on_start(self, run: Any) -> None:
             heard.append("start")
 
@@ -712,7 +712,7 @@ def test_ctrl_c_returns_what_was_reached() -> None:
     import os
     import signal
 
-    class Interrupt(ur.Callback):
+    class Interrupt(ur.protocols.Callback):
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
             if record["step"] == 3:
                 os.kill(os.getpid(), signal.SIGINT)

@@ -11,7 +11,7 @@ import pytest
 
 import unrender as ur
 from tests.contract import analytic
-from unrender.app.distributed.assignment import deal
+from unrender.app.distributed.assignment import assign
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.hosts import LocalHosts
 from unrender.app.distributed.share import ViewShare
@@ -32,7 +32,7 @@ class Counting(LocalExecutor):
 
 
 def distributed(problem: ur.Problem) -> DistributedExecutor:
-    shares = deal([16] * VIEWS, 2)
+    shares = assign([16] * VIEWS, 2)
     parts = [problem.replaced(views=[problem.given_views[view] for view in views]) for views in shares]
     hosts = LocalHosts(tuple(ViewShare(part, views) for part, views in zip(parts, shares, strict=True)))
     return DistributedExecutor(problem, shares, hosts)

@@ -328,7 +328,7 @@ def test_no_module_is_imported_because_a_file_names_it(tmp_path: Path, monkeypat
     assert "trap" not in sys.modules
 
 
-class Stop(ur.Callback):
+class Stop(ur.protocols.Callback):
     """Interrupts after five steps."""
 
     def on_step(self, run, record):

@@ -507,7 +507,7 @@ METHODS = {
 }
 
 
-class Renders(ur.Callback):
+class Renders(ur.protocols.Callback):
     """Looks at the run's images at every step, in every way there is."""
 
     def __init__(self) -> None:
@@ -520,7 +520,7 @@ class Renders(ur.Callback):
         self.images.extend(ur.render_pair(run.problem, parameters, parameters, 2, 1))
 
 
-def optimised(method: str, callbacks: tuple[ur.Callback, ...] = ()) -> ur.Result:
+def optimised(method: str, callbacks: tuple[ur.protocols.Callback, ...] = ()) -> ur.Result:
     estimator = METHODS[method]()
     optimizer = ur.optimizers.MetaAdam() if isinstance(estimator, ur.MetaEstimator) else ur.optimizers.Adam()
     return ur.optimize(problem(), estimator, optimizer, steps=4, seed=3, callbacks=callbacks)

@@ -7,7 +7,7 @@ from typing import Any
 import unrender as ur
 
 
-class At(ur.Callback):
+class At(ur.protocols.Callback):
     """Does something once, after a number of steps."""
 
     def __init__(self, step: int, what: Any):

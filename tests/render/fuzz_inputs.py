@@ -194,7 +194,7 @@ def _npy(array: np.ndarray) -> bytes:
 def _volume_files() -> Files:
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     values = np.random.default_rng(0).random((3, 4, 5, 1)).astype(np.float32)
-    ur.write_grid(place / "a.vol", values)
+    ur.io.write_grid(place / "a.vol", values)
     np.save(place / "a.npy", values)
     np.savez_compressed(place / "a.npz", values=values)
     return {path.name: path.read_bytes() for path in place.iterdir()}

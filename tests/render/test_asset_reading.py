@@ -134,5 +134,5 @@ def test_maps_that_are_too_large_are_refused_and_nothing_is_left(
     monkeypatch.setattr(materials, "MOST_TEXELS", 7)
     before = sorted(tmp_path.iterdir())
     with pytest.raises(ur.InputError, match="reflectance has 8 x 4 texels, expected at most 7 along a side"):
-        ur.export((problem, problem.initial_values()), tmp_path / "out", formats=["obj"])
+        ur.app.export((problem, problem.initial_values()), tmp_path / "out", formats=["obj"])
     assert sorted(tmp_path.iterdir()) == before

@@ -51,7 +51,7 @@ PAIRS: dict[str, tuple[Any, Any]] = {
     "uniform": (ur.PathGradient(pixels=ur.pixels.Uniform(16), spp=2), ur.optimizers.Adam(0.02)),
     "loss": (ur.PathGradient(pixels=ur.pixels.LossProportional(16, refresh=4, denoiser="none"), spp=2), ur.optimizers.Adam(0.02)),
     "views": (ur.PathGradient(image=rcv(), pixels=ur.pixels.Views(1), spp=2), ur.optimizers.Adam(0.02)),
-    "filtered": (ur.FilteredGradient(ur.PathGradient(image=rcv(), spp=2)), ur.optimizers.Adam(0.02)),
+    "filtered": (ur.estimators.FilteredGradient(ur.PathGradient(image=rcv(), spp=2)), ur.optimizers.Adam(0.02)),
     "momentum": (ur.PathGradient(spp=2), ur.optimizers.SGD(0.5, momentum=0.9)),
 }  # fmt: skip
 
@@ -119,25 +119,25 @@ def test_downsampling_keeps_the_mean_and_constants() -> None:
 
 
 def test_shapes_by_step() -> None:
-    way = ur.CoarseToFine((200, 400))
+    way = ur.scene.CoarseToFine((200, 400))
     assert [way.shape((64, 64, 64, 1), step) for step in (0, 199, 200, 399, 400, 9999)] == [
         (n, n, n, 1) for n in (16, 16, 32, 32, 64, 64)
     ]
-    assert ur.CoarseToFine((5,), factor=3).shape((53, 45, 44, 1), 0) == (18, 15, 15, 1)
+    assert ur.scene.CoarseToFine((5,), factor=3).shape((53, 45, 44, 1), 0) == (18, 15, 15, 1)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ur.CoarseToFine(()), r"steps must be whole numbers of at least 1 that ascend, such as \[200, 400\], got \(\)"),
-        (lambda: ur.CoarseToFine((4, 4)), "steps must be whole numbers"),
-        (lambda: ur.CoarseToFine((0, 4)), "steps must be whole numbers"),
-        (lambda: ur.CoarseToFine((True, 4)), "steps must be whole numbers"),
-        (lambda: ur.CoarseToFine((4,), factor=1), "factor must be"),
-        (lambda: ur.CoarseToFine((4,), wrap=1), "wrap must be true, false"),  # type: ignore
-        (lambda: ur.CoarseToFine((4,), states="keep"), 'states must be "estimator", "carry" or "reset", got \'keep\''),  # type: ignore
+        (lambda: ur.scene.CoarseToFine(()), r"steps must be whole numbers of at least 1 that ascend, such as \[200, 400\], got \(\)"),
+        (lambda: ur.scene.CoarseToFine((4, 4)), "steps must be whole numbers"),
+        (lambda: ur.scene.CoarseToFine((0, 4)), "steps must be whole numbers"),
+        (lambda: ur.scene.CoarseToFine((True, 4)), "steps must be whole numbers"),
+        (lambda: ur.scene.CoarseToFine((4,), factor=1), "factor must be"),
+        (lambda: ur.scene.CoarseToFine((4,), wrap=1), "wrap must be true, false"),  # type: ignore
+        (lambda: ur.scene.CoarseToFine((4,), states="keep"), 'states must be "estimator", "carry" or "reset", got \'keep\''),  # type: ignore
         (lambda: problem((1, 2, 3, 4)), "coarse_to_fine: shape .* is too small to be coarser 4 times by 2"),
-        (lambda: problem(ur.CoarseToFine((1,), wrap=(True,))), "coarse_to_fine: wrap must have 2 entries"),
+        (lambda: problem(ur.scene.CoarseToFine((1,), wrap=(True,))), "coarse_to_fine: wrap must have 2 entries"),
         (lambda: problem("soon"), "coarse_to_fine: CoarseToFine: steps must be whole numbers"),
         (lambda: problem({"step": 3}), "coarse_to_fine: CoarseToFine has no option step"),
     ],
@@ -164,7 +164,7 @@ def test_what_has_one_resolution_is_refused() -> None:
 
 def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any, Any]:
     """A run before its change of resolution, and after: (run, memory) each."""
-    found = problem(ur.CoarseToFine((steps,), states=states))  # type: ignore
+    found = problem(ur.scene.CoarseToFine((steps,), states=states))  # type: ignore
     run, memory = loop.prepare(Plan(found, *PAIRS[name]), 9, None, 0)
     for _ in range(steps):
         loop._step(run, memory)
@@ -344,7 +344,7 @@ def test_auto_starts_a_grid_coarse_whoever_has_the_views() -> None:
 
 
 def test_by_default_the_estimator_remembers_and_the_optimizer_starts_anew() -> None:
-    assert ur.CoarseToFine((3,)).states == "estimator"
+    assert ur.scene.CoarseToFine((3,)).states == "estimator"
     parameters, before, run, memory = at_the_change("rcv", "estimator")
     assert memory.estimator.image.views is before.estimator.image.views
     np.testing.assert_allclose(
@@ -358,7 +358,7 @@ def test_by_default_the_estimator_remembers_and_the_optimizer_starts_anew() -> N
 def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     """−η sign(g), by the schedule's factor of the present step."""
     schedule = ur.optimizers.schedules.Steps(every=3, factor=0.5)
-    found = problem(ur.CoarseToFine((3,), states="reset"))
+    found = problem(ur.scene.CoarseToFine((3,), states="reset"))
     plan = Plan(found, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02, schedule=schedule))
     run, memory = loop.prepare(plan, 9, None, 0)
     for _ in range(3):
@@ -374,7 +374,7 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
 
 
 def test_what_cannot_be_carried_starts_anew_and_says_so() -> None:
-    found = problem(ur.CoarseToFine((2,), states="carry"))
+    found = problem(ur.scene.CoarseToFine((2,), states="carry"))
     result = ur.optimize(found, ur.PathGradient(spp=2), ur.optimizers.LBFGS(0.1), 5)
     assert "step 2: LBFGSState cannot be carried to another resolution: it starts anew" in result.warnings
     smoothed = ur.optimize(found, ur.SmoothedDerivatives(0.05, 8), ur.optimizers.CMAES(diagonal=True), 4)
@@ -385,7 +385,7 @@ def test_what_cannot_be_carried_starts_anew_and_says_so() -> None:
 # ---------------------------------------------------------------------- whole runs
 
 
-class Shapes(ur.Callback):
+class Shapes(ur.protocols.Callback):
     def __init__(self):
         self.seen: list[Any] = []
 
@@ -397,8 +397,8 @@ class Shapes(ur.Callback):
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_run_ends_fine_with_the_history_of_all_stages(name: str, states: Any, tmp_path: Path) -> None:
     listen = Shapes()
-    live = ur.Live(tmp_path / "run")
-    found = problem(ur.CoarseToFine((3, 6), states=states))
+    live = ur.runs.Live(tmp_path / "run")
+    found = problem(ur.scene.CoarseToFine((3, 6), states=states))
     result = ur.optimize(found, *PAIRS[name], 9, callbacks=[listen, live], run_directory=tmp_path / "run")
     assert listen.seen == [(4, 3)] * 3 + [(8, 6)] * 3 + [(16, 12)] * 3
     assert [record["step"] for record in result.history] == list(range(9))
@@ -438,7 +438,7 @@ def test_without_noise_coarse_to_fine_finds_the_field() -> None:
     assert ends[0] < 0.5 * ends[1]  # 48 pixels do not tell 192 texels, but 12
 
 
-class Stop(ur.Callback):
+class Stop(ur.protocols.Callback):
     def __init__(self, step: int):
         self.step = step
 
@@ -449,7 +449,7 @@ class Stop(ur.Callback):
 
 @functools.cache
 def uninterrupted(name: str, states: Any) -> ur.Result:
-    return ur.optimize(problem(ur.CoarseToFine((3,), states=states)), *PAIRS[name], 6)
+    return ur.optimize(problem(ur.scene.CoarseToFine((3,), states=states)), *PAIRS[name], 6)
 
 
 @pytest.mark.parametrize("at", quick([2, 3, 4], 3))
@@ -457,7 +457,7 @@ def uninterrupted(name: str, states: Any) -> ur.Result:
 @pytest.mark.parametrize("name", PAIRS)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:
     """Interrupted before a change of resolution, at it, and after it."""
-    way = ur.CoarseToFine((3,), states=states)
+    way = ur.scene.CoarseToFine((3,), states=states)
     whole = uninterrupted(name, states)
     with pytest.raises(KeyboardInterrupt):
         ur.optimize(
@@ -489,7 +489,7 @@ def solve(strength: float, size: tuple[int, ...], x: np.ndarray) -> np.ndarray:
     return np.asarray(scipy.sparse.linalg.spsolve(matrix, x.ravel())).reshape(x.shape)
 
 
-class Sizes(ur.Callback):
+class Sizes(ur.protocols.Callback):
     """What a callback sees of the parameter's size; its error can be asked for."""
 
     def __init__(self) -> None:
@@ -510,10 +510,10 @@ def planned(given: ur.Problem, **settings: Any) -> Plan:
 def test_a_plan_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     """As those of `Parameter`, with states carried; a parameter's own come first."""
     estimator = ur.PathGradient(image=rcv(), spp=2)
-    coarse = ur.CoarseToFine((3, 6), states="carry")
+    coarse = ur.scene.CoarseToFine((3, 6), states="carry")
     brings = planned(problem(None), coarse_to_fine=coarse)
     whole = ur.optimize(problem(None), brings, steps=8, seed=1)
-    given = problem(ur.CoarseToFine((3, 6), states="carry"))
+    given = problem(ur.scene.CoarseToFine((3, 6), states="carry"))
     own = ur.optimize(given, estimator, ur.optimizers.ScheduleFree(0.05), steps=8, seed=1)
     np.testing.assert_array_equal(whole.parameters[KEY], own.parameters[KEY])
     assert [step["resolution"][KEY] for step in whole.history if "resolution" in step] == [(4, 3), (8, 6), (16, 12)]
@@ -534,7 +534,7 @@ def test_a_plan_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tm
 
 def test_resolutions_of_a_plan_that_make_no_sense_are_refused() -> None:
     def descend(steps: Any) -> None:
-        ur.optimize(problem(None), planned(problem(None), coarse_to_fine=ur.CoarseToFine(steps)), steps=1)
+        ur.optimize(problem(None), planned(problem(None), coarse_to_fine=ur.scene.CoarseToFine(steps)), steps=1)
 
     with pytest.raises(InputError, match=f"parameter {KEY}: coarse_to_fine: .*too small to be coarser 5 times by 2"):
         descend((3, 6, 9, 12, 15))
@@ -553,7 +553,7 @@ def test_auto_takes_coarse_steps_for_grids_alone(cells: tuple[int, ...], steps: 
     choice = method("auto").plan(made)
     assert isinstance(choice.optimizer, ur.optimizers.ScheduleFree)
     coarse = choice.settings[KEY].coarse_to_fine
-    assert coarse == (ur.CoarseToFine(steps, states="carry") if steps else None)
+    assert coarse == (ur.scene.CoarseToFine(steps, states="carry") if steps else None)
     assert any("coarse to fine" in reason for reason in choice.reasons) == bool(steps)
     detailed = truth + np.arange(cells[0]).reshape(-1, *(1,) * len(cells)) * 0.01
     for others, options in (
@@ -640,7 +640,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-class Scenes(ur.Callback):
+class Scenes(ur.protocols.Callback):
     """What both scenes hold at each step: texels of the wall, voxels of the smoke along an axis."""
 
     def __init__(self):
@@ -655,8 +655,8 @@ class Scenes(ur.Callback):
 @pytest.mark.slow
 def test_the_scene_takes_each_resolution(folder: Path) -> None:
     found = ur.Problem.from_file(folder / "problem.toml")
-    assert found.coarse_to_fine[WALL] == ur.CoarseToFine((2, 4))
-    assert found.coarse_to_fine[SMOKE] == ur.CoarseToFine((3,), states="reset")
+    assert found.coarse_to_fine[WALL] == ur.scene.CoarseToFine((2, 4))
+    assert found.coarse_to_fine[SMOKE] == ur.scene.CoarseToFine((3,), states="reset")
     scenes = Scenes()
     result = ur.optimize(
         found, *PAIRS["coupled"], 5, callbacks=[scenes], run_directory=folder / "run", checkpoint_every=1
@@ -671,7 +671,7 @@ def test_the_scene_takes_each_resolution(folder: Path) -> None:
     again = ur.resume(folder / "run", steps=6)
     assert again.steps == 6
     assert again.history[:5] == ur.resume(folder / "run", steps=7).history[:5]
-    done = ur.export(folder / "run", folder / "out")
+    done = ur.app.export(folder / "run", folder / "out")
     assert np.array(mi.VolumeGrid(str(done.folder / "maps" / "smoke.interior_medium.sigma_t.vol"))).shape == (4, 4, 4)
 
 

@@ -64,7 +64,7 @@ def test_a_checkpoint_of_other_arrays_is_one_line(
         ur.resume(tmp_path / "run", problem, steps=3, **again)
 
 
-class Kill(ur.Callback):
+class Kill(ur.protocols.Callback):
     """Ends the process of the last share, as the system does where memory is short."""
 
     def on_step(self, run: Any, record: Any) -> None:
@@ -83,14 +83,14 @@ def test_two_workers_descend_as_one_process_and_a_kill_changes_nothing() -> None
     views = [ur.View(image * (1 + 0.1 * index)) for index in range(4)]
     problem = ur.Problem(room.renderer, room.parameters, views, room.loss, room.max_depth)
 
-    def run(problem: ur.Problem, *callbacks: ur.Callback) -> dict[str, np.ndarray]:
+    def run(problem: ur.Problem, *callbacks: ur.protocols.Callback) -> dict[str, np.ndarray]:
         estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
         adam = ur.optimizers.Adam(learning_rate=0.02)
         return ur.optimize(problem, estimator, adam, steps=12, progress=False, callbacks=callbacks).parameters
 
     alone = run(problem)
     lines: list[str] = []
-    with ur.deal(problem, workers=2, threads=1, tell=lines.append) as together:
+    with ur.app.distribute(problem, workers=2, threads=1, tell=lines.append) as together:
         whole = run(together)
         broken = run(together, Kill())
         executor = together.executor

@@ -80,6 +80,6 @@ def test_a_run_tells_in_its_folder(tmp_path: Any):
     made = problem(scene(material), "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value")
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
-    page = ur.report.page(tmp_path / "run").read_text()
+    page = ur.app.report.page(tmp_path / "run").read_text()
     assert "Not determined by the pictures" in page
     assert "wall.bsdf.sheen_tint.value: over its whole range" in page

@@ -117,7 +117,7 @@ def test_a_power_cut_leaves_the_last_checkpoint(tmp_path: Path, whole: dict[str,
     """On the worst disk that POSIX allows, at every fifth flush, and right after the end."""
     promised: list[tuple[int, int]] = []
 
-    class Note(ur.Callback):
+    class Note(ur.protocols.Callback):
         def on_step(self, run, record):
             if run.step % 2 == 0:
                 promised.append((now.flushes, run.step))

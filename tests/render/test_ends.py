@@ -275,7 +275,7 @@ def test_a_second_thread_is_refused_while_a_run_goes_on(tmp_path: Path, whole: u
             lambda: ur.render(problem),
             lambda: ur.estimate(problem, ur.PathGradient()),
             lambda: ur.gallery.problem("exponential"),
-            lambda: ur.export((problem, {}), tmp_path / "scene"),
+            lambda: ur.app.export((problem, {}), tmp_path / "scene"),
         )
         for call in calls:
             with pytest.raises(InputError) as caught:
@@ -302,7 +302,7 @@ def test_a_long_history_is_thinned_and_resumed(tmp_path: Path, monkeypatch: pyte
     sizes: list[int] = []
     followed = HistoryReader(folder / "history.jsonl", folder)
 
-    class Watch(ur.Callback):
+    class Watch(ur.protocols.Callback):
         def on_step(self, run, record):
             sizes.append((folder / "history.jsonl").stat().st_size)
             if run.step % 50 == 0:

@@ -41,7 +41,7 @@ def test_a_material_that_tells_no_description_is_one_line(tmp_path: Path) -> Non
     for description in (scene(MADE_BEFORE[0]), lambda: scene(MADE_BEFORE[0])):
         asked = problem(description)
         with pytest.raises(ur.InputError, match=r"^ball\.bsdf: a ready-made .*, which tells no description of itself"):
-            ur.export((asked, start(asked)), tmp_path / "out")
+            ur.app.export((asked, start(asked)), tmp_path / "out")
         assert not list(tmp_path.iterdir())
     MADE_BEFORE.clear()
 
@@ -53,7 +53,7 @@ def test_materials_made_by_load_described_are_exported(tmp_path: Path) -> None:
         return scene(load_described({"type": "roughconductor", "distribution": "ggx", "alpha": 0.25}))
 
     asked = problem(description, "ball.bsdf.alpha.value")
-    done = ur.export((asked, {"ball.bsdf.alpha.value": np.array(0.5)}), tmp_path / "out")
+    done = ur.app.export((asked, {"ball.bsdf.alpha.value": np.array(0.5)}), tmp_path / "out")
     assert done.scene is not None
     assert 'value="ggx"' in done.scene.read_text()
 
@@ -67,7 +67,7 @@ def test_diffuse_materials_made_by_mitsuba_are_read_off_the_object(tmp_path: Pat
 
     loader = mi.load_dict
     asked = problem(description, "ball.bsdf.brdf_0.reflectance.value")
-    done = ur.export((asked, {"ball.bsdf.brdf_0.reflectance.value": np.array(0.75)}), tmp_path / "out")
+    done = ur.app.export((asked, {"ball.bsdf.brdf_0.reflectance.value": np.array(0.75)}), tmp_path / "out")
     assert mi.load_dict is loader
     found: Any = mi.load_file(str(done.scene))
     shapes = [shape for shape in found.shapes() if shape.bsdf() is not None]
@@ -91,7 +91,7 @@ def test_a_texture_of_the_scene_that_two_materials_share_is_one_parameter_and_is
 
     asked = problem(description, "ball.bsdf.reflectance.data")
     assert "other.bsdf.reflectance.data" not in asked.renderer.parameters()
-    done = ur.export((asked, {"ball.bsdf.reflectance.data": 0.5 * values}), tmp_path / "out")
+    done = ur.app.export((asked, {"ball.bsdf.reflectance.data": 0.5 * values}), tmp_path / "out")
     again = MitsubaRenderer(done.scene)
     keys = [key for key in again.parameters() if key.endswith("reflectance.data")]
     for key in keys:
@@ -102,9 +102,9 @@ def test_a_texture_of_the_scene_that_two_materials_share_is_one_parameter_and_is
 def test_values_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     asked = problem(scene({"type": "diffuse"}))
     with pytest.raises(ur.InputError, match="expected"):
-        ur.export((asked, {}), tmp_path / "out")
+        ur.app.export((asked, {}), tmp_path / "out")
     with pytest.raises(ur.InputError, match="shape"):
-        ur.export((asked, {"sky.radiance.value": np.zeros((2, 2))}), tmp_path / "out")
+        ur.app.export((asked, {"sky.radiance.value": np.zeros((2, 2))}), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
@@ -118,7 +118,7 @@ def test_a_scene_with_other_values_than_asked_for_is_not_left(tmp_path: Path, mo
     monkeypatch.setattr(exporting, "store", faulty)
     asked = problem(scene({"type": "diffuse"}))
     with pytest.raises(ur.InputError, match=r"parameter sky\.radiance\.value cannot be exported: .* another value"):
-        ur.export((asked, start(asked)), tmp_path / "out")
+        ur.app.export((asked, start(asked)), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
@@ -126,13 +126,13 @@ def test_an_export_that_died_is_set_right_by_the_next(tmp_path: Path) -> None:
     """One that died between two renames, on a system that cannot exchange names, and one that died before."""
     problem = ur.gallery.problem("lamp", resolution=8, reference_spp=4)
     values = {key: np.asarray(value) for key, value in problem.initial().items()}
-    ur.export((problem, values), tmp_path / "out")
+    ur.app.export((problem, values), tmp_path / "out")
     dead = 2**22 + 1
     (tmp_path / "out").rename(tmp_path / f".out.{dead}.old")
     (tmp_path / f".out.{dead}.part").mkdir()
     (tmp_path / f".out.{dead}.part" / "scene.xml").write_text("half")
     with pytest.raises(ur.InputError, match="holds an earlier export"):  # it is back
-        ur.export((problem, values), tmp_path / "out")
+        ur.app.export((problem, values), tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 

@@ -226,7 +226,7 @@ def test_an_exported_environment_map_is_read_back_exactly(renderer: MitsubaRende
     )
     problem = ur.Problem(scene, [ur.Parameter("sky.data", initial=0.5)], [VIEW], max_depth=2)
     sky = periodic.pad(2 * PICTURE, 1)
-    ur.export((problem, {"sky.data": sky}), tmp_path / "out", formats=["mitsuba"])
+    ur.app.export((problem, {"sky.data": sky}), tmp_path / "out", formats=["mitsuba"])
     for written in ("maps/sky.exr", "textures/sky.exr"):
         found = of_file(renderer, "sky.data", tmp_path / "out" / written)
         np.testing.assert_array_equal(found, sky)

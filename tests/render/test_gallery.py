@@ -433,7 +433,7 @@ def test_a_cup_with_its_handle_hidden_looks_the_same_whichever_way_it_is_turned(
 def test_a_cup_s_angle_and_its_label_are_recovered_in_one_run():
     problem = ur.gallery.problem("mug", label=6, resolution=24, reference_spp=256)
     choice = method("auto").plan(problem, {"sigma": 0.6, "spp": 2})
-    assert isinstance(choice.estimator, ur.HybridGradient)
+    assert isinstance(choice.estimator, ur.estimators.HybridGradient)
     assert choice.estimator.keys == ("mug.rotation.y",)
     found = ur.optimize(problem, choice, steps=60)
     angle, label = problem.parameter_error(found.parameters).values()

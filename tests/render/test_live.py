@@ -35,7 +35,7 @@ def _always(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_POLL_SECONDS", 0.0)
 
 
-class Then(ur.Callback):
+class Then(ur.protocols.Callback):
     """Does something at one step."""
 
     def __init__(self, **at: Any):
@@ -47,7 +47,7 @@ class Then(ur.Callback):
             self._at[run.step]()
 
 
-def descend(problem: ur.Problem, callbacks: list[ur.Callback], steps: int = 6) -> ur.Result:
+def descend(problem: ur.Problem, callbacks: list[ur.protocols.Callback], steps: int = 6) -> ur.Result:
     estimator = ur.PathGradient(spp=4)
     return ur.optimize(problem, estimator, ur.optimizers.Adam(learning_rate=0.02), steps=steps, callbacks=callbacks)
 
@@ -88,7 +88,7 @@ def test_what_is_written_is_what_the_run_is(problem, tmp_path):
 def test_pictures_are_those_of_the_step(problem, tmp_path):
     kept: list[np.ndarray] = []
 
-    class Keep(ur.Callback):
+    class Keep(ur.protocols.Callback):
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
             kept.append(np.asarray(run.estimate.info["images"][0], np.float32))
             with np.load(tmp_path / "live" / "views.npz") as found:
@@ -201,7 +201,7 @@ def test_updates_take_at_most_their_share_of_the_time(problem, tmp_path, monkeyp
     writes: list[float] = []
     monkeypatch.setattr(module, "_views", lambda run: writes.append(now[0]) or now.__setitem__(0, now[0] + 0.1) or {})
 
-    class Tick(ur.Callback):
+    class Tick(ur.protocols.Callback):
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
             now[0] += 0.05
 
@@ -323,7 +323,7 @@ def test_commands_are_followed_while_the_disk_is_full(problem, tmp_path, monkeyp
 def test_what_is_not_finite_is_null_for_those_who_watch(problem, tmp_path):
     """Strict JSON has no word for it."""
 
-    class Spoil(ur.Callback):
+    class Spoil(ur.protocols.Callback):
         def on_step(self, run: Any, record: dict[str, Any]) -> None:
             record["loss"] = float("nan")
 

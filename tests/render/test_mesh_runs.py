@@ -43,7 +43,7 @@ def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_p
     np.testing.assert_array_equal(written.vertices.astype(np.float32).reshape(-1), result.parameters[STATUE])
     # What is exported renders what the last picture shows.
     moved = problem.remeshed({STATUE: _mesh(run)})
-    exported = ur.export((moved, result.parameters), tmp_path / "scene", formats=["mitsuba", "ply", "obj"])
+    exported = ur.app.export((moved, result.parameters), tmp_path / "scene", formats=["mitsuba", "ply", "obj"])
     for path in (tmp_path / "scene/ply/statue.ply", tmp_path / "scene/obj/asset.obj"):
         again: Any = trimesh.load(path, process=False, maintain_order=True)
         np.testing.assert_allclose(np.sort(again.vertices, axis=0), np.sort(written.vertices, axis=0), atol=1e-6)

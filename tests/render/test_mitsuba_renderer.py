@@ -115,7 +115,7 @@ def test_no_kernel_is_compiled_after_warm_up(name: str) -> None:
     launched: list[int] = []
     new: list[int] = []
 
-    class Count(ur.Callback):
+    class Count(ur.protocols.Callback):
         """Looks at the kernels between one step's end and the next's."""
 
         def on_start(self, run: Any) -> None:

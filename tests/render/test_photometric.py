@@ -36,11 +36,11 @@ def test_true_normals_and_colours_render_the_photographs(linear: bool, tmp_path:
         shown = one if linear else srgb(one)
         Image.fromarray((255 * shown + 0.5).astype(np.uint8)).save(folder / f"{index}.png")
 
-    found = ur.import_capture(folder, tmp_path / "plate", ur.ImportOptions(hold_out=0))
+    found = ur.app.import_capture(folder, tmp_path / "plate", ur.app.ImportOptions(hold_out=0))
     assert (found.kind, found.views, found.held_out, found.size) == ("lights", 6, 0, (WIDTH, HEIGHT))
     assert any("linear" in notice for notice in found.notices) == linear
     with pytest.raises(ur.InputError, match="overwrite=True"):
-        ur.import_capture(folder, tmp_path / "plate")
+        ur.app.import_capture(folder, tmp_path / "plate")
     problem = ur.Problem.from_file(tmp_path / "plate" / "problem.toml")
     # Only the product of colour and light is known: a brightness is the first picture's.
     shapes = {key: value.shape for key, value in problem.initial_values().items()}

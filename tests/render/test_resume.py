@@ -47,7 +47,7 @@ reference = "photo.exr"
 """
 
 
-class Stop(ur.Callback):
+class Stop(ur.protocols.Callback):
     """Interrupts after some steps, as a second Ctrl-C does."""
 
     def __init__(self, step: int):
@@ -85,7 +85,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(wall: Path) -> None:
     interrupted(ur.Problem.from_file(wall), folder)
     told: list[int] = []
 
-    class Listen(ur.Callback):
+    class Listen(ur.protocols.Callback):
         def on_start(self, run):
             told.append(run.step)
 

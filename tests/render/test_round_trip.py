@@ -25,8 +25,8 @@ NOISE = 2.0
 def recovered(tmp_path_factory: pytest.TempPathFactory) -> tuple[ur.Problem, ur.Problem, dict[str, np.ndarray]]:
     folder = tmp_path_factory.mktemp("round-trip")
     ur.gallery.photographs(folder / "photographs", views=9, size=32, spp=64)
-    options = ur.ImportOptions(resolution=32, texture=32, faces=800, voxels=32, unknowns=UNKNOWNS)
-    ur.import_capture(folder / "photographs", folder / "problem", options)
+    options = ur.app.ImportOptions(resolution=32, texture=32, faces=800, voxels=32, unknowns=UNKNOWNS)
+    ur.app.import_capture(folder / "photographs", folder / "problem", options)
     problem = ur.Problem.from_file(folder / "problem" / "problem.toml")
     result = ur.optimize(problem, "auto", steps=20)
     assert np.ptp(result.parameters["asset.bsdf.normalmap.data"]) > 0.1

@@ -166,7 +166,7 @@ def test_a_state_that_was_packed_goes_on_as_it_was(name: str) -> None:
         np.testing.assert_array_equal(state.emitters.probabilities, again.emitters.probabilities)
 
 
-class Stop(ur.Callback):
+class Stop(ur.protocols.Callback):
     """Interrupts after some steps."""
 
     def on_step(self, run, record):
@@ -243,5 +243,5 @@ def test_beside_perturbed_renders_it_looks_at_the_parameters_of_paths() -> None:
     lamp = "lamp0.emitter.radiance.value"
     smoothed = ur.SmoothedDerivatives(0.3, samples=4)
     asked = problem(4, keys=(FLOOR, lamp))
-    _, state = estimates(asked, ur.HybridGradient(adaptive(), smoothed, keys=(lamp,)), 6)
+    _, state = estimates(asked, ur.estimators.HybridGradient(adaptive(), smoothed, keys=(lamp,)), 6)
     assert state.path.emitters.probabilities[0] > 0.3

@@ -66,7 +66,7 @@ def test_of_an_emissive_medium_there_are_the_grids(tmp_path: Path) -> None:
     problem = small("nerf-volume")
     parameters = elsewhere(problem)
     for overwrite in (False, True):
-        done = ur.export((problem, parameters), tmp_path / "out", overwrite=overwrite)
+        done = ur.app.export((problem, parameters), tmp_path / "out", overwrite=overwrite)
     assert done.scene is None
     assert any("plain Mitsuba has no emissive medium" in notice for notice in done.notices)
     for key, value in parameters.items():
@@ -92,7 +92,7 @@ def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
     keys = ["ball.interior_medium.albedo.value.value", "ball.interior_medium.phase_function.g"]
     problem = ur.Problem(scene, [ur.Parameter(key) for key in keys], [ur.View(np.zeros((8, 8, 3)))], max_depth=5)
     parameters = elsewhere(problem)
-    done = ur.export((problem, parameters), tmp_path / "out")
+    done = ur.app.export((problem, parameters), tmp_path / "out")
     assert done.scene is not None
     verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
     assert verdict, figures
@@ -102,7 +102,7 @@ def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
 def test_plain_mitsuba_renders_the_runs_picture(name: str, tmp_path: Path) -> None:
     problem = small(name)
     parameters = elsewhere(problem)
-    done = ur.export((problem, parameters), tmp_path / "scene")
+    done = ur.app.export((problem, parameters), tmp_path / "scene")
     view = len(problem.views) - 1
     verdict, figures = agree(ours(problem, parameters, view), theirs(done.scene, problem.views[view].sensor), size=2)
     assert verdict, figures
@@ -113,7 +113,7 @@ def test_a_wrong_texture_is_seen(tmp_path: Path) -> None:
     """The test above can fail: a quarter of the texels of an exported texture a fifth brighter."""
     problem = small("poster")
     parameters = elsewhere(problem)
-    done = ur.export((problem, parameters), tmp_path / "scene")
+    done = ur.app.export((problem, parameters), tmp_path / "scene")
     (texture,) = (done.folder / "textures").iterdir()
     pixels = np.array(mi.Bitmap(str(texture)))
     pixels[:4, :4] *= 1.2
@@ -144,7 +144,7 @@ def test_the_tutorials_cornell_box(assets: Path, tmp_path: Path) -> None:
     ):
         problem = ur.Problem(path, [ur.Parameter(key) for key in keys], black, max_depth=4)
         parameters = elsewhere(problem, 0.1)
-        done = ur.export((problem, parameters), tmp_path / f"exported-{number}")
+        done = ur.app.export((problem, parameters), tmp_path / f"exported-{number}")
         verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
         assert verdict, figures
         assert not done.notices
@@ -210,7 +210,7 @@ def still() -> tuple[Problem, dict[str, np.ndarray]]:
 
 def test_ready_made_objects_and_parameters_of_every_kind(still: Any, tmp_path: Path) -> None:
     problem, parameters = still
-    done = ur.export(still, tmp_path / "scene")
+    done = ur.app.export(still, tmp_path / "scene")
     verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
     assert verdict, figures
 
@@ -218,8 +218,8 @@ def test_ready_made_objects_and_parameters_of_every_kind(still: Any, tmp_path: P
 @pytest.mark.slow
 def test_an_exported_scene_exports_as_itself(still: Any, tmp_path: Path) -> None:
     """Its XML is a problem's scene with the same keys and values; exported once more, meshes and pictures are the same."""
-    first = ur.export(still, tmp_path / "first").folder
-    names = dict(notice.split(" is called ") for notice in ur.export(still, tmp_path / "again").notices)
+    first = ur.app.export(still, tmp_path / "first").folder
+    names = dict(notice.split(" is called ") for notice in ur.app.export(still, tmp_path / "again").notices)
     keys = [names[key].removesuffix(" in the exported scene") if key in names else key for key in KEYS]
     again = ur.Problem(
         first / "scene.xml", [ur.Parameter(key) for key in keys], [ur.View(np.zeros((8, 8, 3)))], max_depth=4
@@ -227,7 +227,7 @@ def test_an_exported_scene_exports_as_itself(still: Any, tmp_path: Path) -> None
     read = {key: np.array(value.numpy()) for key, value in again.renderer.values(keys).items()}
     for key, (own, value) in zip(keys, still[1].items(), strict=True):
         np.testing.assert_allclose(read[key], value, rtol=1e-5, atol=1e-6, err_msg=own)
-    second = ur.export((again, read), tmp_path / "second").folder
+    second = ur.app.export((again, read), tmp_path / "second").folder
     for name in ("left.ply", "ball.ply"):
         files = (str(parent / "meshes" / name) for parent in (first, second))
         shapes: Any = [mi.traverse(mi.load_dict({"type": "ply", "filename": file})) for file in files]

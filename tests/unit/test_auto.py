@@ -280,7 +280,7 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     made = Problem(renderer, unknown, [View(renderer.exact(truth))], truth=truth)
     assert isinstance(chosen(made)[0], PathGradient)
     known = renderer.parameters()
-    formed = known | {"place": dataclasses.replace(known["place"], nonlinear=True)}
+    formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
     plan = method("auto").plan(made)
     assert plan.estimator == GaussNewton(module._MOST_NUMBER, module._MOST_DIFFERENCE)

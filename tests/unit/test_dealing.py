@@ -16,7 +16,7 @@ import unrender as ur
 from tests.contract import analytic
 from unrender.app.cli.dealing import variant_again
 from unrender.app.distributed import capacity
-from unrender.app.distributed.assignment import deal, total
+from unrender.app.distributed.assignment import assign, total
 from unrender.app.distributed.cluster import Workers, share
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.hosts import LocalHosts
@@ -38,7 +38,7 @@ ESTIMATORS = {
     "rcv of mini-batches": lambda: ur.PathGradient(
         RCV(whole_views=3, learn_from_draws=False), pixels=ur.pixels.Uniform(40), spp=2
     ),
-    "filtered": lambda: ur.FilteredGradient(ur.PathGradient(RCV(), spp=2)),
+    "filtered": lambda: ur.estimators.FilteredGradient(ur.PathGradient(RCV(), spp=2)),
 }
 
 
@@ -112,7 +112,7 @@ class Crowded(LocalHosts):
 
 
 def dealt(problem: ur.Problem, count: int, compress: bool = False, lose: Sequence[int] = ()) -> ur.Problem:
-    shares = deal([16] * len(problem.views), count)
+    shares = assign([16] * len(problem.views), count)
     return problem.executed_by(DistributedExecutor(problem, shares, Losing(problem, shares, lose), compress))
 
 
@@ -126,9 +126,9 @@ def apart(a: ur.Result, b: ur.Result) -> float:
 
 
 def test_views_are_dealt_by_their_pixels() -> None:
-    assert deal([16] * 5, 2) == ((0, 2, 4), (1, 3))
-    assert deal([100, 10, 10, 80], 2) == ((0,), (1, 2, 3))
-    assert deal([1, 1], 4) == ((0,), (1,))
+    assert assign([16] * 5, 2) == ((0, 2, 4), (1, 3))
+    assert assign([100, 10, 10, 80], 2) == ((0,), (1, 2, 3))
+    assert assign([1, 1], 4) == ((0,), (1,))
 
 
 def test_sums_are_in_double_precision_and_in_order() -> None:
@@ -190,7 +190,7 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
         "unrender.app.distributed.memories._MOST_STEPS", 4
     )  # so that memories are collected and stored, too
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
-    shares = deal([16] * VIEWS, 3)
+    shares = assign([16] * VIEWS, 3)
     whole = descend(dealt(problem, 3, compress=True), name)
     for die in (2, 5, 8, 11):
         hosts = Crowded(problem, shares, (die, die + 1, die + 5))
@@ -220,7 +220,7 @@ def test_exposures_of_all_views_are_sent_to_each_share() -> None:
     ]
     unknown = [ur.Parameter("colour", initial=0.5, bounds=(0, 1)), ur.Parameter("exposure")]
     problem = ur.Problem(given.renderer, unknown, bright)
-    shares = deal([16] * 3, 2)
+    shares = assign([16] * 3, 2)
     held = [ViewShare(unpacked(packed(problem, views, WITHOUT_RAY), WITHOUT_RAY), views) for views in shares]
     together = problem.executed_by(DistributedExecutor(problem, shares, LocalHosts(tuple(held))))
     alone = descend(problem, "plain")
@@ -246,7 +246,7 @@ def test_files_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_workers_of_a_resumed_run_have_the_variant_that_they_had(tmp_path: Path) -> None:
     problem = analytic.problem(views=2)
-    shares = deal([16] * 2, 2)
+    shares = assign([16] * 2, 2)
     executor = DistributedExecutor(problem, shares, LocalHosts(shares_of(problem, shares)), variant="cuda_ad_rgb")
     descend(problem.executed_by(executor), "plain", steps=1, run_directory=tmp_path / "dealt")
     descend(problem, "plain", steps=1, run_directory=tmp_path / "alone")
@@ -296,7 +296,7 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
     with pytest.raises(ur.InputError, match="SmoothedDerivatives renders all views"):
         ur.optimize(dealt(analytic.problem(views=2), 2), smoothed, adam, steps=1)
     with pytest.raises(ur.InputError, match="HybridGradient renders all views"):
-        ur.optimize(dealt(analytic.problem(views=2), 2), ur.HybridGradient(keys=("colour",)), adam, steps=1)
+        ur.optimize(dealt(analytic.problem(views=2), 2), ur.estimators.HybridGradient(keys=("colour",)), adam, steps=1)
     for refused, words in (
         (ur.PathGradient(differential_bsdf=True), "differential_bsdf is not supported by workers"),
         (ur.PathGradient(emitters="adaptive"), 'emitters="adaptive" is not supported by workers'),
@@ -313,7 +313,10 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
     remembering = ur.MetaEstimator(coupled=True, image=memory, pixels=drawn)
     with pytest.raises(ur.InputError, match="a control variate of images and mini-batches of pixels at once"):
         ur.optimize(dealt(analytic.problem(views=2), 2), remembering, adam, steps=1)
-    with pytest.raises(ur.InputError, match="one view, which cannot be dealt to 2"), ur.deal(analytic.problem(), 2):
+    with (
+        pytest.raises(ur.InputError, match="one view, which cannot be dealt to 2"),
+        ur.app.distribute(analytic.problem(), 2),
+    ):
         pass
 
 
@@ -322,8 +325,11 @@ def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pyt
         assert store_bytes == 256 << 20
         raise ur.InputError(str(share([(16, 0)], workers.count, gpu=False, most=most)))
 
-    monkeypatch.setattr("unrender.app.distributed.deal.connect", connect)
-    with pytest.raises(ur.InputError, match=r"count=4, cpus=4\.0"), ur.deal(analytic.problem(views=4), "auto"):
+    monkeypatch.setattr("unrender.app.distributed.distribute.connect", connect)
+    with (
+        pytest.raises(ur.InputError, match=r"count=4, cpus=4\.0"),
+        ur.app.distribute(analytic.problem(views=4), "auto"),
+    ):
         pass
 
 

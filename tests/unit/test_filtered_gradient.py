@@ -54,11 +54,11 @@ def squared_errors(truth: str, estimator: Any, count: int = 20) -> np.ndarray:
 def test_it_is_nearer_to_the_gradient_than_the_mean_of_the_halves(truth: str, most: float) -> None:
     plain, filtered = (
         squared_errors(truth, estimator)
-        for estimator in (ur.PathGradient(spp=8), ur.FilteredGradient(ur.PathGradient(spp=4)))
+        for estimator in (ur.PathGradient(spp=8), ur.estimators.FilteredGradient(ur.PathGradient(spp=4)))
     )
     error = np.hypot(plain.std(ddof=1) * most, filtered.std(ddof=1)) / np.sqrt(len(plain))
     assert filtered.mean() < most * plain.mean() - 3 * error
-    shuffled = squared_errors(truth, ur.FilteredGradient(Shared(ur.PathGradient(spp=4))))
+    shuffled = squared_errors(truth, ur.estimators.FilteredGradient(Shared(ur.PathGradient(spp=4))))
     assert shuffled.mean() > most * plain.mean(), "halves that share their samples went unseen"
 
 
@@ -78,7 +78,9 @@ class Shared:
 @pytest.mark.parametrize("truth", TRUTHS)
 def test_it_is_consistent(truth: str) -> None:
     """Its error falls with that of the mean of the halves, in proportion; a smoothing that does not know the noise keeps its bias."""
-    few, many = (squared_errors(truth, ur.FilteredGradient(ur.PathGradient(spp=n)), 10).mean() for n in (4, 1024))
+    few, many = (
+        squared_errors(truth, ur.estimators.FilteredGradient(ur.PathGradient(spp=n)), 10).mean() for n in (4, 1024)
+    )
     assert many < 0.02 * few
     blurred = np.asarray(ur.preconditioners.LargeSteps(1.0).apply(exact(truth)))
     assert np.square(blurred - exact(truth)).sum() > 5 * many, "a bias that stays went unseen"
@@ -88,7 +90,7 @@ def test_it_is_consistent(truth: str) -> None:
 def test_the_halves_tell_the_noise_memories_included(inner: Any) -> None:
     """After five steps, the variance from the halves is that of their mean over runs; halves with one memory would tell less."""
     asked, means, halves, planted = problem(), [], [], []
-    outer = ur.FilteredGradient(inner)
+    outer = ur.estimators.FilteredGradient(inner)
     at = asked.initial()
     for seed in range(60):
         state = outer.init(asked, at)
@@ -112,7 +114,7 @@ def test_the_halves_tell_the_noise_memories_included(inner: Any) -> None:
 
 def test_one_estimate_suffices_where_it_tells_its_variance() -> None:
     asked, inner = problem(), ur.MetaEstimator(coupled=True, spp=2)
-    outer = ur.FilteredGradient(inner)
+    outer = ur.estimators.FilteredGradient(inner)
     state = outer.init(asked, asked.initial())
     found, after = outer.estimate(asked, asked.initial(), state, Key(3))
     assert len(after.halves) == 1
@@ -123,7 +125,7 @@ def test_one_estimate_suffices_where_it_tells_its_variance() -> None:
 
 def test_what_is_no_map_and_what_is_fresh_are_passed_on() -> None:
     asked, inner = problem(), ur.PathGradient(CV(), spp=2, fresh_from=8)
-    outer = ur.FilteredGradient(inner)
+    outer = ur.estimators.FilteredGradient(inner)
     at = asked.initial()
     state, found = outer.init(asked, at), None
     for step in range(9):
@@ -144,7 +146,7 @@ def test_what_is_no_map_and_what_is_fresh_are_passed_on() -> None:
 def test_a_run_is_resumed_to_the_same_result(tmp_path: Path) -> None:
     asked, outer = (
         problem(loss=ur.losses.L1()),
-        ur.FilteredGradient(ur.PathGradient(CV(), spp=2), {"map": (False, True)}),
+        ur.estimators.FilteredGradient(ur.PathGradient(CV(), spp=2), {"map": (False, True)}),
     )
     assert tables.component(tables.table(outer), "estimator") == outer
     whole = ur.optimize(asked, outer, ur.optimizers.Adam(0.02), 8)
@@ -157,14 +159,14 @@ def test_a_run_is_resumed_to_the_same_result(tmp_path: Path) -> None:
 def test_black_images_and_samples_that_are_no_numbers_are_passed_on() -> None:
     asked = problem(noise=0.0)
     at = dict(asked.initial(), map=TRUTHS["smooth"][..., None])
-    outer = ur.FilteredGradient()
+    outer = ur.estimators.FilteredGradient()
     found, _ = outer.estimate(asked, at, outer.init(asked, at), Key(0))
     np.testing.assert_allclose(found.gradient["map"], 0.0, atol=1e-9)
     broken, _ = outer.estimate(asked, dict(at, map=np.full_like(at["map"], np.nan)), outer.init(asked, at), Key(0))
     assert np.isnan(broken.gradient["map"]).all()
 
 
-made: Any = ur.FilteredGradient
+made: Any = ur.estimators.FilteredGradient
 
 
 @pytest.mark.parametrize(
@@ -172,11 +174,20 @@ made: Any = ur.FilteredGradient
     [
         (lambda: made(ur.PathGradient), "inner must be an estimator, such as PathGradient"),
         (lambda: made(3), "inner must be an estimator, such as PathGradient"),
-        (lambda: ur.FilteredGradient(ur.LossValues()), "LossValues provides no gradient to be filtered"),
+        (
+            lambda: ur.estimators.FilteredGradient(ur.estimators.LossValues()),
+            "LossValues provides no gradient to be filtered",
+        ),
         (lambda: made(wrap=True), "wrap must be {key: true or false}, got True"),
         (lambda: made(wrap={"map": 2}), "wrap must be true, false, or one of these per axis, got 2"),
-        (lambda: ur.estimate(problem(), ur.FilteredGradient(wrap={"mop": True})), 'wrap: unknown parameter "mop"'),
-        (lambda: ur.estimate(problem(), ur.FilteredGradient(wrap={"map": (True,)})), "wrap must have 2 entries"),
+        (
+            lambda: ur.estimate(problem(), ur.estimators.FilteredGradient(wrap={"mop": True})),
+            'wrap: unknown parameter "mop"',
+        ),
+        (
+            lambda: ur.estimate(problem(), ur.estimators.FilteredGradient(wrap={"map": (True,)})),
+            "wrap must have 2 entries",
+        ),
     ],
 )
 def test_bad_arguments_are_named(make: Any, message: str) -> None:

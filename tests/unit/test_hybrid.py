@@ -60,10 +60,10 @@ def exact(asked: ur.Problem, at: dict[str, np.ndarray]) -> dict[str, np.ndarray]
     return {"map": flat[:4].reshape(2, 2, 1), "pose": flat[4:]}
 
 
-def all_four(whole_views: int = 3) -> ur.HybridGradient:
+def all_four(whole_views: int = 3) -> ur.estimators.HybridGradient:
     adaptive = ur.pixels.Adaptive(16, denoiser="none")
     path = ur.MetaEstimator(coupled=True, spp=2, image=CV("primary", whole_views=whole_views), pixels=adaptive)
-    return ur.HybridGradient(path, smoothed())
+    return ur.estimators.HybridGradient(path, smoothed())
 
 
 @pytest.mark.parametrize("pixels", [ur.pixels.All(), ur.pixels.Uniform(16)])
@@ -71,7 +71,7 @@ def test_the_path_s_part_is_that_of_its_estimator_to_the_bit(pixels: Any) -> Non
     """For a remembering estimator, over steps at which both groups move."""
     both, alone = problem(), problem(keys=("map",))
     path = ur.PathGradient(CV("primary", whole_views=2), pixels, spp=4)
-    hybrid = ur.HybridGradient(path, smoothed())
+    hybrid = ur.estimators.HybridGradient(path, smoothed())
     state, own = hybrid.init(both, both.initial()), path.init(alone, alone.initial())
     for step in range(5):
         at = {"map": both.initial()["map"] + 0.02 * step, "pose": both.initial()["pose"]}
@@ -96,7 +96,7 @@ def test_both_parts_are_unbiased() -> None:
     expected = exact(asked, at)
     rows: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for debiased, found in rows.items():
-        estimator = ur.HybridGradient(ur.PathGradient(spp=2), smoothed(debiased=debiased))
+        estimator = ur.estimators.HybridGradient(ur.PathGradient(spp=2), smoothed(debiased=debiased))
         state = estimator.init(asked, at)
         for seed in range(300):
             gradient = estimator.estimate(asked, at, state, Key(seed))[0].gradient
@@ -116,13 +116,15 @@ def test_a_perturbed_texture_with_a_preconditioner_and_a_path_gradient_are_by_th
     b = ur.Parameter("b", 0.5, (0.1, 2.0), parameterisation=log)
     asked = ur.Problem(renderer, [a, b], [ur.View(renderer.exact({}))])
     perturbed = smoothed(samples=64, orthogonal=True)
-    found = ur.estimate(asked, ur.HybridGradient(ur.PathGradient(), perturbed, ("a",)))
+    found = ur.estimate(asked, ur.estimators.HybridGradient(ur.PathGradient(), perturbed, ("a",)))
     plain = ur.Problem(renderer, [ur.Parameter("a", 0.5), ur.Parameter("b", 0.5)], asked.given_views)
     exactly = ur.estimate(plain, ur.PathGradient()).gradient
     assert found.preconditioned
     np.testing.assert_allclose(found.gradient["b"], 0.4 * exactly["b"], rtol=1e-5)  # x = 0.1 + exp u
     runs = [
-        ur.estimate(asked, ur.HybridGradient(ur.PathGradient(), perturbed, ("a",)), seed=seed).gradient["a"].ravel()
+        ur.estimate(asked, ur.estimators.HybridGradient(ur.PathGradient(), perturbed, ("a",)), seed=seed)
+        .gradient["a"]
+        .ravel()
         for seed in range(50)
     ]
     assert worst(np.stack(runs), smooth.apply(exactly["a"]).ravel()) < 3.9
@@ -202,7 +204,7 @@ def test_all_four_recover_both_and_resume_to_the_bit(tmp_path: Path) -> None:
 def test_the_variance_of_what_is_perturbed_is_a_mean_square() -> None:
     """So that MetaAdam's steps are no longer than its learning rate."""
     asked = problem(noise=0.0)
-    estimator = ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(samples=64))
+    estimator = ur.estimators.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(samples=64))
     found = ur.estimate(asked, estimator)
     assert found.variance is not None
     assert (found.variance["pose"] > found.gradient["pose"] ** 2).all()
@@ -215,8 +217,8 @@ def test_what_is_perturbed_has_running_means_where_asked_for() -> None:
     """So that MetaAdam's steps are Adam's, and no longer than its learning rate."""
     asked, at = problem(noise=0.0), problem().initial()
     hybrid, alone = (
-        ur.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(), averaged=True),
-        ur.HybridGradient(perturbed=smoothed()),
+        ur.estimators.HybridGradient(ur.MetaEstimator(coupled=True), smoothed(), averaged=True),
+        ur.estimators.HybridGradient(perturbed=smoothed()),
     )
     state, own = hybrid.init(asked, at), alone.init(asked, at)
     rule, adam = ur.optimizers.MetaAdam(0.1), ur.optimizers.Adam(0.1)
@@ -232,7 +234,7 @@ def test_what_is_perturbed_has_running_means_where_asked_for() -> None:
 def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> None:
     asked = problem()
     choice = method("auto").plan(asked, {"sigma": "0.3, pose=0.4"})
-    assert isinstance(choice.estimator, ur.HybridGradient)
+    assert isinstance(choice.estimator, ur.estimators.HybridGradient)
     assert choice.estimator.keys == ("pose",)
     assert isinstance(choice.estimator.path, ur.PathGradient)
     assert choice.estimator.path.image == CV("primary", max_weight=0.95)
@@ -242,7 +244,7 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     settings = {"sigma": "0.3", "step": 0.1, "gradient": "coupled", "image": "rcv", "pixels": 16, "spp": 2}
     choice = method("hybrid").plan(asked, settings)
     estimator, optimizer = choice.estimator, choice.optimizer
-    assert isinstance(estimator, ur.HybridGradient)
+    assert isinstance(estimator, ur.estimators.HybridGradient)
     image, drawn = CV("primary", max_weight=0.95), ur.pixels.Adaptive(16)
     assert estimator.path == ur.MetaEstimator(
         coupled=True, spp=2, image=image, space="primary", pixels=drawn, max_weight=0.8
@@ -262,11 +264,11 @@ def wrong(given: Any) -> Any:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda: ur.HybridGradient(wrong(ur.PathGradient)), "path must be an estimator"),
-        (lambda: ur.HybridGradient(ur.SmoothedDerivatives(0.1)), "of path gradients"),
-        (lambda: ur.HybridGradient(ur.LossValues()), "of path gradients"),
-        (lambda: ur.HybridGradient(perturbed=ur.SmoothedDerivatives(0.1, order="hvp")), "no curvature"),
-        (lambda: ur.HybridGradient(keys=wrong("pose")), "keys must be a list"),
+        (lambda: ur.estimators.HybridGradient(wrong(ur.PathGradient)), "path must be an estimator"),
+        (lambda: ur.estimators.HybridGradient(ur.SmoothedDerivatives(0.1)), "of path gradients"),
+        (lambda: ur.estimators.HybridGradient(ur.estimators.LossValues()), "of path gradients"),
+        (lambda: ur.estimators.HybridGradient(perturbed=ur.SmoothedDerivatives(0.1, order="hvp")), "no curvature"),
+        (lambda: ur.estimators.HybridGradient(keys=wrong("pose")), "keys must be a list"),
         (lambda: ur.SmoothedDerivatives(0.1, spp=1, debiased=True), "spp must be"),
     ],
 )
@@ -290,4 +292,4 @@ def test_what_makes_no_sense_is_refused_at_once(made: Any, said: str) -> None:
 def test_what_does_not_suit_a_problem_is_refused_before_the_first_step(options: Any, keys: Any, said: str) -> None:
     asked = problem(keys=keys)
     with pytest.raises(ur.InputError, match=said):
-        ur.HybridGradient(**options).init(asked, asked.initial())
+        ur.estimators.HybridGradient(**options).init(asked, asked.initial())

@@ -186,19 +186,19 @@ def test_files_are_decoded_by_the_response_that_is_named(tmp_path: Path) -> None
 @pytest.mark.parametrize("given", ["", "gamma", "0.5", "5", "nan", "-2.2", "inf", "sRGB\n"])
 def test_other_responses_are_one_line(given: str) -> None:
     with pytest.raises(InputError, match="--response") as raised:
-        ur.ImportOptions(response=given)
+        ur.app.ImportOptions(response=given)
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.mitsuba
 def test_a_fitted_response_is_an_unknown_and_not_beside_exposures() -> None:
-    options = ur.ImportOptions(response="fit", unknowns=("light", "colour"))
+    options = ur.app.ImportOptions(response="fit", unknowns=("light", "colour"))
     assert options.unknowns == ("colour", "light", "response")
     names = unknowns.stages(options.chosen(()), Path("problem.toml")).stages[0].unknowns
     assert RESPONSE in names
     assert RESPONSE in [table["key"] for table in unknowns.parameters(options.chosen(()), 1.0)]
     with pytest.raises(InputError, match="undetermined up to a power"):
-        ur.ImportOptions(response="fit", unknowns=("colour", "exposure"))
+        ur.app.ImportOptions(response="fit", unknowns=("colour", "exposure"))
 
 
 @pytest.mark.mitsuba
@@ -206,5 +206,5 @@ def test_photographs_under_known_lights_choose_by_themselves(tmp_path: Path) -> 
     (tmp_path / "lit").mkdir()
     (tmp_path / "lit" / "lights.txt").write_text("1\n0 0 1\n")
     with pytest.raises(InputError, match="--response: of one camera under known lights"):
-        ur.import_capture(tmp_path / "lit", tmp_path / "out", ur.ImportOptions(response="linear"))
+        ur.app.import_capture(tmp_path / "lit", tmp_path / "out", ur.app.ImportOptions(response="linear"))
     assert not (tmp_path / "out").exists()

@@ -61,7 +61,7 @@ def test_problems_that_it_cannot_take() -> None:
     renderer = AnalyticRenderer({"x": np.full((2, 2, 1), 0.5), "y": np.full(1, 0.5)}, np.ones((12, 5)), shape=(2, 2))
     smooth = ur.Parameter("x", initial=0.2, preconditioner=ur.preconditioners.LargeSteps(1.0))
     asked = ur.Problem(renderer, [smooth], [ur.View(renderer.exact({}))])
-    for estimator in (ur.LossValues(), ur.SmoothedDerivatives(0.1)):
+    for estimator in (ur.estimators.LossValues(), ur.SmoothedDerivatives(0.1)):
         with pytest.raises(ur.InputError, match="CMAES: parameter x has a preconditioner"):
             ur.optimize(asked, estimator, ur.optimizers.CMAES(), steps=1)
     log = ur.Parameter("y", initial=0.2, bounds=(0.1, 2.0), parameterisation=ur.parameterisations.Log())
@@ -71,7 +71,7 @@ def test_problems_that_it_cannot_take() -> None:
     with pytest.raises(ur.InputError, match=r'"hvp".*does not provide'):
         ur.optimize(problem(), ur.SmoothedDerivatives(0.1), ur.optimizers.NewtonCG(), steps=1)
     with pytest.raises(ur.InputError, match=r'"gradient".*does not provide'):
-        ur.optimize(problem(), ur.LossValues(), ur.optimizers.Adam(), steps=1)
+        ur.optimize(problem(), ur.estimators.LossValues(), ur.optimizers.Adam(), steps=1)
 
 
 @pytest.mark.mitsuba
@@ -99,7 +99,7 @@ def test_all_paths_are_counted_those_of_products_too() -> None:
         assert samples(kept, optimizers.NewtonCG(iterations=3)) == 1 + 16
     whole = ur.SmoothedDerivatives(0.1, samples=16, order="hessian", aggregate=False, joint=False)
     assert samples(whole, optimizers.Newton()) == 1 + 3 * 16 + 6 * 16
-    assert samples(ur.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
+    assert samples(ur.estimators.LossValues(), optimizers.CMAES(population=7)) == 1 + 7
 
 
 @pytest.mark.parametrize("order", ["gradient", "hessian", "hvp"])

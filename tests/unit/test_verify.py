@@ -343,7 +343,7 @@ def test_runs_that_cannot_succeed_tell_so(
 # ---------------------------------------------------------------------- resuming
 
 
-class Kill(ur.Callback):
+class Kill(ur.protocols.Callback):
     """Ends the run by an exception, as a second Ctrl-C does."""
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:

@@ -73,7 +73,7 @@ class PictureErrors:
         return found
 
 
-class Recorder(ur.Callback):
+class Recorder(ur.protocols.Callback):
     """(processor seconds, paths, error) along a run, for each error; its own time is not the run's."""
 
     def __init__(self, errors: PictureErrors, array: Any, every: int):
@@ -130,7 +130,7 @@ def run(
     errors = PictureErrors(made, options, groups)
 
     def problem(coarse: bool) -> ur.Problem:
-        way = ur.CoarseToFine(changes, states="carry") if coarse else None
+        way = ur.scene.CoarseToFine(changes, states="carry") if coarse else None
         parameters = [replace(parameter, coarse_to_fine=way) for parameter in made.parameters]
         return made.replaced(parameters=parameters, views=[made.given_views[number] for number in seen])
 

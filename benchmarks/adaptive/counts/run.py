@@ -105,7 +105,7 @@ def entrants() -> list[Entrant]:
 def seconds_per_path(problem: ur.Problem, chosen: list[Entrant], rounds: int, steps: int = 30) -> dict[str, float]:
     """Processor seconds of all threads per path of short descents, in turns: medians."""
 
-    class Clock(ur.Callback):
+    class Clock(ur.protocols.Callback):
         def __init__(self) -> None:
             self.points: list[tuple[float, float]] = []
 

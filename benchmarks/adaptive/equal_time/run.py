@@ -95,7 +95,7 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
     return found
 
 
-class Clock(ur.Callback):
+class Clock(ur.protocols.Callback):
     """(seconds of the processor, paths so far) of each step."""
 
     def __init__(self) -> None:

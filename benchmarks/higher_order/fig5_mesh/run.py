@@ -34,7 +34,7 @@ def smoothed(samples: int = SAMPLES, **more: Any) -> ur.SmoothedDerivatives:
 def cma_es(deviation: float) -> tuple[Any, Any]:
     """A search that begins with that deviation over 2, in units of σ."""
     optimizer = ur.optimizers.CMAES(0.5, SAMPLES, diagonal=True, learning_rate=deviation * SIGMA)
-    return ur.LossValues(spp=_SPP), optimizer
+    return ur.estimators.LossValues(spp=_SPP), optimizer
 
 
 def _fr22(_: int) -> tuple[Any, Any]:
@@ -53,7 +53,7 @@ def _search(_: int) -> tuple[Any, Any]:
 METHODS: dict[str, Callable[[int], tuple[Any, Any]]] = {"FR22": _fr22, "CMA-ES": _search, "OurJoint": _joint}
 
 
-class _Track(ur.Callback):
+class _Track(ur.protocols.Callback):
     """Where a run went, by the processor's clock, which leaves out the warm-up."""
 
     def __init__(self, start: np.ndarray, budget: float):

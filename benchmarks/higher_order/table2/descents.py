@@ -60,7 +60,7 @@ class Descent:
         return [float(seconds[np.argmax(values <= goal)]) if (values <= goal).any() else math.inf for goal in GOALS]
 
 
-class _Track(ur.Callback):
+class _Track(ur.protocols.Callback):
     """Keeps where a run went; ends it once the last goal is met in parameters, or the budget spent.
 
     Its clock is the processor's time of this process, warm-up and its own work left out: with one thread that is the time on a machine

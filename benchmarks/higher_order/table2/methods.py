@@ -146,7 +146,7 @@ def _joint(task: Task, n: int, c: Config) -> tuple[Any, Any]:
 def _search(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     population = None if c["population"] == 0 else int(c["population"])
     optimizer = ur.optimizers.CMAES(c["deviation"], population, diagonal=n > _MANY, learning_rate=task.sigma)
-    return ur.LossValues(spp=_spp(task, c)), optimizer
+    return ur.estimators.LossValues(spp=_spp(task, c)), optimizer
 
 
 def _lbfgs(task: Task, n: int, c: Config) -> tuple[Any, Any]:

@@ -97,7 +97,7 @@ def entrants(problem: str) -> dict[str, Entrant]:
     return {name: Entrant(*made[name], rates) for name, rates in RATES[problem].items()}
 
 
-class Recorder(ur.Callback):
+class Recorder(ur.protocols.Callback):
     """Keeps (processor seconds, samples, error) at some steps of a run and at its last."""
 
     def __init__(self, problem: ur.Problem, steps: int):

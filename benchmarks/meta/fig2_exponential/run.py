@@ -30,7 +30,7 @@ FIRST_TUNING_SEED = 10_000
 QUICK = {"seeds": 2, "tuning_seeds": 1, "steps": (4, 8), "rates": 2}
 
 
-class Trace(ur.Callback):
+class Trace(ur.protocols.Callback):
     """The rate after every step, and what the estimator said of it."""
 
     def __init__(self) -> None:

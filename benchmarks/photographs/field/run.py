@@ -52,7 +52,7 @@ class Judge:
         return float(np.mean(found))
 
 
-class Clock(ur.Callback):
+class Clock(ur.protocols.Callback):
     """Ends a stage after so many seconds of the processor; now and then, it looks at what there is."""
 
     def __init__(self, earlier: float, seconds: float, marks: list[float], judges: tuple[Judge, ...], curve: list):
@@ -60,11 +60,11 @@ class Clock(ur.Callback):
         self.spent, self.steps = 0.0, 0
 
     def on_start(self, run: Any) -> None:
-        """See `ur.Callback`."""
+        """See `ur.protocols.Callback`."""
         self._since = time.process_time()
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `ur.Callback`."""
+        """See `ur.protocols.Callback`."""
         del record
         self.spent += time.process_time() - self._since
         self.steps += 1

@@ -117,7 +117,7 @@ def processor_seconds(calls: list[Callable[[], None]]) -> list[float]:
     return [min(of) for of in times]
 
 
-class _Clock(ur.Callback):
+class _Clock(ur.protocols.Callback):
     """Processor time of the steps from the second one on."""
 
     def __init__(self) -> None:

@@ -34,7 +34,7 @@ MERGE = ("descents.*.methods",)
 QUICK = {"steps": 6, "seeds": 2, "resolution": 8}
 
 
-class Distance(ur.Callback):
+class Distance(ur.protocols.Callback):
     """Keeps how far the parameters are from the truth."""
 
     def __init__(self, truth: dict[str, np.ndarray]):

@@ -1,1 +1,39 @@
 """From images to an estimate of the loss gradient."""
+
+from typing import TYPE_CHECKING
+
+from unrender.core import lazy
+
+if TYPE_CHECKING:
+    from unrender.estimators.filtered import FilteredGradient
+    from unrender.estimators.gauss_newton import GaussNewton
+    from unrender.estimators.hybrid import HybridGradient
+    from unrender.estimators.loss_values import LossValues
+    from unrender.estimators.meta import MetaEstimator
+    from unrender.estimators.path import PathGradient
+    from unrender.estimators.smoothed import SmoothedDerivatives
+    from unrender.estimators.stock import StockGradient
+
+__getattr__, _ = lazy.attach(
+    __name__,
+    {
+        "FilteredGradient": "filtered",
+        "GaussNewton": "gauss_newton",
+        "HybridGradient": "hybrid",
+        "LossValues": "loss_values",
+        "MetaEstimator": "meta",
+        "PathGradient": "path",
+        "SmoothedDerivatives": "smoothed",
+        "StockGradient": "stock",
+    },
+)
+__all__ = [
+    "FilteredGradient",
+    "GaussNewton",
+    "HybridGradient",
+    "LossValues",
+    "MetaEstimator",
+    "PathGradient",
+    "SmoothedDerivatives",
+    "StockGradient",
+]

@@ -1,1 +1,21 @@
 """The descent, its callbacks, and how a run is resumed."""
+
+from typing import TYPE_CHECKING
+
+from unrender.core import lazy
+
+if TYPE_CHECKING:
+    from unrender.runs.live import Live
+    from unrender.runs.tensorboard import TensorBoard
+
+__getattr__, _ = lazy.attach(
+    __name__,
+    {
+        "Live": "live",
+        "TensorBoard": "tensorboard",
+    },
+)
+__all__ = [
+    "Live",
+    "TensorBoard",
+]

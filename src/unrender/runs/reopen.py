@@ -81,8 +81,8 @@ def problem_of(directory: str | Path) -> Problem:
     path = folder / serialization.FILE
     if not bounded_files.exists(path):
         raise InputError(
-            f"{path}: no such file: Result.save keeps no problem; hand it in, as unrender.export((problem, result.parameters), out), or "
-            "keep a whole run, with run_directory="
+            f"{path}: no such file: Result.save keeps no problem; hand it in, as unrender.app.export((problem, result.parameters), "
+            "out), or keep a whole run, with run_directory="
         )
     stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
     if "gallery" in stored:
@@ -93,7 +93,7 @@ def problem_of(directory: str | Path) -> Problem:
     if "scene" not in stored:
         raise InputError(
             f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
-            "unrender.export((problem, result.parameters), out)"
+            "unrender.app.export((problem, result.parameters), out)"
         )
     file = origin.get("file")
     return Problem.from_file(file if isinstance(file, str) and bounded_files.kind(Path(file)) == "file" else path)

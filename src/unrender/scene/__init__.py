@@ -1,1 +1,18 @@
 """What is to be recovered, and from which images."""
+
+from typing import TYPE_CHECKING
+
+from unrender.core import lazy
+
+if TYPE_CHECKING:
+    from unrender.scene.coarse_to_fine import CoarseToFine
+
+__getattr__, _ = lazy.attach(
+    __name__,
+    {
+        "CoarseToFine": "coarse_to_fine",
+    },
+)
+__all__ = [
+    "CoarseToFine",
+]

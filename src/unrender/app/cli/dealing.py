@@ -60,12 +60,12 @@ def dealt(
         return
     from rich.markup import escape
 
-    from unrender.app.distributed.deal import deal
+    from unrender.app.distributed.distribute import distribute
 
     def tell(line: str) -> None:
         console.print(f"[yellow]workers[/] {escape(line)}", soft_wrap=True)
 
     with contextlib.ExitStack() as stack:
         with phases.phase("workers"):
-            found = stack.enter_context(deal(problem, workers, compress, variant, threads, tell))
+            found = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
         yield found

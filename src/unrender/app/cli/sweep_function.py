@@ -1,4 +1,4 @@
-"""`unrender.sweep`: what `unrender sweep` does, as a function."""
+"""`unrender.app.sweep`: what `unrender sweep` does, as a function."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def sweep(
 ) -> SweepRecord:
     """Search a method's options for those of the least error, on one problem: `unrender sweep` as a function, silent.
 
-        found = unrender.sweep("room.toml", "rcv", {"learning_rate": "0.001:0.1:log", "spp": [2, 8]}, trials=40, workers="auto")
+        found = unrender.app.sweep("room.toml", "rcv", {"learning_rate": "0.001:0.1:log", "spp": [2, 8]}, trials=40, workers="auto")
         best = found.trials[found.best].settings
 
     Args:
@@ -89,7 +89,7 @@ def _carried_out(
     folder = arguments.folder(out, f"{arguments.short_name(plan.problem)}-sweep", overwrite, MARK)
     session = Session(folder, workers, threads, fresh=True)
     try:
-        run_trials(Console(file=io.StringIO()), session, SweepRecord(command="unrender.sweep", plan=plan), search)
+        run_trials(Console(file=io.StringIO()), session, SweepRecord(command="unrender.app.sweep", plan=plan), search)
     except typer.Exit as end:
         if end.exit_code != FAILED:
             raise KeyboardInterrupt from end

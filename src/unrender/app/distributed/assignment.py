@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-__all__ = ["deal", "total"]
+__all__ = ["assign", "total"]
 
 
-def deal(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
+def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
     """The views of each worker, ascending: the largest view that is left goes to who has the fewest pixels so far, the first of these.
 
     Args:

@@ -76,9 +76,9 @@ def export(
 ) -> Exported:
     """Write a scene with its recovered parameters as a folder that plain Mitsuba loads, or for other programs.
 
-        ur.export("out/indirect-room-auto", "out/room")
-        ur.export((problem, result.parameters), "out/room-2")
-        ur.export("out/indirect-room-auto", "out/room-3", formats=["obj", "ply"])
+        ur.app.export("out/indirect-room-auto", "out/room")
+        ur.app.export((problem, result.parameters), "out/room-2")
+        ur.app.export("out/indirect-room-auto", "out/room-3", formats=["obj", "ply"])
 
     The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
     maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the

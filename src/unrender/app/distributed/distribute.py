@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from unrender.app.distributed.assignment import deal as dealt_views
+from unrender.app.distributed.assignment import assign
 from unrender.app.distributed.cluster import Workers, connect
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.ray_hosts import RayHosts
@@ -19,7 +19,7 @@ from unrender.backend.variant import check_threads
 from unrender.core.errors import InputError
 from unrender.scene.problem import Problem
 
-__all__ = ["deal"]
+__all__ = ["distribute"]
 
 _log = logging.getLogger("unrender")
 _LEAST_STORE = 256 << 20
@@ -28,7 +28,7 @@ _GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5
 
 
 @contextlib.contextmanager
-def deal(
+def distribute(
     problem: Problem,
     workers: int | str | Workers = "auto",
     compress: bool = False,
@@ -39,7 +39,7 @@ def deal(
 ) -> Iterator[Problem]:
     """The problem, its views dealt to workers: within the context, `optimize` and `resume` have them compute its gradients.
 
-        with unrender.deal(problem, workers=4) as dealt:
+        with unrender.app.distribute(problem, workers=4) as dealt:
             result = unrender.optimize(dealt, "rcv", steps=300)
 
     Each worker is a process by Ray, with a GPU or some of the processor's threads, and keeps its views: their references, and what image
@@ -81,7 +81,7 @@ def deal(
             check_threads(threads)
         resolutions = problem.renderer.resolutions()
         pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
-        shares = dealt_views(pixels, cluster.share.count)
+        shares = assign(pixels, cluster.share.count)
         blobs = tuple(packed(problem, share, cluster.ray) for share in shares)
         hosts = RayHosts(cluster, shares, blobs, threads, tell)
         try:
