@@ -7,13 +7,14 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 """The repository."""
 PACKAGE = ROOT / "benchmarks"
 ORDER = (
     *("suite", "own_loop", "speed", "peers", "rcv.fig9_reconstruction", "rcv", "meta", "higher_order", "adaptive"),
-    *("volumes", "shapes", "together"),
+    *("volumes", "shapes"),
 )
 """The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""
 
@@ -33,6 +34,10 @@ class Benchmark:
     def module(self, kind: str) -> ModuleType:
         """Its run, plot or table module."""
         return importlib.import_module(f"benchmarks.{self.name}.{kind}")
+
+    def table(self, record: dict[str, Any]) -> str:
+        """Return the tables of a record as Markdown."""
+        return self.module("table").table(record)
 
     def has(self, kind: str) -> bool:
         """Whether it has this module."""

@@ -85,7 +85,7 @@ def execute(benchmark: Benchmark, arguments: Sequence[str]) -> int:
     if benchmark.has("plot"):
         draw(benchmark, record, folder / "figure.png")
     if benchmark.has("table"):
-        print(benchmark.module("table").table(record))
+        print(benchmark.table(record))
     return 0
 
 

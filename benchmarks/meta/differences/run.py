@@ -5,9 +5,7 @@ length is varied; Var[ΔF] is taken over runs, summed over the elements, in path
 its log-log slope. Cost: an estimate by plain gradients, of the paper's meta-estimation and of the coupled form, and the
 parts of a meta step. Noise: the variance of plain gradients by samples per pixel, near the truth, summed over elements:
 where that of images and adjoints multiply, it falls with the square of the samples, and many in one step serve a descent
-better than as many over several. Images of F: with the loss derivatives of ΔF at images of its own, and at F's, the
-processor time of a step on one thread, the variance of the meta-estimate along a fixed path, beside the one that it
-states, and the errors that descents end with.
+better than as many over several.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, SampleRequest, arrays, coupled_gradients, loss_derivative, prepare, trees
-from benchmarks.meta.differences.images_of_f import OPTIONS, images_of_f
 from benchmarks.paths import truth
 from benchmarks.runner.timing import medians, turns
 
@@ -29,10 +26,9 @@ STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 NOISE_SPP = (2, 4, 8, 16, 64)
 NEAR = 0.9
 """Share of the way at which the noise is measured."""
-MERGE = ("variance.problems", "cost", "noise.problems", "images_of_f.problems")
+MERGE = ("variance.problems", "cost", "noise.problems")
 QUICK = {
     "problem": ("chalice",), "resolution": 8, "cost_resolution": (8,), "runs": 3, "spp": 2, "noise_runs": 3,
-    "images_resolution": 8, "images_runs": 3, "steps": 3, "seeds": 1,
 }  # fmt: skip
 
 
@@ -125,16 +121,12 @@ def noise(problem: ur.Problem, runs: int) -> list[float]:
 
 def run(
     problem: tuple[str, ...] = PROBLEMS,
-    part: tuple[str, ...] = ("variance", "cost", "noise", "images of F"),
+    part: tuple[str, ...] = ("variance", "cost", "noise"),
     resolution: int = 32,
     cost_resolution: tuple[int, ...] = (96, 256),
     spp: int = 4,
     runs: int = 48,
     noise_runs: int = 64,
-    images_resolution: int = 64,
-    images_runs: int = 96,
-    steps: int = 300,
-    seeds: int = 3,
 ) -> Iterator[dict[str, Any]]:
     """Costs at each size, then variances.
 
@@ -144,10 +136,6 @@ def run(
         spp: of the variances
         runs: of the variances
         noise_runs: of the noise
-        images_resolution: of the images of F
-        images_runs: of their variances
-        steps: of their descents
-        seeds: of their descents
     """
     loss = "RelativeL2"
     for size in cost_resolution if "cost" in part else ():
@@ -164,6 +152,3 @@ def run(
             size = {**options, "texture_resolution": 1} if name == "spiral" else options
             found[name] = noise(ur.gallery.problem(name, **size), noise_runs)
         yield {"noise": {"resolution": resolution, "runs": noise_runs, "spp": NOISE_SPP, "problems": found}}
-    if "images of F" in part:
-        names = tuple(name for name in problem if name in OPTIONS)
-        yield {"images_of_f": images_of_f(names, images_resolution, images_runs, steps, seeds)}

@@ -1,7 +1,5 @@
 """Table."""
 
-from typing import Any
-
 from benchmarks import markdown
 from benchmarks.runner.records import Record
 
@@ -39,28 +37,4 @@ def table(record: Record) -> str:
             of_paths = [v * n for v, n in zip(values, found["spp"], strict=True)]
             rows.append([name, *(f"{v / of_paths[0]:.3f}" for v in of_paths)])
         blocks.append(markdown.table(["problem", *(f"{n} spp" for n in found["spp"])], rows))
-    if "images_of_f" in record:
-        blocks += images_of_f(record["images_of_f"])
     return "\n\n".join(blocks)
-
-
-def images_of_f(found: Any) -> list[str]:
-    """Of ΔF's loss derivatives."""
-    size = (
-        f"{found['resolution']}², one thread, {found['runs']} runs, {found['seeds']} descents of {found['steps']} steps"
-    )
-    title = (
-        f"By the images that the loss derivatives of ΔF are at ({size}; error relative to the start, median and range):"
-    )
-    rows = []
-    for name, forms in found["problems"].items():
-        for form, f in forms.items():
-            row = [name, form, f"{f['milliseconds']:.1f}"]
-            if "final" in f:
-                middle, least, most = f["final"]
-                variance, deviation = f["ratio"]
-                ratios = [f"{variance:.2f} ± {deviation:.2f}", f"{f['stated'] / f['variance']:.2f}"]
-                row += [*ratios, f"{middle:.3f} ({least:.3f} to {most:.3f})"]
-            rows.append(row + ["–"] * (6 - len(row)))
-    columns = ["problem", "images", "ms a step", "Var M over that of own", "stated over Var M", "error"]
-    return [title, markdown.table(columns, rows)]
