@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,23 +26,24 @@ class Benchmark:
 
     Attributes:
         name: of the folder, with dots: "rcv.fig4_order".
-        folder: with run.py, plot.py, table.py, notes.md, and, once measured, results.json, maps.npz and figure.png.
+        folder: with run.py, report.py, notes.md, and, once measured, results.json, and maps.npz where it keeps images.
     """
 
     name: str
     folder: Path
 
     def module(self, kind: str) -> ModuleType:
-        """Its run, plot or table module."""
+        """Its run or report module."""
         return importlib.import_module(f"benchmarks.{self.name}.{kind}")
 
     def table(self, record: dict[str, Any]) -> str:
         """Return the tables of a record as Markdown."""
-        return self.module("table").table(record)
+        return self.module("report").table(record)
 
-    def has(self, kind: str) -> bool:
-        """Whether it has this module."""
-        return (self.folder / f"{kind}.py").is_file()
+    @property
+    def plot(self) -> Callable[[dict[str, Any]], Any] | None:
+        """The function that draws a record; None where the table says it all."""
+        return getattr(self.module("report"), "plot", None)
 
     @property
     def docstring(self) -> str:

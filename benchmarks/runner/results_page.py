@@ -43,7 +43,7 @@ def write_pages(folder: Path = _FOLDER, figures: bool = True) -> Path:
         if text is None:
             continue
         names.append(name)
-        if figures and benchmark.has("plot"):
+        if figures:
             text += _figure(benchmark, folder)
         (folder / f"{name}.md").write_text(f"{text[1:]}\n")
     index = folder / "index.md"
