@@ -266,12 +266,7 @@ def second_moments(
 
 
 def gradient_of(
-    problem: ur.Problem,
-    parameters: Tree,
-    batch: Any,
-    key: Key,
-    spp: int = 2,
-    emitters: np.ndarray | None = None,
+    problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2, emitters: np.ndarray | None = None
 ) -> list[np.ndarray]:
     """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
     for the scene's own."""

@@ -37,11 +37,7 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "mirror-trio": ("mirror-trio", {"resolution": 192}, 2048),
     "two-planets, memories": ("two-planets", {}, 2048),
     "three-textures": ("three-textures", FINE, 2048),
-    "globe-and-mirror": (
-        "globe-and-mirror",
-        {"resolution": 4096, "texture_resolution": 256, "reference_spp": 4},
-        2048,
-    ),
+    "globe-and-mirror": ("globe-and-mirror", {"resolution": 4096, "texture_resolution": 256, "reference_spp": 4}, 2048),
     "sunlit-vase": ("sunlit-vase", {**MANY, "views": 16, "loss": "L2"}, 2048),
     "sun-glossy, 32 views": ("sun-glossy", {**MANY, "views": 32}, 2048),
 }

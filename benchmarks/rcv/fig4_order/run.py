@@ -42,10 +42,7 @@ class UpdatedBeforeUse(ur.images.RecursiveControlVariate):
         return memory
 
 
-ORDERS = {
-    "before": UpdatedBeforeUse(),
-    "after": ur.images.RecursiveControlVariate(),
-}
+ORDERS = {"before": UpdatedBeforeUse(), "after": ur.images.RecursiveControlVariate()}
 PILOT_SEEDS = (1_000_001, 1_000_002)
 QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3, "reference_spp": 128}
 
