@@ -13,21 +13,15 @@ def table(record: Record) -> str:
     rows = []
     for name, ways in record["faults"].items():
         for way, entry in ways.items():
-            cells = [_cell(entry[key], 2 if key == "poses" else 4) if key in entry else "" for key in _KEYS]
+            cells = (_cell(entry[key], 2 if key == "poses" else 4) if key in entry else "" for key in _KEYS)
             rows.append([name, way, *cells])
-    head = [
-        "nuisance",
-        "models",
-        "base colour",
-        "light (log)",
-        "exposure (stops)",
-        "vignetting (stops)",
-        "response",
-        "poses (°)",
-    ]
+    head = (
+        "nuisance | models | base colour | light (log) | exposure (stops) | vignetting (stops) | response | poses (°)"
+    )
     seeds = record["settings"]["seeds"]
     said = f"{seeds} seeds, mean ± spread" if seeds > 1 else "1 seed"
-    return f"{record['steps']} steps, photographs of {record['size']}², {said}.\n\n{markdown.table(head, rows)}"
+    text = f"{record['steps']} steps, photographs of {record['size']}², {said}."
+    return markdown.blocks(text, markdown.table(head, rows))
 
 
 def _cell(errors: list[float], digits: int) -> str:

@@ -1,7 +1,5 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -9,33 +7,27 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """Error at equal time, and memory."""
     rows = []
-    for loss, entries in record["losses"].items():
-        for name, entry in entries.items():
-            unchanged = entries[name.removesuffix(", changed")]["final"][0]
-            middle, low, high = entry["final"]
-            rows.append(
-                [
-                    loss.upper(), name, entry["spp"], f"{entry['rate']:g}", entry["steps"], f"{middle:.4f} ({low:.4f} to {high:.4f})",
-                    f"**{middle / unchanged:.2f}**" if name.endswith("changed") else "1",
-                ]
-            )  # fmt: skip
-    settings = record["settings"]
+    for entry in markdown.named(record["losses"], "loss", "", "name"):
+        name, (middle, low, high) = entry["name"], entry["final"]
+        unchanged = record["losses"][entry["loss"]][name.removesuffix(", changed")]["final"][0]
+        ratio = f"**{middle / unchanged:.2f}**" if name.endswith("changed") else "1"
+        row = markdown.fill("{name} | {spp} | {rate:g} | {steps}", entry)
+        rows.append([entry["loss"].upper(), row, f"{middle:.4f} ({low:.4f} to {high:.4f})", ratio])
+    text = "`indirect-room`, {resolution}², texture {texture_resolution}², {seconds:g} s, {seeds} seeds; error of the texture (RMSE; "
+    text += "{start:.3f} at the start), median and range."
     parts = [
-        f"`indirect-room`, {settings['resolution']}², texture {settings['texture_resolution']}², {settings['seconds']:g} s, "
-        f"{settings['seeds']} seeds; error of the texture (RMSE; {record['start']:.3f} at the start), median and range.",
-        markdown.table(["loss", "loop", "spp", "rate", "steps", "error", "of the unchanged"], rows),
+        markdown.fill(text, record, record["settings"]),
+        markdown.table("loss | loop | spp | rate | steps | error | of the unchanged", rows),
     ]
     if "leaks" in record:
-        leaks = [
-            [name, entry["points"][-1][0], f"{entry['kib_per_1000_steps']:+.0f}", f"{entry['points'][1][2]} to {entry['points'][-1][2]}"]
-            for name, entry in record["leaks"].items()
-        ]  # fmt: skip
-        head = ["loop", "steps", "KiB per 1000 steps", "lines of dr.whos"]
-        parts += ["Memory of the changed loops:", markdown.table(head, leaks)]
-    return "\n\n".join(parts)
+        row = "{name} | {points[-1][0]} | {kib_per_1000_steps:+.0f} | {points[1][2]} to {points[-1][2]}"
+        head = "loop | steps | KiB per 1000 steps | lines of dr.whos"
+        leaks = markdown.records(head, row, markdown.named(record["leaks"], "name"))
+        parts += ["Memory of the changed loops:", leaks]
+    return markdown.blocks(*parts)
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error over seconds, a panel for each loss."""
     panels = {
         f"{loss.upper()} loss": {

@@ -5,7 +5,6 @@ from __future__ import annotations
 from statistics import geometric_mean
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
@@ -65,40 +64,44 @@ def _mean(speeds: list[float | None], problems: list[Record], seconds: float) ->
 
 def table(record: Record) -> str:
     """Error at the end, and the time to the tuned loop's best error."""
-    settings, problems = record["settings"], record["problems"]
-    rows = []
+    settings, problems, rows = record["settings"], record["problems"], []
     for name, entry in problems.items():
-        setting, never = entry["setting"], entry["speed"] is None
-        words = f"{setting['spp']} spp, {setting['rate']:g}{', falling' if setting['falling'] else ''}"
-        hand = entry.get("fixed_point")
-        first = "never" if never else f"{entry['seconds_of_auto']:.2g} s"
-        rows.append(
-            [
-                name, words, f"{entry['loop'][4]:.3f}, {entry['loop'][-1]:.3f}", f"{entry['auto'][4]:.3f}, {entry['auto'][-1]:.3f}",
-                f"{hand[4]:.3f}, {hand[-1]:.3f}" if hand else "",
-                f"{entry['seconds_of_loop']:.2g} s", first, "below 1" if never else f"**{entry['speed']:.2g}**",
-                _tuned(entry), f"{entry['compile_seconds']:.1f} s",
-            ]
-        )  # fmt: skip
-    head = ["problem", "the loop's best setting", "loop, half and end", "auto, half and end", "fixed point"]
-    head += ["loop at its best", "auto there", "faster", "tuned", "compile"]
+        sides = {"loop", "auto", "fixed_point"} & entry.keys()
+        ends = {side: f"{entry[side][4]:.3f}, {entry[side][-1]:.3f}" for side in sides}
+        speed, first = "below 1", "never"
+        if entry["speed"] is not None:
+            speed, first = f"**{entry['speed']:.2g}**", f"{entry['seconds_of_auto']:.2g} s"
+        rows.append([name, _setting(entry), ends["loop"], ends["auto"], ends.get("fixed_point", "")])
+        rows[-1] += [
+            f"{entry['seconds_of_loop']:.2g} s",
+            first,
+            speed,
+            _tuned(entry),
+            f"{entry['compile_seconds']:.1f} s",
+        ]
+    head = (
+        "problem | the loop's best setting | loop, half and end | auto, half and end | fixed point | loop at its best"
+    )
     entries = list(problems.values())
     mean = _mean([entry["speed"] for entry in entries], entries, settings["seconds"])
     seeds = sorted({len(entry["final"]["auto"]) for entry in entries})
     tuned = len(settings["spp"]) * len(settings["rates"]) * 2
-    return "\n\n".join(
-        [
-            f"{settings['seconds']:g} s, {' or '.join(map(str, seeds))} seeds, medians; errors where seen, relative to the "
-            f"start. The loop is the best of {tuned} settings, the column `auto` has none set.",
-            markdown.table(head, rows),
-            f"Geometric mean over the {len(problems)} problems: **{mean:.2f}** times as fast, where `auto` never gets "
-            f"there as if it did at the end. Ahead at the end on {sum(e['auto'][-1] < e['loop'][-1] for e in entries)}."
-            + _of_tuning(entries, settings["seconds"]),
-        ]
+    return markdown.blocks(
+        f"{settings['seconds']:g} s, {' or '.join(map(str, seeds))} seeds, medians; errors where seen, relative to the "
+        f"start. The loop is the best of {tuned} settings, the column `auto` has none set.",
+        markdown.table(f"{head} | auto there | faster | tuned | compile", rows),
+        f"Geometric mean over the {len(problems)} problems: **{mean:.2f}** times as fast, where `auto` never gets "
+        f"there as if it did at the end. Ahead at the end on {sum(e['auto'][-1] < e['loop'][-1] for e in entries)}."
+        + _of_tuning(entries, settings["seconds"]),
     )
 
 
-def plot(record: Record) -> Figure:
+def _setting(entry: Record) -> str:
+    falling = ", falling" if entry["setting"]["falling"] else ""
+    return f"{entry['setting']['spp']} spp, {entry['setting']['rate']:g}{falling}"
+
+
+def plot(record: Record) -> figures.Figure:
     """Error of both sides over seconds."""
     seconds = record["settings"]["seconds"] * np.arange(11) / 10
     sides = {"loop": "stock loop, tuned", "auto": "auto, no option", "fixed_point": "reference / rendering"}

@@ -1,7 +1,6 @@
 """Table and figure."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.adaptive.equal_time.run import timed
@@ -12,26 +11,22 @@ def table(record: Record) -> str:
     """All races in one table; then per task final errors, and ratios to uniform at checkpoints."""
     parts = [all_races(record)]
     for name, entry in record["entries"].items():
+        over = entry["over uniform"]
         rows = []
         for method, run in entry["methods"].items():
-            rows.append([method, f"{run['rate']:g}", f"{entry['errors'][method][-1]:.3f}"])
-            for ratios in entry["over uniform"].values():
-                rows[-1].append(" ".join(f"{x:.2f}" for x in ratios[method]))
-        head = [
-            "pixels",
-            "rate",
-            "error at equal time",
-            *(f"over uniform, at tenths of the {by}" for by in entry["over uniform"]),
-        ]
+            ratios = (" ".join(f"{x:.2f}" for x in of[method]) for of in over.values())
+            rows.append([method, f"{run['rate']:g}", f"{entry['errors'][method][-1]:.3f}", *ratios])
+        head = " | ".join(
+            ["pixels | rate | error at equal time", *(f"over uniform, at tenths of the {by}" for by in over)]
+        )
         sizes = ", ".join(f"{key}={value}" for key, value in entry["options"].items())
         budget = f"{entry['steps']} steps, falling rates" if entry.get("steps") else f"{entry['seconds']:g} s"
         summary = f"{entry['count']} pixels a step, {budget}, {entry['seeds']} seeds"
-        text = f"**{name}**{f' ({sizes})' if sizes else ''}, {summary}.\n\n{markdown.table(head, rows)}"
+        parts += [f"**{name}**{f' ({sizes})' if sizes else ''}, {summary}.", markdown.table(head, rows)]
         if "time" in entry:
             found = (f"{method} {'never' if x is None else f'{x:.2f}'}" for method, x in entry["time"].items())
-            text += f"\n\nTime to the least error that all reach, over that of uniform pixels: {', '.join(found)}."
-        parts.append(text)
-    return "\n\n".join(parts)
+            parts.append(f"Time to the least error that all reach, over that of uniform pixels: {', '.join(found)}.")
+    return markdown.blocks(*parts)
 
 
 def all_races(record: Record) -> str:
@@ -39,24 +34,21 @@ def all_races(record: Record) -> str:
     rows, ends = [], []
     for name, entry in record["entries"].items():
         over, time = entry["over uniform"], entry.get("time", {}).get("adaptive")
-        cells = [
-            f"{over[by][method][-1]:.2f}" if method in over[by] else "–"
-            for by in ("time", "samples")
-            for method in ("loss", "adaptive")
-        ]
+        pairs = [(by, method) for by in ("time", "samples") for method in ("loss", "adaptive")]
+        cells = (f"{over[by][method][-1]:.2f}" if method in over[by] else "–" for by, method in pairs)
         rows.append([name, *cells, f"{time:.2f}" if time else "–"])
         if not name.startswith("mirror-trio"):
             ends.append(over["time"]["adaptive"][-1])
-    head = ["race", "Eq. 5, equal time", "adaptive, equal time", "Eq. 5, equal samples", "adaptive, equal samples"]
+    head = "race | Eq. 5, equal time | adaptive, equal time | Eq. 5, equal samples | adaptive, equal samples | time"
     mean = float(np.exp(np.log(ends).mean()))
     return markdown.blocks(
         "**All races**: error at the end over that of uniform pixels, and the time of adaptive pixels to the least error that all reach "
         f"over theirs. Geometric mean of adaptive pixels at equal time: {mean:.2f}, without `mirror-trio`, whose error crosses 0.",
-        markdown.table([*head, "time"], rows),
+        markdown.table(head, rows),
     )
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error over seconds."""
     panels = {
         name: {

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -13,37 +11,32 @@ def table(record: Record) -> str:
     s, variance = record["settings"], record["variance"]
     alphas = [f"{point['alpha']:g}" for point in next(iter(variance.values()))]
     parts = [
-        f"{s['resolution']}² pixels, {s['spp']} paths each, {s['runs']} gradients; differential over ordinary, by alpha."
+        "{resolution}² pixels, {spp} paths each, {runs} gradients; differential over ordinary, by alpha.".format(**s)
     ]
-    for label, of in (
-        ("variance of the image's derivative", "derivative"),
-        ("variance of the loss's gradient", "loss"),
-    ):
+    kinds = {"derivative": "variance of the image's derivative", "loss": "variance of the loss's gradient"}
+    for of, label in kinds.items():
         rows = [[name, *(_ratio(point[of]) for point in points)] for name, points in variance.items()]
-        parts += [f"**{label}** at equal paths; at equal processor time", markdown.table(["scene", *alphas], rows)]
-    worst = max(
-        abs(point[of]["z"]) for points in variance.values() for point in points for of in ("derivative", "loss")
+        head = " | ".join(["scene", *alphas])
+        parts += [f"**{label}** at equal paths; at equal processor time", markdown.table(head, rows)]
+    every = [point[of] for points in variance.values() for point in points for of in kinds]
+    worst = max(abs(entry["z"]) for entry in every)
+    return markdown.blocks(
+        *parts,
+        f"The largest |z| of the difference of the {len(every)} pairs of means: {worst:.2f}.",
+        "**descents**: {steps} steps of {count} pixels, two paths each, {seeds} seeds".format(**s),
+        markdown.records(
+            "scene | pixels, derivatives | error of alpha, last quarter | processor seconds a run",
+            "{scene} | {kind} | {mean:.3f} ± {error:.2g} | {seconds:.1f}",
+            markdown.named(record["descents"], "scene", "", "kind"),
+        ),
     )
-    count = 2 * sum(map(len, variance.values()))
-    parts.append(f"The largest |z| of the difference of the {count} pairs of means: {worst:.2f}.")
-    rows = [
-        [name, kind, f"{entry['mean']:.3f} ± {entry['error']:.2g}", f"{entry['seconds']:.1f}"]
-        for name, entries in record["descents"].items()
-        for kind, entry in entries.items()
-    ]
-    head = ["scene", "pixels, derivatives", "error of alpha, last quarter", "processor seconds a run"]
-    parts += [
-        f"**descents**: {s['steps']} steps of {s['count']} pixels, two paths each, {s['seeds']} seeds",
-        markdown.table(head, rows),
-    ]
-    return markdown.blocks(*parts)
 
 
 def _ratio(entry: dict[str, Any]) -> str:
     return f"{entry['ratio']:.2g} ± {entry['error']:.1g}; {entry['ratio'] * entry['cost']:.2g}"
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error along the descents."""
     panels = {
         name: {label: figures.over_steps(entry["along"]) for label, entry in entries.items()}

@@ -1,5 +1,6 @@
 """Table."""
 
+from collections.abc import Callable
 from typing import Any
 
 from benchmarks import markdown
@@ -15,36 +16,25 @@ def table(record: Record) -> str:
     ]
     for label in record["summary"]:
         found = {name: entry[label] for name, entry in record["problems"].items() if label in entry}
-        steps = [str(point["step"]) for point in next(iter(found.values()))]
-        rows = [[name, *(_cell(point) for point in points)] for name, points in found.items()]
-        parts += [
-            f"**{label}**, variance over uniform's after so many steps",
-            markdown.table(["problem", *steps], rows),
-        ]
+        parts += [f"**{label}**, variance over uniform's after so many steps", _by_steps(found, _cell)]
     direct = {
         name: [point for point in entry["adaptive"] if point["gradients"]]
         for name, entry in record["problems"].items()
         if "adaptive" in entry
     }
-    rows = [[name, *(_direct(point) for point in points)] for name, points in direct.items()]
-    steps = [str(point["step"]) for point in next(iter(direct.values()))]
     parts += [
         f"**adaptive**, by {settings['runs']} gradients of each sampler, plain / relative",
-        markdown.table(["problem", *steps], rows),
+        _by_steps(direct, _direct),
     ]
-    rows = []
-    for label, summary in record["summary"].items():
-        worst = [f"{ratio:.2f} ± {error:.1g}" for ratio, error in summary["worst"]]
-        rows.append([label, summary["problems"], *(f"{mean:.2f}" for mean in summary["mean"]), *worst])
-    head = [
-        "sampler",
-        "problems",
-        "geometric mean at the end, plain",
-        "relative",
-        "worst of all steps, plain",
-        "relative",
-    ]
-    return markdown.blocks(*parts, markdown.table(head, rows))
+    head = "sampler | problems | geometric mean at the end, plain | relative | worst of all steps, plain | relative"
+    row = "{label} | {problems} | {mean[0]:.2f} | {mean[1]:.2f} | {worst[0][0]:.2f} ± {worst[0][1]:.1g}"
+    row += " | {worst[1][0]:.2f} ± {worst[1][1]:.1g}"
+    return markdown.blocks(*parts, markdown.records(head, row, markdown.named(record["summary"], "label")))
+
+
+def _by_steps(found: dict[str, Any], cell: Callable[[dict[str, Any]], str]) -> str:
+    head = " | ".join(["problem", *(str(point["step"]) for point in next(iter(found.values())))])
+    return markdown.table(head, [[name, *map(cell, points)] for name, points in found.items()])
 
 
 def _cell(point: dict[str, Any]) -> str:

@@ -1,26 +1,22 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
     """What was left of the loss."""
-    settings = record["settings"]
     rows = []
-    for name, task in record["tasks"].items():
-        for method, found in task["methods"].items():
-            finals = ", ".join(f"{run['final']:.3f}" for run in found["runs"])
-            steps = ", ".join(str(run["steps"]) for run in found["runs"])
-            rows.append([name, task["numbers"], method, f"{found['setting']:g}", finals, steps])
-    lead = f"{settings['views']} views of {settings['resolution']}², {settings['seconds']:g} s of the processor, runs: {settings['runs']}."
-    columns = ["task", "numbers", "method", "rate or radius, in σ", "loss / at the start", "steps"]
-    return f"{lead}\n\n" + markdown.table(columns, rows)
+    for found in markdown.named(record["tasks"], "task", "methods", "method"):
+        finals = ", ".join(f"{run['final']:.3f}" for run in found["runs"])
+        steps = ", ".join(str(run["steps"]) for run in found["runs"])
+        rows.append([markdown.fill("{task} | {numbers} | {method} | {setting:g}", found), finals, steps])
+    text = "{views} views of {resolution}², {seconds:g} s of the processor, runs: {runs}."
+    head = "task | numbers | method | rate or radius, in σ | loss / at the start | steps"
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Loss over seconds."""
     panels = {
         f"{name}: {task['numbers']} numbers": {

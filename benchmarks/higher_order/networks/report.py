@@ -2,8 +2,6 @@
 
 import math
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -11,29 +9,25 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """Errors of the networks' answers, and when they had fallen by 90 and 99 %."""
     rows = []
-    for name, task in record["tasks"].items():
-        for method, entry in task["methods"].items():
-            finals = sorted(run["final"] for run in entry["runs"])
-            steps = sorted(run["steps"] for run in entry["runs"])
-            middle = finals[len(finals) // 2]
-            spread = f"{middle:.3f} ({finals[0]:.3f} to {finals[-1]:.3f})"
-            times = [sorted(run["reached"][goal] for run in entry["runs"])[len(finals) // 2] for goal in range(2)]
-            rows.append(
-                [
-                    f"{name}, {task['weights']} weights",
-                    method,
-                    f"{len(finals)} of {task['seconds']:g} s",
-                    f"{entry['rate']:g}",
-                    spread,
-                    *[f"{t:.3g}" if math.isfinite(t) else "—" for t in times],
-                    steps[len(steps) // 2],
-                ]
-            )
-    head = ["task", "method", "runs", "rate or radius", "final error: median (range)", "s to 90 %", "99 %", "steps"]
+    for entry in markdown.named(record["tasks"], "task", "methods", "method"):
+        runs = entry["runs"]
+        middle = len(runs) // 2
+        finals, steps = (sorted(run[key] for run in runs) for key in ("final", "steps"))
+        times = [sorted(run["reached"][goal] for run in runs)[middle] for goal in range(2)]
+        row = "{task}, {weights} weights | {method} | {count} of {seconds:g} s | {rate:g}"
+        rows.append(
+            [
+                markdown.fill(row, entry, {"count": len(runs)}),
+                markdown.median_range((finals[middle], finals[0], finals[-1])),
+                *(f"{t:.3g}" if math.isfinite(t) else "—" for t in times),
+                steps[middle],
+            ]
+        )
+    head = "task | method | runs | rate or radius | final error: median (range) | s to 90 % | 99 % | steps"
     return markdown.table(head, rows)
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error over seconds."""
     panels = {
         name: {method: [run["curve"] for run in entry["runs"]] for method, entry in task["methods"].items()}

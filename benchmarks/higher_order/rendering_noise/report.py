@@ -3,36 +3,27 @@
 import math
 import statistics
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
     """Final errors by samples per pixel, and renders to a tenth of the error."""
-    settings = record["settings"]
-    counts = [str(count) for count in settings["spp"]]
-    rows = []
+    counts, rows = [str(count) for count in record["settings"]["spp"]], []
     for name, methods in record["tasks"].items():
         for method, entry in methods.items():
-            finals = [sorted(run["final"] for run in entry[count]) for count in counts]
+            finals = [[run["final"] for run in entry[count]] for count in counts]
             times = [statistics.median(run["renders"] for run in entry[count]) for count in counts]
-            rows.append(
-                [
-                    name,
-                    method,
-                    *[f"{statistics.median(f):.4f} (to {f[-1]:.3f})" for f in finals],
-                    *[f"{t:.0f}" if math.isfinite(t) else "—" for t in times],
-                ]
-            )
-    head = ["task", "method", *[f"final, {c} spp" for c in counts], *[f"to 90 %, {c} spp" for c in counts]]
-    size = f"{settings['renders']} renders, {settings['runs']} runs"
-    lead = f"{size}: median final error of the parameters (worst), and median renders to a tenth."
-    return f"{lead}\n\n{markdown.table(head, rows)}"
+            cells = [f"{statistics.median(f):.4f} (to {max(f):.3f})" for f in finals]
+            rows.append([name, method, *cells, *(f"{t:.0f}" if math.isfinite(t) else "—" for t in times)])
+    head = ["task | method", *(f"final, {c} spp" for c in counts), *(f"to 90 %, {c} spp" for c in counts)]
+    text = (
+        "{renders} renders, {runs} runs: median final error of the parameters (worst), and median renders to a tenth."
+    )
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(" | ".join(head), rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Final errors by samples per pixel."""
     panels = {
         name: {

@@ -4,43 +4,35 @@ import itertools
 import statistics
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 OURS = ("OurHVPA", "OurJoint")
 """Tuned as widely as FR22, and measured with it."""
+GOALS = "image 90 % | 99 % | 99.9 % | parameters 90 % | 99 % | 99.9 %"
 
 
 def table(record: Record) -> str:
     """Seconds to each reduction of the error, and FR22's and CMA-ES's against the better of `OURS`."""
-    settings = record["settings"]
-
-    def seconds(values: list[float | None]) -> list[str]:
-        return ["—" if value is None else f"{value:.3g}" for value in values]
-
+    entries = list(markdown.named(record["tasks"], "task", "methods", "method"))
     rows = []
-    for name, task in record["tasks"].items():
-        for method, entry in task["methods"].items():
-            summary = entry["summary"]
-            there = " / ".join(map(str, summary["parameter_count"])) + f" of {len(entry['runs'])}"
-            rows.append([name, method, *seconds(summary["image"]), *seconds(summary["parameter"]), there])
-    goals = ["image 90 %", "99 %", "99.9 %", "parameters 90 %", "99 %", "99.9 %"]
-    count = f"Random starts, {settings['resolution']}²; median seconds of the processor, — where half the runs or more never got there."
-    entries = [entry for task in record["tasks"].values() for entry in task["methods"].values()]
+    for entry in entries:
+        times = [*entry["summary"]["image"], *entry["summary"]["parameter"]]
+        there = " / ".join(map(str, entry["summary"]["parameter_count"])) + f" of {len(entry['runs'])}"
+        cells = ("—" if time is None else f"{time:.3g}" for time in times)
+        rows.append([entry["task"], entry["method"], *cells, there])
     commands = dict.fromkeys(entry["command"] for entry in entries if "command" in entry)
-    made = "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands)
-    parts = [count, markdown.table(["task", "method", *goals, "runs that got there"], rows), made]
-    for rival in ("FR22", "CMA-ES"):
-        parts += [
-            f"{rival}'s time over the better of OurHVPA and OurJoint, per goal (>: its budget over theirs where it never got there):"
-        ]
-        parts += [_gains(record["tasks"], rival, goals)]
-    parts += [
-        "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached."
+    parts = [
+        f"Random starts, {record['settings']['resolution']}²; median seconds of the processor, — where half the runs or more "
+        "never got there.",
+        markdown.table(f"task | method | {GOALS} | runs that got there", rows),
+        "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands),
     ]
-    return "\n\n".join([*parts, _apart(record["tasks"])])
+    for rival in ("FR22", "CMA-ES"):
+        text = "'s time over the better of OurHVPA and OurJoint, per goal (>: its budget over theirs where it never got there):"
+        parts += [rival + text, _gains(record["tasks"], rival)]
+    text = "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached."
+    return markdown.blocks(*parts, text, _apart(record["tasks"]))
 
 
 def _apart(tasks: dict[str, Any]) -> str:
@@ -52,7 +44,7 @@ def _apart(tasks: dict[str, Any]) -> str:
         cells = [f"{statistics.fmean(found):.2f}" if found else "—" for found in ratios.values()]
         middle = f"{statistics.fmean(every):.2f} ({statistics.geometric_mean(every):.2f})" if every else "—"
         rows.append([f"{rival} / {method}", *cells, middle, len(every)])
-    return markdown.table(["", *tasks, "all (geometric)", "goals"], rows)
+    return markdown.table(" | ".join(["", *tasks, "all (geometric)", "goals"]), rows)
 
 
 def _both(methods: dict[str, Any], rival: str, method: str) -> list[float]:
@@ -65,7 +57,7 @@ def _both(methods: dict[str, Any], rival: str, method: str) -> list[float]:
     return [a / b for a, b in zip(theirs, ours, strict=True) if a is not None and b is not None]
 
 
-def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:
+def _gains(tasks: dict[str, Any], rival: str) -> str:
     """A row of ratios per task, their mean, and the mean of all."""
     rows, everything = [], []
     for name, task in tasks.items():
@@ -88,10 +80,10 @@ def _gains(tasks: dict[str, Any], rival: str, goals: list[str]) -> str:
     mean = (
         f"Mean of all {len(everything)}, bounds counted as they are: {sum(everything) / max(len(everything), 1):.2f}."
     )
-    return markdown.table(["task", *goals, "mean"], rows) + f"\n\n{mean}"
+    return markdown.table(f"task | {GOALS} | mean", rows) + f"\n\n{mean}"
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Per task: median error over seconds, in the image and in the parameters."""
     panels = {
         f"{name}: {kind}": {method: [entry["curves"][kind]] for method, entry in task["methods"].items()}

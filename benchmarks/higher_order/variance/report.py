@@ -6,13 +6,11 @@ from benchmarks.runner.records import Record
 
 def table(record: Record) -> str:
     """Variance times evaluations over that of the plain estimator."""
-    settings = record["settings"]
     problems = record["problems"]
     names = list(next(iter(next(iter(problems.values())).values())))
     head = ["", *(f"{problem}: {order}" for problem, orders in problems.items() for order in orders)]
     rows = [
-        [name, *(f"{orders[order][name]:.2g}" for orders in problems.values() for order in orders)] for name in names
+        [name, *(f"{cuts[name]:.2g}" for orders in problems.values() for cuts in orders.values())] for name in names
     ]
-    return (
-        f"{settings['runs']} runs of {settings['samples']} evaluations; below 1 pays.\n\n{markdown.table(head, rows)}"
-    )
+    text = "{runs} runs of {samples} evaluations; below 1 pays.".format(**record["settings"])
+    return markdown.blocks(text, markdown.table(" | ".join(head), rows))

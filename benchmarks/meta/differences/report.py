@@ -1,49 +1,42 @@
 """Table and figure."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """Meta: variance and cost of differences."""
-    variance = record["variance"]
+    """Meta: variance, cost and noise of differences."""
+    variance, noise = record["variance"], record["noise"]
+    first = next(iter(variance["problems"].values()))
+    text = "{resolution}², {spp} spp, {runs} runs. Var ΔF / Var F by step, a share of the way to the truth:".format(
+        **variance
+    )
     rows = []
     for name, entry in variance["problems"].items():
         for space in ("path", "primary"):
-            f = entry[space]
-            ratios = [f"{v / f['gradient']:.1e}" for v in f["difference"]]
-            rows.append([name, space, f"{f['slope']:.2f}", *ratios])
-    steps = next(iter(variance["problems"].values()))["steps"]
-    sizes = f"{variance['resolution']}², {variance['spp']} spp, {variance['runs']} runs."
-    sizes += " Var ΔF / Var F by step, a share of the way to the truth:"
-    first = markdown.table(["problem", "space", "slope, log-log", *(f"{s:g}" for s in steps)], rows)
-    blocks = [sizes, first]
+            ratios = (f"{value / entry[space]['gradient']:.1e}" for value in entry[space]["difference"])
+            rows.append([name, space, f"{entry[space]['slope']:.2f}", *ratios])
+    head = ["problem | space | slope, log-log", *(f"{step:g}" for step in first["steps"])]
+    parts = [text, markdown.table(" | ".join(head), rows)]
     for size, cost in record["cost"].items():
-        keys = list(next(iter(cost.values())))
-        blocks.append(f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {size}²:")
-        blocks.append(
-            markdown.table(
-                ["milliseconds", *cost], [[key, *(f"{cost[name][key]:.2f}" for name in cost)] for key in keys]
-            )
-        )
-    if "noise" in record:
-        found = record["noise"]
-        blocks.append(
-            f"Var F of plain gradients times samples per pixel, over that at {found['spp'][0]}, near the truth: what equal paths in "
-            f"steps of so many leave of noise ({found['resolution']}², {found['runs']} runs):"
-        )
-        rows = []
-        for name, values in found["problems"].items():
-            of_paths = [v * n for v, n in zip(values, found["spp"], strict=True)]
-            rows.append([name, *(f"{v / of_paths[0]:.3f}" for v in of_paths)])
-        blocks.append(markdown.table(["problem", *(f"{n} spp" for n in found["spp"])], rows))
-    return "\n\n".join(blocks)
+        rows = [[key, *(f"{of[key]:.2f}" for of in cost.values())] for key in next(iter(cost.values()))]
+        parts += [
+            f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {size}²:",
+            markdown.table(" | ".join(["milliseconds", *cost]), rows),
+        ]
+    rows = []
+    for name, values in noise["problems"].items():
+        of_paths = [v * n for v, n in zip(values, noise["spp"], strict=True)]
+        rows.append([name, *(f"{v / of_paths[0]:.3f}" for v in of_paths)])
+    text = "Var F of plain gradients times samples per pixel, over that at {spp[0]}, near the truth: what equal paths in steps of so many "
+    text += "leave of noise ({resolution}², {runs} runs):"
+    head = " | ".join(["problem", *(f"{n} spp" for n in noise["spp"])])
+    return markdown.blocks(*parts, markdown.fill(text, noise), markdown.table(head, rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Variance of the difference over that of the gradient, against the step."""
     contenders = {
         f"{name}, {space}: slope {found[space]['slope']:.2f}": [

@@ -1,32 +1,24 @@
 """Table and figure."""
 
-from typing import Any
-
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
     """Meta, Fig. 2."""
-    settings = record["settings"]
-    rows = []
-    for method, entry in record["methods"].items():
-        row: list[Any] = [method]
-        for horizon in map(str, settings["steps"]):
-            f = entry[horizon]
-            row += [f"{f['rmse']:.5f}", f"{f['of_adam']:.2f}", f"{f['rate']:g}"]
-        rows.append(row)
-    head = ["method"]
-    for horizon in settings["steps"]:
-        head += [f"RMSE after {horizon} steps", "of Adam's", "rate"]
-    return (
-        f"{settings['seeds']} runs; each method tuned for each horizon on other seeds.\n\n{markdown.table(head, rows)}"
+    horizons = [str(steps) for steps in record["settings"]["steps"]]
+    cells = (f"{{{n}[rmse]:.5f}} | {{{n}[of_adam]:.2f}} | {{{n}[rate]:g}}" for n in horizons)
+    return markdown.blocks(
+        f"{record['settings']['seeds']} runs; each method tuned for each horizon on other seeds.",
+        markdown.records(
+            " | ".join(["method", *(f"RMSE after {n} steps | of Adam's | rate" for n in horizons)]),
+            " | ".join(["{method}", *cells]),
+            markdown.named(record["methods"], "method"),
+        ),
     )
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """The rate over the steps, with the range of 20 runs, and its RMSE."""
     horizon = str(record["settings"]["steps"][0])
     methods = {f"{name}, rate {entry[horizon]['rate']:g}": entry[horizon] for name, entry in record["methods"].items()}

@@ -1,32 +1,24 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
     """Fig. 3."""
-    settings = record["settings"]
-    rows = [
-        [
-            rule,
-            f"{f['variance'][2]:.3f}",
-            f"{f['weight'][-1]:.3f}",
-            f"{f['variance'][-1]:.4f}",
-            f"{f['bias']:+.2%} ± {f['bias_error']:.2%}",
-        ]
-        for rule, f in record["rules"].items()
-    ]
-    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['steps']} steps, {settings['runs']} runs"
-    return (
-        f"{sizes}; at the last step but where it says otherwise, variance relative to one render's.\n\n"
-        + markdown.table(["rule", "variance after 3 renders", "weight", "variance", "bias"], rows)
+    text = "{resolution}², {spp} spp, {steps} steps, {runs} runs; at the last step but where it says otherwise, variance relative to one "
+    text += "render's."
+    return markdown.blocks(
+        text.format(**record["settings"]),
+        markdown.records(
+            "rule | variance after 3 renders | weight | variance | bias",
+            "{rule} | {variance[2]:.3f} | {weight[-1]:.3f} | {variance[-1]:.4f} | {bias:+.2%} ± {bias_error:.2%}",
+            markdown.named(record["rules"], "rule"),
+        ),
     )
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Weights and variance over the steps."""
     steps, rules = range(record["settings"]["steps"]), record["rules"]
     panels = {

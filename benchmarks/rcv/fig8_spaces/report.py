@@ -1,7 +1,6 @@
 """Table and figure."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
@@ -9,27 +8,19 @@ from benchmarks.runner.records import Record
 
 def table(record: Record) -> str:
     """Fig. 8."""
-    settings = record["settings"]
-    rows = []
-    for scene, entry in record["scenes"].items():
-        for space, f in entry["summary"].items():
-            ratios = (f["weight"], f["variance_ratio"], f["error_ratio_at_last"], f["image_cost"], f["step_cost"])
-            rows.append([scene, space, *(f"{x:.2f}" for x in ratios)])
-    head = [
-        "scene",
-        "space",
-        "mean weight",
-        "variance ÷",
-        "error ÷ at the last step",
-        "cost of an image",
-        "cost of a step",
-    ]
-    sizes = f"{settings['resolution']}², {settings['spp']} spp, {settings['steps']} steps, {settings['runs']} runs"
-    sizes += "; relative to a plain render."
-    return f"{sizes}\n\n{markdown.table(head, rows)}"
+    text = "{resolution}², {spp} spp, {steps} steps, {runs} runs; relative to a plain render."
+    fields = ("weight", "variance_ratio", "error_ratio_at_last", "image_cost", "step_cost")
+    return markdown.blocks(
+        text.format(**record["settings"]),
+        markdown.records(
+            "scene | space | mean weight | variance ÷ | error ÷ at the last step | cost of an image | cost of a step",
+            " | ".join(["{scene} | {space}", *(f"{{{field}:.2f}}" for field in fields)]),
+            markdown.named(record["scenes"], "scene", "summary", "space"),
+        ),
+    )
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Per scene: mean weight, and variance over a plain render's."""
     panels = {}
     for scene, entry in record["scenes"].items():

@@ -1,7 +1,5 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -12,35 +10,21 @@ def table(record: Record) -> str:
     """Equal-time reconstruction."""
     rows = []
     for entry in record["entries"].values():
-        summary = entry["summary"]
         for method in (each for each in ORDER if each in entry["methods"]):
-            chosen, row = entry["methods"][method], summary[method]
-            middle, low, high = row["final"]
-            other = ""
+            found, others = {**entry, **entry["methods"][method], **entry["summary"][method]}, ["1", "", ""]
             if method != "rcv":
-                reached = [t for t in row["rcv_reaches_its_best_after"] if t is not None]
+                reached = sorted(t for t in found["rcv_reaches_its_best_after"] if t is not None)
                 share = f"{len(reached)} of {len(entry['methods']['rcv']['runs'])}"
-                when = f"{sorted(reached)[len(reached) // 2]:.1f} s ({share})" if reached else "never"
-                other = f"{1 / row['ratio']:.2f}× | {row['it_reaches_its_best_after']:.1f} s | {when}"
-            else:
-                other = "1 | | "
-            rows.append(
-                [
-                    entry["problem"],
-                    entry["loss"],
-                    f"{entry['seconds']:g} s{' of the processor' if 'processor' in entry else ''}",
-                    f"{method} ({chosen['spp']} spp, {chosen['rate']:g})",
-                    f"{middle:.3f} ({low:.3f} to {high:.3f})",
-                    f"{row['best']:.3f}",
-                    *other.split(" | "),
-                ]
-            )
-    head = ["problem", "loss", "budget", "method (spp, rate)", "final error", "best on the way"]
-    head += ["× rcv's final", "its best at", "rcv gets there at"]
-    return markdown.table(head, rows)
+                when = f"{reached[len(reached) // 2]:.1f} s ({share})" if reached else "never"
+                others = [f"{1 / found['ratio']:.2f}×", f"{found['it_reaches_its_best_after']:.1f} s", when]
+            clock = " of the processor" if "processor" in entry else ""
+            row = f"{{problem}} | {{loss}} | {{seconds:g}} s{clock} | {method} ({{spp}} spp, {{rate:g}}) | {{final!m}} | {{best:.3f}}"
+            rows.append([markdown.fill(row, found), *others])
+    head = "problem | loss | budget | method (spp, rate) | final error | best on the way | × rcv's final | its best at"
+    return markdown.table(f"{head} | rcv gets there at", rows)
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error over seconds, a panel per problem and loss."""
     panels = {
         name: {

@@ -1,8 +1,5 @@
 """Table and figure."""
 
-import numpy as np
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -10,30 +7,23 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """What was left of the errors, and the gradient's variance."""
     rows = []
-    for problem, of_problem in record["problems"].items():
-        methods = of_problem["methods"]
-        for name, of in methods.items():
-            finals = [
-                markdown.median_range((float(np.median(values)), min(values), max(values))) if values else "–"
-                for values in ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
-            ]
-            uniform = methods["uniform"]["variance"] if "uniform" in methods else 0.0
+    for problem, found in record["problems"].items():
+        uniform = found["methods"].get("uniform", {}).get("variance", 0.0)
+        for name, of in found["methods"].items():
+            values = ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
+            finals = (markdown.spread(each) if each else "–" for each in values)
             noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
             rows.append([problem, name, f"{of['rate']:g}", *finals, noise])
-    settings = record["settings"]
-    said = (
-        f"Of the start's, after {settings['seconds']:g} s of the processor, {settings['seeds']} seeds: median (least to greatest). "
-        f"Views of {settings['resolution']}², mini-batches of {settings['pixels']} pixels, {settings['spp']} spp. "
+    text = (
+        "Of the start's, after {seconds:g} s of the processor, {seeds} seeds: median (least to greatest). "
+        "Views of {resolution}², mini-batches of {pixels} pixels, {spp} spp. "
         "Variance of the gradient at the start, over that of uniform mini-batches."
     )
-    return (
-        said
-        + "\n\n"
-        + markdown.table(["problem", "pixels", "rate", "surface error", "picture error", "variance"], rows)
-    )
+    head = "problem | pixels | rate | surface error | picture error | variance"
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error of the surface over seconds, of the problems where it is known."""
     panels = {
         name: {method: [run["curve"] for run in entry["runs"]] for method, entry in found["methods"].items()}

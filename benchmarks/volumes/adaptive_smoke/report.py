@@ -1,36 +1,25 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
     """Final errors, and ratios to uniform draws."""
+    over = record["over uniform"]
     rows = [
         [
-            name,
-            f"{e['rate']:g}",
-            "{:.3f} ({:.3f} to {:.3f})".format(*e["final"]["both"]),
-            *(" ".join(f"{x:.3f}" for x in ratios[name][1::3]) for ratios in record["over uniform"].values()),
+            markdown.fill("{name} | {rate:g} | {final[both]!m}", entry),
+            *(" ".join(f"{x:.3f}" for x in ratios[entry["name"]][1::3]) for ratios in over.values()),
         ]
-        for name, e in record["methods"].items()
+        for entry in markdown.named(record["methods"], "name")
     ]
-    s = record["settings"]
-    head = [
-        "pixels",
-        "learning rate",
-        "final error",
-        *(f"over uniform, at .2 .5 .8 of the {by}" for by in record["over uniform"]),
-    ]
-    return (
-        f"`smoke`, {s['resolution']}², grids of {s['grid']}³, {s['count']} pixels a step, L2, {s['seconds']:g} s, {s['seeds']} seeds.\n\n"
-        f"{markdown.table(head, rows)}"
-    )
+    head = ["pixels | learning rate | final error", *(f"over uniform, at .2 .5 .8 of the {by}" for by in over)]
+    text = "`smoke`, {resolution}², grids of {grid}³, {count} pixels a step, L2, {seconds:g} s, {seeds} seeds."
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(" | ".join(head), rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error over seconds and over paths."""
     panels = {
         f"over {unit}": {

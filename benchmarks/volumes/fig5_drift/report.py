@@ -1,7 +1,6 @@
 """Table and figure."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
@@ -15,13 +14,11 @@ def table(record: Record) -> str:
         [name, *(f"{100 * mean:+.1f} ± {100 * error:.1f} %" for mean, error in found["distance"].values())]
         for name, found in entry["methods"].items()
     ]
-    return (
-        f"`three-bodies`, {entry['resolution']}², {entry['steps']} steps, learning rate {entry['rate']:g}, "
-        f"{entry['seeds']} seeds.\n\n{markdown.table(['loss, method', *keys], rows)}"
-    )
+    text = "`three-bodies`, {resolution}², {steps} steps, learning rate {rate:g}, {seeds} seeds.".format(**entry)
+    return markdown.blocks(text, markdown.table(" | ".join(["loss, method", *keys]), rows))
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Distance over steps, a panel per loss and parameter."""
     entry = record["descents"]["three-bodies"]
     panels: dict[str, dict[str, figures.Curves]] = {}

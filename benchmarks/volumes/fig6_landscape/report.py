@@ -1,7 +1,6 @@
 """Table and figure."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
@@ -12,24 +11,20 @@ def table(record: Record) -> str:
 
     def summary(name: str, spp: str, what: str) -> str:
         place, error = record["places"][name][spp][what], record["errors"][name][spp][what]
-        if place is None:
-            return "outside"
-        return f"{place:.3f}" + ("" if error is None else f" ± {error:.3f}")
+        return "outside" if place is None else f"{place:.3f}" + ("" if error is None else f" ± {error:.3f}")
 
-    rows = [
-        [name, spp, summary(name, spp, "least"), summary(name, spp, "stop")]
-        for name, entry in record["places"].items()
-        for spp in entry
-    ]
-    s, factors = record["settings"], record["factors"]
-    head = ["loss", "spp", "mean loss least at", "mean derivative 0 at"]
-    return (
-        f"`three-bodies`, {s['resolution']}², {s['runs']} renders at {len(factors)} factors from {factors[0]:g} to {factors[-1]:g} of "
-        f"the fog's true extinction, 1.\n\n{markdown.table(head, rows)}"
+    kinds = ("least", "stop")
+    places = [(name, spp) for name, entry in record["places"].items() for spp in entry]
+    rows = [[name, spp, *(summary(name, spp, what) for what in kinds)] for name, spp in places]
+    text = "`three-bodies`, {resolution}², {runs} renders at {count} factors from {factors[0]:g} to {factors[-1]:g} of the fog's true "
+    text += "extinction, 1."
+    return markdown.blocks(
+        markdown.fill(text, record["settings"], record, {"count": len(record["factors"])}),
+        markdown.table("loss | spp | mean loss least at | mean derivative 0 at", rows),
     )
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Mean loss and mean derivative against the factor."""
     panels = {
         f"{loss}: mean {what}": {

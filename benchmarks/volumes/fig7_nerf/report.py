@@ -1,7 +1,5 @@
 """Table and figure."""
 
-from matplotlib.figure import Figure
-
 from benchmarks import figures, markdown
 from benchmarks.runner.records import Record
 
@@ -9,26 +7,23 @@ from benchmarks.runner.records import Record
 def table(record: Record) -> str:
     """Final errors at equal time."""
     parts = []
-    for s in record["schedules"].values():
+    for entry in record["schedules"].values():
+        of = " of {balls} balls" if entry["balls"] else ""
+        by = " of the processor" if entry["processor"] else ""
+        text = f"`nerf-volume`{of}, {{resolution}}², grids of {{grid}}³, {{kind}} rates, {{seconds:g}} s{by}, {{seeds}} seeds. "
         rows = [
             [
-                name,
-                f"{e['rate']:g}",
-                *("{:.3f} ({:.3f} to {:.3f})".format(*e["final"][views]) for views in ("seen", "unseen")),
-                ", ".join(map(str, e["steps"])),
+                markdown.fill("{name} | {rate:g} | {final[seen]!m} | {final[unseen]!m}", found),
+                ", ".join(map(str, found["steps"])),
             ]
-            for name, e in s["methods"].items()
+            for found in markdown.named(entry["methods"], "name")
         ]
-        head = ["method", "learning rate", "error of views seen", "of views unseen", "steps"]
-        of = f" of {s['balls']} balls" if s["balls"] else ""
-        by = " of the processor" if s["processor"] else ""
-        sizes = f"`nerf-volume`{of}, {s['resolution']}², grids of {s['grid']}³, {s['kind']} rates"
-        sizes += f", {s['seconds']:g} s{by}, {s['seeds']} seeds."
-        parts.append(f"{sizes} Errors over the initial ones.\n\n{markdown.table(head, rows)}")
-    return "\n\n".join(parts)
+        head = "method | learning rate | error of views seen | of views unseen | steps"
+        parts += [markdown.fill(text + "Errors over the initial ones.", entry), markdown.table(head, rows)]
+    return markdown.blocks(*parts)
 
 
-def plot(record: Record) -> Figure:
+def plot(record: Record) -> figures.Figure:
     """Error of views seen and unseen over seconds, or over paths where runs are told by the processor's time."""
     panels = {
         f"{kind}, {views}, over {'paths' if entry['processor'] else 'seconds'}": {
