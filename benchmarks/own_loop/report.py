@@ -5,7 +5,7 @@ from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """Error at equal time, and memory."""
+    """Error at equal time."""
     rows = []
     for entry in markdown.named(record["losses"], "loss", "", "name"):
         name, (middle, low, high) = entry["name"], entry["final"]
@@ -15,16 +15,10 @@ def table(record: Record) -> str:
         rows.append([entry["loss"].upper(), row, f"{middle:.4f} ({low:.4f} to {high:.4f})", ratio])
     text = "`indirect-room`, {resolution}², texture {texture_resolution}², {seconds:g} s, {seeds} seeds; error of the texture (RMSE; "
     text += "{start:.3f} at the start), median and range."
-    parts = [
+    return markdown.blocks(
         markdown.fill(text, record, record["settings"]),
         markdown.table("loss | loop | spp | rate | steps | error | of the unchanged", rows),
-    ]
-    if "leaks" in record:
-        row = "{name} | {points[-1][0]} | {kib_per_1000_steps:+.0f} | {points[1][2]} to {points[-1][2]}"
-        head = "loop | steps | KiB per 1000 steps | lines of dr.whos"
-        leaks = markdown.records(head, row, markdown.named(record["leaks"], "name"))
-        parts += ["Memory of the changed loops:", leaks]
-    return markdown.blocks(*parts)
+    )
 
 
 def plot(record: Record) -> figures.Figure:

@@ -29,10 +29,4 @@ def table(record: Record) -> str:
         markdown.table("whole step | ms | of the stock loop", whole),
         "Variance of the gradient, leave-one-out groups over an adjoint on paths of its own, equal spp, L2 (equal is 1):",
         markdown.table("problem | at the start | near the truth", variance),
-        "Time outside kernels at the gallery's default sizes, control variate at 2 spp, and kernels new after warm-up:",
-        markdown.records(
-            "problem | wall ms a step | kernel ms | outside | new kernels",
-            "{name} | {wall_ms:.1f} | {kernels_ms:.1f} | {outside:.1%} | {new}",
-            markdown.named(record["outside_kernels"], "name"),
-        ),
     )

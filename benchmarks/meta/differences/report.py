@@ -7,7 +7,7 @@ from benchmarks.runner.records import Record
 
 
 def table(record: Record) -> str:
-    """Meta: variance, cost and noise of differences."""
+    """Meta: variance and noise of differences."""
     variance, noise = record["variance"], record["noise"]
     first = next(iter(variance["problems"].values()))
     text = "{resolution}², {spp} spp, {runs} runs. Var ΔF / Var F by step, a share of the way to the truth:".format(
@@ -20,12 +20,6 @@ def table(record: Record) -> str:
             rows.append([name, space, f"{entry[space]['slope']:.2f}", *ratios])
     head = ["problem | space | slope, log-log", *(f"{step:g}" for step in first["steps"])]
     parts = [text, markdown.table(" | ".join(head), rows)]
-    for size, cost in record["cost"].items():
-        rows = [[key, *(f"{of[key]:.2f}" for of in cost.values())] for key in next(iter(cost.values()))]
-        parts += [
-            f"Whole estimates of all views (`chalice` has two) and their parts for one view, at {size}²:",
-            markdown.table(" | ".join(["milliseconds", *cost]), rows),
-        ]
     rows = []
     for name, values in noise["problems"].items():
         of_paths = [v * n for v, n in zip(values, noise["spp"], strict=True)]
