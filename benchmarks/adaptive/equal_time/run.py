@@ -22,7 +22,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.pixel_schemes import pixels
-from benchmarks.races import Entrant, Runs, over, race, reached, tenths
+from benchmarks.races import Entrant, Runs, follow, over, race, reached, tenths
 from benchmarks.runner.timing import work_time
 
 FINE = {"resolution": 192, "texture_resolution": 192}
@@ -63,18 +63,6 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
     return found
 
 
-class Clock(ur.Callback):
-    """(seconds of the processor, paths so far) of each step."""
-
-    def __init__(self) -> None:
-        self.found: list[tuple[float, float]] = []
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        del run
-        self.found.append((work_time(), float(record["samples"])))
-
-
 def costs(
     problem: ur.Problem, chosen: list[Entrant], rate: float, rounds: int = 5, steps: int = 60
 ) -> dict[str, float]:
@@ -82,10 +70,8 @@ def costs(
     found: dict[str, list[float]] = {entrant.name: [] for entrant in chosen}
     for turn in range(rounds):
         for entrant in chosen:
-            clock = Clock()
-            options: dict[str, Any] = {"steps": steps, "seed": turn, "callbacks": [clock]}
-            ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), **options)
-            (begun, before), (ended, after) = clock.found[steps // 3], clock.found[-1]
+            points = follow(problem, entrant, rate, turn, points=2 * steps, clock=work_time, steps=steps).points[""]
+            (begun, before, _), (ended, after, _) = points[steps // 3], points[-1]
             found[entrant.name].append((ended - begun) / (after - before))
     return {name: float(np.median(times)) for name, times in found.items()}
 
