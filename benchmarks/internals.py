@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from unrender.capture.mesh import Mesh as CapturedMesh
-from unrender.capture.mesh import ply
-from unrender.capture.turntable import light_turns
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -23,26 +20,20 @@ from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
 from unrender.evaluation import denoising
-from unrender.evaluation.metrics import srgb
 from unrender.gallery import parts, volumes
 from unrender.gallery.indirect_room import IndirectRoom
 from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
-from unrender.io.images import srgb_to_linear
 from unrender.methods import method
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.problem.batches import WholeView
 from unrender.problem.bounds import project
 from unrender.problem.parameter import ParameterSettings
-from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
-from unrender.rendering.camera_poses import Camera, Corrections
 from unrender.rendering.numpy.exponential import RATE
-from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
-from unrender.rendering.response import curve
-from unrender.rendering.vignetting import falloff
+from unrender.rendering.renderer import RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
 from unrender.stages import stages_file
@@ -53,11 +44,7 @@ dr: Any = importlib.import_module("drjit")
 mi: Any = importlib.import_module("mitsuba")
 
 __all__ = [
-    "MITSUBA_TO_OPENGL",
     "RATE",
-    "Camera",
-    "CapturedMesh",
-    "Corrections",
     "Estimate",
     "Estimator",
     "ImageEstimate",
@@ -68,7 +55,6 @@ __all__ = [
     "PixelSampler",
     "PlainState",
     "RenderSession",
-    "Renderer",
     "SampleRequest",
     "Smoke",
     "Tree",
@@ -80,30 +66,23 @@ __all__ = [
     "black_box",
     "build_problem",
     "coupled_gradients",
-    "curve",
     "dr",
     "element_scales",
-    "falloff",
     "from_tensor",
     "gradient_of",
     "hardly_seen",
     "hardware",
     "image_step",
     "leave_one_out_groups",
-    "light_turns",
-    "loss_derivative",
     "method",
     "mi",
     "parts",
     "pixel_probability",
     "pixel_shares",
-    "ply",
     "prepare",
     "project",
     "scene_description",
     "second_moments",
-    "srgb",
-    "srgb_to_linear",
     "stages_file",
     "stock_scene",
     "trees",
@@ -172,11 +151,6 @@ def coupled_gradients(
     if found.previous is None:
         raise RuntimeError("the pair has no previous gradient")
     return found.gradient, found.previous
-
-
-def loss_derivative(problem: ur.Problem, view: int, images: Any) -> Any:
-    """The derivative of the problem's loss by the images of a view."""
-    return problem.loss_derivative(view, images)
 
 
 def available_denoiser() -> denoising.Denoiser:

@@ -20,12 +20,7 @@ QUICK = {"resolution": 8, "runs": 3, "step": 3, "renders": 4, "reference_spp": 2
 
 
 def run(
-    resolution: int = 40,
-    runs: int = 24,
-    spp: int = 4,
-    step: int = 20,
-    renders: int = 256,
-    reference_spp: int = 8192,
+    resolution: int = 40, runs: int = 24, spp: int = 4, step: int = 20, renders: int = 256, reference_spp: int = 8192
 ) -> dict[str, Any]:
     """Return the bias and the variance of both derivatives.
 
