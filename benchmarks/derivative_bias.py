@@ -68,10 +68,7 @@ def derivatives(
         result[name] = {"scale": scale}
         for method in METHODS:
             found = moments[name, method]
-            result[name][method] = {
-                **paired_bias(found, scale),
-                "variance": float(found.variance.mean() / scale**2),
-            }
+            result[name][method] = {**paired_bias(found, scale), "variance": float(found.variance.mean() / scale**2)}
             maps[f"{name}/{method}/bias"] = found.mean.mean(axis=-1)
     gain = float(variance["plain"].variance.sum() / variance["rcv"].variance.sum())
     return {"losses": result, "image_variance_ratio": gain}, maps

@@ -5,19 +5,13 @@ Dr.Jit and Mitsuba stand here untyped (`dr`, `mi`): their stubs know less than t
 
 from __future__ import annotations
 
-import functools
 import importlib
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from unrender.app.capture.mesh import Mesh as CapturedMesh
-from unrender.app.capture.mesh import ply
-from unrender.app.capture.turntable import light_turns
 from unrender.app.stages import stages_file
 from unrender.app.stages.stage_problem import Whole
 from unrender.core import arrays, trees, vectors
@@ -34,14 +28,9 @@ from unrender.gallery.specification import build_problem
 from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
-from unrender.io.images import srgb_to_linear
-from unrender.losses.metrics import srgb
 from unrender.methods import method
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
-from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
-from unrender.rendering.camera_poses import Camera, Corrections
-from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.range_table import Range
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
@@ -49,10 +38,6 @@ from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
-from unrender.rendering.response import curve
-from unrender.rendering.vignetting import falloff
-from unrender.runs import optimize as runs_optimize
-from unrender.runs.folder.writer import RunWriter
 from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
 from unrender.scene.batches import WholeView
@@ -64,11 +49,7 @@ dr: Any = importlib.import_module("drjit")
 mi: Any = importlib.import_module("mitsuba")
 
 __all__ = [
-    "MITSUBA_TO_OPENGL",
     "RATE",
-    "Camera",
-    "CapturedMesh",
-    "Corrections",
     "Estimate",
     "Estimator",
     "ImageEstimate",
@@ -81,7 +62,6 @@ __all__ = [
     "PlainState",
     "Range",
     "RenderSession",
-    "Renderer",
     "SampleRequest",
     "SlotReaders",
     "Smoke",
@@ -89,46 +69,34 @@ __all__ = [
     "Whole",
     "WholeView",
     "advance",
-    "allocated",
     "arrays",
     "available_denoiser",
     "black_box",
     "build_problem",
-    "channel_moments",
     "coupled_gradients",
-    "curve",
     "dr",
     "element_scales",
-    "falloff",
     "from_tensor",
     "gradient_of",
     "hardly_seen",
     "hardware",
     "image_step",
     "leave_one_out_groups",
-    "light_turns",
     "load_scene",
-    "loss_derivative",
     "media",
     "method",
-    "method_parts",
     "mi",
     "mitsuba_renderer",
     "parts",
     "pixel_probability",
     "pixel_shares",
-    "ply",
     "prepare",
     "project",
     "scene_description",
     "second_moments",
-    "srgb",
-    "srgb_to_linear",
     "stages_file",
     "stock_scene",
-    "time_run_folder",
     "trees",
-    "turntable_turns",
     "vectors",
     "versions",
     "volumes",
@@ -177,21 +145,6 @@ def _mitsuba(problem: ur.Problem) -> Any:
     return problem.renderer
 
 
-def allocated() -> Callable[[], int]:
-    """From now on, a function that tells the peak of the bytes that Dr.Jit has allocated: of the GPU where the variant runs on one, else of
-    the host."""
-    backend = dr.JitBackend.CUDA if mi.variant().startswith("cuda") else dr.JitBackend.LLVM
-    dr.sync_thread()
-    dr.detail.malloc_clear_statistics()
-    return lambda: int(dr.detail.malloc_watermark(backend))
-
-
-def turntable_turns(scene: Any) -> np.ndarray | None:
-    """How a turntable's light is turned before each camera, (V, 3, 3), of a live scene; None where no light turns."""
-    found = [light for light in scene.emitters() if turntable_light.is_turntable(light)]
-    return turntable_light.turns(found[0]) if found else None
-
-
 def from_tensor(value: Any, like: Any) -> Any:
     """A tensor in the type that a scene's parameter has."""
     from unrender.rendering.mitsuba.tensors import from_tensor as convert
@@ -216,11 +169,6 @@ def coupled_gradients(
     if found.previous is None:
         raise RuntimeError("the pair has no previous gradient")
     return found.gradient, found.previous
-
-
-def loss_derivative(problem: ur.Problem, view: int, images: Any) -> Any:
-    """The derivative of the problem's loss by the images of a view."""
-    return problem.loss_derivative(view, images)
 
 
 def available_denoiser() -> denoising.Denoiser:
@@ -309,63 +257,8 @@ def second_moments(
     return found
 
 
-def channel_moments(problem: ur.Problem, at: Tree, scales: np.ndarray, rounds: int, key: Key) -> list[np.ndarray]:
-    """E[∂L/∂I_c ∂L/∂I_c'] and Σ_k E[∂I_c/∂θ_k ∂I_c'/∂θ_k] of each pixel of all views by single paths, (2, pixels, 3, 3) each, the halves
-    from different paths, and E|∂L/∂I|, (pixels, 3): from 8 paths a pixel and round.
-
-    Args:
-        problem, at: what is rendered, by Mitsuba; nothing moves.
-        scales: factors of the elements' derivatives in the coordinates of the descent, (n,).
-        rounds: how many, each with signs of its own.
-        key: of the random numbers.
-    """
-    from unrender.pixels.pixel_statistics import random_tangents
-
-    each = 8
-    session: Any = prepare(problem, at)
-    factors = {name: problem.renderer.array(value) for name, value in _split(at, scales).items()}
-    found: list[list[np.ndarray]] = [[], [], []]
-    for index, view in enumerate(problem.views):
-        products, moments, magnitudes = [], [], []
-        for turn in range(rounds):
-            of_turn = key.fold(index).fold(turn)
-            rendering = session.image(at, SampleRequest(view.sensor, each, of_turn.uint32(), each))
-            derivative = arrays.numpy(problem.loss_derivative(index, rendering.images)).astype(np.float64)
-            session._pair.loaded().set_tangents(
-                at, random_tangents(problem, at, factors, of_turn.fold(1)), session._attached
-            )
-            signed = session._run(_signed_tangents(), rendering.paths.request, rendering.paths.radiance)
-            dr.eval(signed)
-            along = arrays.numpy(session._develop(signed, rendering.paths.request)).astype(np.float64)
-            for values, into in ((derivative, products), (along, moments)):
-                halves = values.reshape(2, each // 2, -1, 3)
-                into.append(np.einsum("hspc,hspd->hpcd", halves, halves) / (each // 2))
-            magnitudes.append(np.abs(derivative).reshape(each, -1, 3).mean(axis=0))
-        for values, into in zip((products, moments, magnitudes), found, strict=True):
-            into.append(np.mean(values, axis=0))
-    return [np.concatenate(values, axis=axis) for values, axis in zip(found, (1, 1, 0), strict=True)]
-
-
-@functools.cache
-def _signed_tangents() -> Any:
-    """The pass of `tangent_moment`, without the square. Made once: kernels are known by it."""
-    from unrender.rendering.mitsuba.passes import TangentPass
-
-    @dataclass(frozen=True)
-    class SignedTangents(TangentPass):
-        def trace(self, paths: Any, size: Any, *own: Any) -> Any:
-            return paths.forward(own[0])
-
-    return SignedTangents()
-
-
 def gradient_of(
-    problem: ur.Problem,
-    parameters: Tree,
-    batch: Any,
-    key: Key,
-    spp: int = 2,
-    emitters: np.ndarray | None = None,
+    problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2, emitters: np.ndarray | None = None
 ) -> list[np.ndarray]:
     """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
     for the scene's own."""
@@ -376,37 +269,6 @@ def gradient_of(
     coordinates = problem.coordinates
     moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
     return [arrays.numpy(value) for value in moved.values()]
-
-
-def method_parts(name: str, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
-    """Estimator and optimizer of a method of the command line."""
-    return method(name).start(settings)
-
-
-def time_run_folder(spent: dict[str, list[float]]) -> Callable[[], None]:
-    """Time the writing of run folders: from now on, `spent` gets the seconds of each "history" line and each of the "checkpoints".
-
-    Returns a function that ends it.
-    """
-
-    class TimedWriter(RunWriter):
-        def append(self, record: Mapping[str, Any]) -> None:
-            began = time.perf_counter()
-            super().append(record)
-            spent["history"].append(time.perf_counter() - began)
-
-        def write_checkpoint(self, *arguments: Any) -> None:
-            began, before = time.perf_counter(), self._written_step
-            super().write_checkpoint(*arguments)
-            if self._written_step != before:
-                spent["checkpoints"].append(time.perf_counter() - began)
-
-    runs_optimize.RunWriter = TimedWriter
-
-    def end() -> None:
-        runs_optimize.RunWriter = RunWriter
-
-    return end
 
 
 def with_preconditioner(problem: ur.Problem, preconditioner: Any, *keys: str) -> ur.Problem:

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Estimator, Optimizer
+from benchmarks.internals import Estimator, Optimizer, Tree
+from unrender.schedules import Constant, Schedule
 
 TUNING_SEED = 1000
+POINTS = 60
+"""Measurements along a run."""
+AT_END = 0.5
+"""In place of `POINTS`: one measurement, at the end."""
+UNIT = 0.01
+"""Nominal learning rate of optimizers that a schedule scales: parameters with a learning rate of their own follow the schedule alone."""
+
+Points = list[tuple[float, float, float]]
+"""(seconds, samples, error) along a run."""
+Runs = dict[str, list[Points]]
+"""The runs of each method."""
+Measure = Callable[[Tree], dict[str, float]]
+"""Errors by name of some parameters, each relative to the start."""
 
 
 @dataclass(frozen=True)
@@ -31,32 +44,79 @@ class Entrant:
     name: str
     group: str
     estimator: Estimator
-    optimizer: Callable[[float], Optimizer]
+    optimizer: Callable[..., Optimizer]
     rates: tuple[float, ...]
 
 
-def descend(
+@dataclass(frozen=True)
+class Scaled:
+    """A schedule times a factor."""
+
+    factor: float
+    schedule: Schedule
+
+    def __call__(self, step: float) -> float:
+        return self.factor * self.schedule(step)
+
+
+def scaled(optimizer: Callable[..., Optimizer], schedule: Schedule | None = None) -> Callable[[float], Optimizer]:
+    """Return what makes an optimizer from a learning rate, to which all parameters' rates are in proportion."""
+    return lambda rate: optimizer(UNIT, schedule=Scaled(rate / UNIT, schedule or Constant()))
+
+
+def total(problem: ur.Problem) -> Measure:
+    """Measure the parameters' errors relative to the start, averaged, under the name ""."""
+    start = problem.parameter_error(problem.initial())
+    return lambda parameters: {"": total_error(problem.parameter_error(parameters), start)}
+
+
+class Recorder(ur.protocols.Callback):
+    """Keep (seconds, samples, error) along a run for each error; measuring is no part of the seconds.
+
+    Args:
+        measure: errors of parameters.
+        start: errors at the start.
+        every: share of the budget between measurements; more than 1 for the end alone.
+        clock: seconds; None for the run's own.
+    """
+
+    def __init__(self, measure: Measure, start: dict[str, float], every: float, clock: Callable[[], float] | None):
+        self.measure, self.every, self.due, self.clock, self.steps = measure, every, every, clock, 0
+        self.points: dict[str, Points] = {name: [(0.0, 0.0, error)] for name, error in start.items()}
+        self.since = self.spent = 0.0
+
+    def on_start(self, run: Any) -> None:
+        """See `Callback.on_start`."""
+        self.since = self.clock() if self.clock else 0.0
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        self.steps, self.spent = run.step, self.spent + self.clock() - self.since if self.clock else run.clock
+        if run.stopped or run.progress() >= self.due:
+            self.due = run.progress() + self.every
+            for name, error in self.measure(run.full()).items():
+                point = (self.spent, float(record["samples"]), error if math.isfinite(error) else math.inf)
+                self.points[name].append(point)
+        self.since = self.clock() if self.clock else 0.0
+
+
+def follow(
     problem: ur.Problem,
     entrant: Entrant,
     rate: float,
     seed: int,
-    seconds: float | None = None,
-    steps: int | None = None,
-    ended: Callable[[ur.Result], None] | None = None,
-) -> list[tuple[float, float, float]]:
-    """(seconds, samples, error) along one run: each parameter's RMSE relative to where it began, averaged over parameters.
-
-    `ended` is called with the result.
-    """
-    result = ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), seconds=seconds, steps=steps, seed=seed)
-    if ended is not None:
-        ended(result)
-    start = problem.parameter_error(problem.initial())
-    return [
-        (h["seconds"], float(h["samples"]), total_error(h["parameter_error"], start))
-        for h in result.history
-        if "parameter_error" in h
-    ]
+    measure: Measure | None = None,
+    points: float = POINTS,
+    clock: Callable[[], float] | None = None,
+    ended: Callable[[ur.Result], None] = lambda result: None,
+    **budget: Any,
+) -> Recorder:
+    """Return the record of one run. See `race` for the arguments."""
+    measure = measure or total(problem)
+    recorder = Recorder(measure, measure(problem.initial()), 1 / points, clock)
+    optimizer = entrant.optimizer(rate)
+    ended(ur.optimize(problem, entrant.estimator, optimizer, seed=seed, callbacks=[recorder], **budget))
+    return recorder
 
 
 def search(rates: tuple[float, ...], error: Callable[[float], float]) -> tuple[float, list[dict[str, float]]]:
@@ -78,49 +138,69 @@ def search(rates: tuple[float, ...], error: Callable[[float], float]) -> tuple[f
     return min(tried, key=tried.__getitem__), [{"rate": rate, "error": e} for rate, e in sorted(tried.items())]
 
 
-def tune(
-    problem: ur.Problem, entrant: Entrant, tuning_seeds: int, **budget: Any
-) -> tuple[float, list[dict[str, float]]]:
-    """The rate whose median final error is least, and all that were tried."""
-
-    def error(rate: float) -> float:
-        seeds = range(TUNING_SEED, TUNING_SEED + tuning_seeds)
-        found = float(np.median([descend(problem, entrant, rate, seed, **budget)[-1][2] for seed in seeds]))
-        print(f"{problem.name} {entrant.name} rate {rate:g}: {found:.4f}", flush=True)
-        return found
-
-    return search(entrant.rates, error)
-
-
 def race(
     problem: ur.Problem,
-    entrants: list[Entrant],
+    entrants: Sequence[Entrant],
     seeds: int,
     tuning_seeds: int = 1,
+    measure: Measure | None = None,
+    by: str = "",
     ended: Callable[[str, int, ur.Result], None] = lambda name, seed, result: None,
+    points: float = POINTS,
     **budget: Any,
 ) -> dict[str, Any]:
-    """Every entrant, tuned, over seeds 0, 1, ..., in turns: {name: {"group", "rate", "tried", "runs", "final"}}.
+    """Run every entrant, tuned, over seeds 0, 1, ..., in turns.
 
-    `ended` is called with the entrant's name, the seed and the result of each run but those that tune.
+    Args:
+        problem: what is raced on.
+        entrants: the methods.
+        seeds: runs of each.
+        tuning_seeds: runs whose median error at the end chooses a rate.
+        measure: errors by name; None for the one of `total`.
+        by: the error that rates are chosen by.
+        ended: called with the entrant's name, the seed and the result of each run but those that tune.
+        points: measurements along a run.
+        budget: seconds or steps of each run, and the clock of its seconds where it is not the run's own.
+
+    Returns:
+        By entrant: group, rate, tried, steps of each run, runs, and [median, least, greatest] at their ends under "final"; with
+        `measure`, runs and ends by the error's name.
     """
-    tuned = {entrant.name: tune(problem, entrant, tuning_seeds, **budget) for entrant in entrants}
-    runs: Runs = {entrant.name: [] for entrant in entrants}
+    measure = measure or total(problem)
+
+    def tuned(entrant: Entrant) -> tuple[float, list[dict[str, float]]]:
+        def error(rate: float) -> float:
+            tries = range(TUNING_SEED, TUNING_SEED + tuning_seeds)
+            ends = [follow(problem, entrant, rate, seed, measure, AT_END, **budget).points[by][-1][2] for seed in tries]
+            print(f"{problem.name} {entrant.name} rate {rate:g}: {np.median(ends):.4f}", flush=True)
+            return float(np.median(ends))
+
+        return search(entrant.rates, error)
+
+    chosen = {entrant.name: tuned(entrant) for entrant in entrants}
+    found: dict[str, list[Recorder]] = {entrant.name: [] for entrant in entrants}
     for seed in range(seeds):
         for entrant in entrants:
-            keep = functools.partial(ended, entrant.name, seed)
-            runs[entrant.name].append(descend(problem, entrant, tuned[entrant.name][0], seed, ended=keep, **budget))
-            print(f"{problem.name} {entrant.name} seed {seed}: final {runs[entrant.name][-1][-1][2]:.4f}", flush=True)
-    return {
-        entrant.name: {
+            name = entrant.name
+
+            def end(result: ur.Result, name: str = name, seed: int = seed) -> None:
+                ended(name, seed, result)
+
+            found[name].append(follow(problem, entrant, chosen[name][0], seed, measure, points, ended=end, **budget))
+            print(f"{problem.name} {name} seed {seed}: final {found[name][-1].points[by][-1][2]:.4f}", flush=True)
+    methods = {}
+    for entrant in entrants:
+        (rate, tried), recorders = chosen[entrant.name], found[entrant.name]
+        runs: Any = {error: [recorder.points[error] for recorder in recorders] for error in recorders[0].points}
+        final: Any = {error: median_and_range([run[-1][2] for run in each]) for error, each in runs.items()}
+        entry = {
             "group": entrant.group,
-            "rate": tuned[entrant.name][0],
-            "tried": tuned[entrant.name][1],
-            "runs": runs[entrant.name],
-            "final": median_and_range([run[-1][2] for run in runs[entrant.name]]),
+            "rate": rate,
+            "tried": tried,
+            "steps": [recorder.steps for recorder in recorders],
         }
-        for entrant in entrants
-    }
+        methods[entrant.name] = entry | {"runs": runs.get("", runs), "final": final.get("", final)}
+    return methods
 
 
 def median_and_range(values: list[float]) -> list[float]:
@@ -131,10 +211,6 @@ def median_and_range(values: list[float]) -> list[float]:
 def total_error(errors: dict[str, float], start: dict[str, float]) -> float:
     """One number for several parameters: the mean of each one's error relative to where it began."""
     return float(np.mean([errors[key] / start[key] for key in errors]))
-
-
-Runs = dict[str, list[list[tuple[float, float, float]]]]
-"""Of each method, per seed: (seconds, samples, error) along the run."""
 
 
 def tenths(runs: Runs, column: int) -> dict[str, list[float]]:

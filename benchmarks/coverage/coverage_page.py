@@ -32,7 +32,7 @@ def page(record: dict[str, Any]) -> str:
     kinds = sorted({plugin.kind for plugin in PLUGINS.values()}, key=str.lower)
     for kind in kinds:
         rows = [row for name, plugin in PLUGINS.items() if plugin.kind == kind for row in _rows(name, record.get(name))]
-        table = markdown.table(["plugin", "parameter", "image", "gradient", "descent"], rows)
+        table = markdown.table("plugin | parameter | image | gradient | descent", rows)
         parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
     return "\n\n".join(parts) + "\n"
 

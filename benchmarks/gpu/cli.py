@@ -10,17 +10,15 @@ import argparse
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.gpu.execute import run_slice
-from benchmarks.gpu.page import lines
 from benchmarks.gpu.plan import SLICES, Slice
 from benchmarks.gpu.states import Folder, device, full, toy
+from unrender.backend import variant
 
-__all__ = ["main"]
-
-MINUTES = 10.0
+__all__ = ["lines", "main"]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -31,7 +29,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--slice", nargs="+", metavar="NAME", choices=[part.name for part in SLICES], default=())
     parser.add_argument("--next", action="store_true", help="the first slice that was never run to its end")
     parser.add_argument("--toy", action="store_true", help="toy sizes, on the processor where no GPU works")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="for a slice; what goes on is ended (10)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="for a slice; what goes on is ended (10)")
     parser.add_argument("--again", action="store_true", help="what has ended, too")
     parser.add_argument("--copy", type=Path, help="copy states and records there after each slice")
     parser.add_argument("--list", action="store_true", help="only list; with --toy, what became of the toy plan")
@@ -41,13 +39,11 @@ def main(arguments: Sequence[str]) -> int:
     if not chosen:
         print(*lines(folder), sep="\n")
         return 0
-    on_gpu = _works()
-    if not on_gpu and not given.toy:
-        from unrender.backend import variant
-
-        print(f"no GPU works here: {variant.gpu_problem()}; --toy runs the plan on the processor", file=sys.stderr)
+    problem = variant.gpu_problem()
+    if problem is not None and not given.toy:
+        print(f"no GPU works here: {problem}; --toy runs the plan on the processor", file=sys.stderr)
         return 2
-    where, ends = device(on_gpu), []
+    where, ends = device(problem is None), []
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the command that runs is ended, too
     try:
         for part in chosen:
@@ -72,7 +68,12 @@ def _chosen(given: argparse.Namespace, folder: Folder) -> list[Slice]:
     return list(SLICES) if given.toy else []
 
 
-def _works() -> bool:
-    from unrender.backend import variant
-
-    return variant.gpu_problem() is None
+def lines(folder: Folder) -> Iterator[str]:
+    """Yield a line per slice: name, state, minutes spent or expected, what it shows, and when and where it ran."""
+    width = max(len(part.name) for part in SLICES)
+    for part in SLICES:
+        state = folder.read(part)
+        spent = sum(entry["seconds"] for entry in state.get("commands", {}).values()) / 60
+        time = f"{spent:.1f} min" if state else f"~{part.minutes:.0f} min"
+        where = f", {state['date']}, {state['device']['name']}" if state else ""
+        yield f"{part.name:{width}}  {folder.summary(part):11}  {time:>8}  {part.what}{where}"

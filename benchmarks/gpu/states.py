@@ -60,7 +60,7 @@ class Folder:
     def note(self, part: Slice, command: Command, where: State, entry: State) -> None:
         """Write what became of a command."""
         state = self.read(part)
-        commands = {**state.get("commands", {}), self.key(command): entry}
+        commands = {**state.get("commands", {}), command.words: entry}
         self.states.mkdir(parents=True, exist_ok=True)
         new = {"slice": part.name, "date": time.strftime("%Y-%m-%d %H:%M"), "device": where, "commands": commands}
         file = self.states / f"{part.name}.json"
@@ -68,13 +68,9 @@ class Folder:
         beside.write_text(json.dumps(new, indent=1, ensure_ascii=False) + "\n")
         os.replace(beside, file)
 
-    def key(self, command: Command) -> str:
-        """Of a command in the file: what it is at full size."""
-        return command.words
-
     def ended(self, part: Slice, command: Command) -> str:
         """ "done", "failed", "cut short", or "" where it never ran."""
-        return self.read(part).get("commands", {}).get(self.key(command), {}).get("ended", "")
+        return self.read(part).get("commands", {}).get(command.words, {}).get("ended", "")
 
     def summary(self, part: Slice) -> str:
         """One word or two of the slice: "not run", "done", "failed", "cut short", "2 of 3 done"."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,85 +72,63 @@ class Clock:
         return not over
 
 
-def drjit_stock(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock) -> None:
-    """`mi.render`, `dr.backward`, `mi.ad.Adam`."""
-    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
-    params, reference = mi.traverse(scene), mi.TensorXf(task.reference)
-    optimizer = mi.ad.Adam(lr=rate)
+def drjit(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, changed: bool) -> None:
+    """`mi.render`, `dr.backward`, `mi.ad.Adam`; changed: the scene's line, the render's, and no `params.update`."""
+    reference, optimizer = mi.TensorXf(task.reference), mi.ad.Adam(lr=rate)
     optimizer[task.key] = mi.TensorXf(task.start)
-    params.update(optimizer)
-    step = 0
+    render = _ours(task, spp, seed) if changed else _stock(task, spp, seed)
     while True:
-        image = mi.render(scene, params, spp=spp, seed=seed * 1_000_003 + step)
-        value = dr.mean(dr.abs(image - reference) if loss == "l1" else dr.square(image - reference))
-        dr.backward(value)
-        optimizer.step()
-        optimizer[task.key] = dr.clip(optimizer[task.key], 0, 1)
-        params.update(optimizer)
-        step += 1
-        if not clock.goes_on(optimizer[task.key]):
-            return
-
-
-def drjit_ours(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, **options: Any) -> None:
-    """The same: the scene's line, the render's, and no `params.update`."""
-    renderer = ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, **options)
-    reference = mi.TensorXf(task.reference)
-    optimizer = mi.ad.Adam(lr=rate)
-    optimizer[task.key] = mi.TensorXf(task.start)
-    while True:
-        image = renderer(optimizer)
-        value = dr.mean(dr.abs(image - reference) if loss == "l1" else dr.square(image - reference))
-        dr.backward(value)
+        difference = render(optimizer) - reference
+        dr.backward(dr.mean(dr.abs(difference) if loss == "l1" else dr.square(difference)))
         optimizer.step()
         optimizer[task.key] = dr.clip(optimizer[task.key], 0, 1)
         if not clock.goes_on(optimizer[task.key]):
             return
 
 
-def torch_stock(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock) -> None:
-    """`dr.wrap` around `mi.render`, PyTorch's Adam."""
+def torch(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, changed: bool) -> None:
+    """`dr.wrap` around `mi.render`, PyTorch's Adam; changed: `renderer(texture)` in place of the wrapped function."""
     import torch  # pyright: ignore[reportMissingImports]
 
-    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
-    params, reference = mi.traverse(scene), torch.from_numpy(task.reference)
-
-    @dr.wrap(source="torch", target="drjit")
-    def render(texture: Any, seed: int = 0) -> Any:
-        params[task.key] = texture
-        params.update()
-        return mi.render(scene, params, spp=spp, seed=seed, seed_grad=seed + 1)
-
-    texture = torch.from_numpy(task.start.copy()).requires_grad_()
-    optimizer = torch.optim.Adam([texture], lr=rate)
-    step = 0
-    while True:
-        optimizer.zero_grad()
-        image = render(texture, seed=seed * 1_000_003 + 2 * step)
-        difference = image - reference
-        (difference.abs() if loss == "l1" else difference**2).mean().backward()
-        optimizer.step()
-        with torch.no_grad():
-            texture.clamp_(0, 1)
-        step += 1
-        if not clock.goes_on(texture):
-            return
-
-
-def torch_ours(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, **options: Any) -> None:
-    """The same: `renderer(texture)` in place of the wrapped function."""
-    import torch  # pyright: ignore[reportMissingImports]
-
-    renderer = ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, **options)
     reference = torch.from_numpy(task.reference)
     texture = torch.from_numpy(task.start.copy()).requires_grad_()
     optimizer = torch.optim.Adam([texture], lr=rate)
+    render = _ours(task, spp, seed) if changed else _wrapped(task, spp, seed)
     while True:
         optimizer.zero_grad()
-        difference = renderer(texture) - reference
+        difference = render(texture) - reference
         (difference.abs() if loss == "l1" else difference**2).mean().backward()
         optimizer.step()
         with torch.no_grad():
             texture.clamp_(0, 1)
         if not clock.goes_on(texture):
             return
+
+
+def _ours(task: Task, spp: int, seed: int) -> ur.Renderer:
+    image = ur.images.RecursiveControlVariate()
+    return ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, image=image, groups=2)
+
+
+def _stock(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
+    params, numbers = mi.traverse(scene), itertools.count(seed * 1_000_003)
+
+    def render(optimizer: Any) -> Any:
+        params.update(optimizer)
+        return mi.render(scene, params, spp=spp, seed=next(numbers))
+
+    return render
+
+
+def _wrapped(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
+    params, numbers = mi.traverse(scene), itertools.count(seed * 1_000_003, 2)
+
+    @dr.wrap(source="torch", target="drjit")
+    def render(texture: Any, number: int) -> Any:
+        params[task.key] = texture
+        params.update()
+        return mi.render(scene, params, spp=spp, seed=number, seed_grad=number + 1)
+
+    return lambda texture: render(texture, next(numbers))

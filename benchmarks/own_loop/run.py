@@ -2,29 +2,27 @@
 
 `indirect-room`, whose back wall is a texture, by `mi.render`, `dr.backward` and `mi.ad.Adam`, and in PyTorch by `dr.wrap` and
 `torch.optim.Adam`; changed, the image comes from `unrender.Renderer` with a control variate and two sample groups. Samples per pixel and
-learning rate of each are tuned in Dr.Jit, on a seed of their own, and taken over in PyTorch. And a leak test: memory over many steps
-of the changed loops.
+learning rate of each are tuned in Dr.Jit, on a seed of their own, and taken over in PyTorch.
 """
 
 from __future__ import annotations
 
-import gc
+import functools
 import importlib.util
 import math
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, scene_description
+from benchmarks.internals import dr, mi, scene_description
 from benchmarks.own_loop import loops
 from benchmarks.own_loop.loops import Clock, Task
 
 QUICK = {
     "loss": ("l2",), "seconds": 0.5, "tuning_seconds": 0.2, "seeds": 1, "resolution": 16, "texture_resolution": 8,
-    "reference_spp": 16, "spp": (4,), "rates": (0.02,), "leak_steps": 30,
+    "reference_spp": 16, "spp": (4,), "rates": (0.02,),
 }  # fmt: skip
 TUNING_SEED = 1000
 KEY = "back.bsdf.reflectance.data"
@@ -47,12 +45,15 @@ def task_of(resolution: int, texture_resolution: int, reference_spp: int) -> Tas
 
 
 def contenders() -> dict[str, Callable[..., None]]:
-    """By name; what is of PyTorch where that is installed."""
-    options = {"image": ur.images.RecursiveControlVariate(), "groups": 2}
-    found = {"drjit": loops.drjit_stock, "drjit, changed": lambda *given: loops.drjit_ours(*given, **options)}
+    """Return the loops by name; those of PyTorch where that is installed."""
+    every = {"drjit": loops.drjit}
     if importlib.util.find_spec("torch") is not None:
-        found |= {"torch": loops.torch_stock, "torch, changed": lambda *given: loops.torch_ours(*given, **options)}
-    return found
+        every["torch"] = loops.torch
+    return {
+        name + suffix: functools.partial(loop, changed=bool(suffix))
+        for name, loop in every.items()
+        for suffix in ("", ", changed")
+    }
 
 
 def tune(loop: Callable[..., None], task: Task, loss: str, seconds: float, spp: Any, rates: Any) -> dict[str, Any]:
@@ -68,33 +69,6 @@ def tune(loop: Callable[..., None], task: Task, loss: str, seconds: float, spp: 
     return best
 
 
-def memory_kib() -> int:
-    """Resident memory of this process."""
-    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmRSS"))
-    return int(line.split()[1])
-
-
-def leak(loop: Callable[..., None], task: Task, steps: int) -> dict[str, Any]:
-    """Resident memory, and Dr.Jit's variables, at ten points along a loop of so many steps."""
-
-    class Counter(Clock):
-        def __init__(self) -> None:
-            super().__init__(math.inf, task.error)
-            self.points: list[tuple[int, int, int]] = []
-
-        def goes_on(self, texture: Any) -> bool:
-            self.steps += 1
-            if self.steps > 0 and self.steps % max(1, steps // 10) == 0:
-                gc.collect()
-                self.points.append((self.steps, memory_kib(), len(dr.whos(as_string=True).splitlines())))
-            return self.steps < steps
-
-    counter = Counter()
-    loop(task, 2, 0.01, "l2", 0, counter)
-    first, last = counter.points[1 if len(counter.points) > 2 else 0], counter.points[-1]
-    return {"points": counter.points, "kib_per_1000_steps": 1000 * (last[1] - first[1]) / max(1, last[0] - first[0])}
-
-
 def run(
     loss: tuple[str, ...] = ("l2", "l1"),
     seconds: float = 6.0,
@@ -105,7 +79,6 @@ def run(
     reference_spp: int = 4096,
     spp: tuple[int, ...] = (2, 4, 16),
     rates: tuple[float, ...] = (0.02, 0.05),
-    leak_steps: int = 2000,
 ) -> Iterator[dict[str, Any]]:
     """All parts.
 
@@ -116,10 +89,9 @@ def run(
         seeds: runs of each loop
         spp: samples per pixel to try
         rates: learning rates to try
-        leak_steps: of the leak test
     """
     task = task_of(resolution, texture_resolution, reference_spp)
-    found: dict[str, Any] = {"start": task.error(_Array(task.start)), "losses": {}}
+    found: dict[str, Any] = {"start": task.error(mi.TensorXf(task.start)), "losses": {}}
     every = contenders()
     for kind in loss:
         tuned = {}
@@ -139,19 +111,3 @@ def run(
             entry["final"] = [float(np.median(ends)), min(ends), max(ends)]
         found["losses"][kind] = entries
         yield found
-    small = task_of(min(resolution, 32), min(texture_resolution, 16), 16)
-    found["leaks"] = {name: leak(every[name], small, leak_steps) for name in every if "changed" in name}
-    yield found
-
-
-class _Array:
-    """A NumPy array where the error of a texture of PyTorch is asked for."""
-
-    def __init__(self, values: np.ndarray):
-        self._values = values
-
-    def detach(self) -> _Array:
-        return self
-
-    def numpy(self) -> np.ndarray:
-        return self._values

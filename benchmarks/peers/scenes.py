@@ -10,7 +10,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import mi
-from benchmarks.real_input.run import photograph
+from benchmarks.suite.scenes import photograph
 
 DEPTH = 5
 MATERIAL = "mat-object"

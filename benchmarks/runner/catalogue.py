@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import ast
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 """The repository."""
 PACKAGE = ROOT / "benchmarks"
 ORDER = (
     *("suite", "own_loop", "speed", "peers", "rcv.fig9_reconstruction", "rcv", "meta", "higher_order", "adaptive"),
-    *("volumes", "shapes", "together"),
+    *("volumes", "shapes"),
 )
 """The order of the list and of the results page, by prefixes of names; the alphabet decides within a prefix."""
 
@@ -24,19 +26,24 @@ class Benchmark:
 
     Attributes:
         name: of the folder, with dots: "rcv.fig4_order".
-        folder: with run.py, plot.py, table.py, notes.md, and, once measured, results.json, maps.npz and figure.png.
+        folder: with run.py, report.py, notes.md, and, once measured, results.json, and maps.npz where it keeps images.
     """
 
     name: str
     folder: Path
 
     def module(self, kind: str) -> ModuleType:
-        """Its run, plot or table module."""
+        """Its run or report module."""
         return importlib.import_module(f"benchmarks.{self.name}.{kind}")
 
-    def has(self, kind: str) -> bool:
-        """Whether it has this module."""
-        return (self.folder / f"{kind}.py").is_file()
+    def table(self, record: dict[str, Any]) -> str:
+        """Return the tables of a record as Markdown."""
+        return self.module("report").table(record)
+
+    @property
+    def plot(self) -> Callable[[dict[str, Any]], Any] | None:
+        """The function that draws a record; None where the table says it all."""
+        return getattr(self.module("report"), "plot", None)
 
     @property
     def docstring(self) -> str:

@@ -87,10 +87,8 @@ def execute(benchmark: Benchmark, arguments: Sequence[str]) -> int:
     if record is None:
         print(f"no results.json in {folder}", file=sys.stderr)
         return 2
-    if benchmark.has("plot"):
-        draw(benchmark, record, folder / "figure.png")
-    if benchmark.has("table"):
-        print(benchmark.module("table").table(record))
+    draw(benchmark, record, folder / "figure.png")
+    print(benchmark.table(record))
     return 0
 
 
@@ -125,8 +123,11 @@ def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
     import matplotlib
 
     matplotlib.use("Agg")
+    plot = benchmark.plot
+    if plot is None:
+        return False
     try:
-        figure = benchmark.module("plot").plot(record)
+        figure = plot(record)
     except KeyError as error:
         if "maps" in record or error.args != ("maps",):
             raise

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.gpu.page import beside
+from benchmarks import markdown
+from benchmarks.gpu.plan import SLICES
+from benchmarks.gpu.states import Folder, full
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
-__all__ = ["section", "split_notes", "write_pages"]
+__all__ = ["on_a_gpu", "section", "split_notes", "write_pages"]
 
 _FOLDER = ROOT / "docs" / "benchmarks"
 _INDEX = """# Benchmarks
@@ -41,7 +43,7 @@ def write_pages(folder: Path = _FOLDER, figures: bool = True) -> Path:
         if text is None:
             continue
         names.append(name)
-        if figures and benchmark.has("plot"):
+        if figures:
             text += _figure(benchmark, folder)
         (folder / f"{name}.md").write_text(f"{text[1:]}\n")
     index = folder / "index.md"
@@ -60,8 +62,22 @@ def section(benchmark: Benchmark) -> str | None:
         f"`{record['command']}`, {record['date']}, {hardware['cores']} cores of {hardware['processor']}, "
         f"Mitsuba {versions['mitsuba']}."
     )
-    parts = [f"## {title}", measured, notes, benchmark.module("table").table(record)]
-    return "\n\n".join(filter(None, [*parts, *beside(benchmark)]))
+    parts = [f"## {title}", measured, notes, benchmark.table(record)]
+    return "\n\n".join(filter(None, [*parts, *on_a_gpu(benchmark)]))
+
+
+def on_a_gpu(benchmark: Benchmark, folder: Folder | None = None) -> list[str]:
+    """Return what a GPU gave for a benchmark, a paragraph for each slice that has ended it, with the device."""
+    folder = folder or full()
+    found = []
+    for part in SLICES:
+        own = [command for command in part.commands if command.name == benchmark.name]
+        record = records.read(folder.records / part.name / benchmark.name)
+        if record is not None and any(folder.ended(part, command) == "done" for command in own):
+            name = folder.read(part)["device"]["name"]
+            title = f"**On a GPU: {name}**, `{record['command']}`, {record['date']}."
+            found.append(markdown.blocks(title, benchmark.table(record)))
+    return found
 
 
 def split_notes(benchmark: Benchmark) -> tuple[str, str]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -56,9 +54,3 @@ def percentiles(values: Any) -> list[float]:
 def ratio(times: Times, one: str, other: str) -> list[float]:
     """10th percentile, median and 90th percentile of the ratio, turn by turn."""
     return [float(q) for q in np.quantile(np.array(times[one]) / np.array(times[other]), [0.1, 0.5, 0.9])]
-
-
-def in_new_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a module's function in a process of its own, for peaks of memory."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()

@@ -2,13 +2,11 @@
 
 On `indirect-room`: the pair against a plain primal render of the same kernel and of Mitsuba's `prb`; a step on
 leave-one-out sample groups and a step with the control variate against the stock loop (`mi.render`, `dr.backward`,
-`mi.ad.Adam`) at equal spp; the variance of the gradients, leave-one-out groups against own paths; the share of a step
-spent outside kernels, and whether any kernel is new after warm-up.
+`mi.ad.Adam`) at equal spp; the variance of the gradients, leave-one-out groups against own paths.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,13 +14,12 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, SampleRequest, dr, mi, prepare, project, stock_scene
-from benchmarks.kernel_history import kernels
 from benchmarks.paths import truth
 from benchmarks.runner.timing import percentiles, turns
 from benchmarks.stock_loop import stock_loop
 
 PROBLEMS = ("indirect-room", "glossy-room", "sunlit-vase", "lamp")
-QUICK = {"problem": ("indirect-room",), "resolution": 16, "spp": 2, "default_resolution": 16}
+QUICK = {"problem": ("indirect-room",), "resolution": 16, "spp": 2}
 
 
 def stepper(problem: ur.Problem, estimator: Any) -> Callable[[int], None]:
@@ -77,21 +74,6 @@ def primal_costs(problem: ur.Problem, spp: int) -> dict[str, Any]:
     return found | ratios
 
 
-def outside_kernels(problem: ur.Problem, estimator: Any, steps: int = 10) -> dict[str, Any]:
-    """The share of wall clock that no kernel accounts for, and how many kernels were new, over some steps after warm-up."""
-    step, warm = stepper(problem, estimator), 8
-    for number in range(warm):
-        step(number)
-    dr.sync_thread()
-    began = time.perf_counter()  # without the history, whose own upkeep would count
-    for number in range(warm, warm + steps):
-        step(number)
-    dr.sync_thread()
-    wall = 1e3 * (time.perf_counter() - began) / steps
-    inside, new, launched = kernels(step, range(warm + steps, warm + 2 * steps))
-    return {"wall_ms": wall, "kernels_ms": inside, "outside": 1 - inside / wall, "launched": launched, "new": new}
-
-
 def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[str, Any]:
     """Variance of the gradient summed over elements, leave-one-out groups against an adjoint on paths of its own at equal spp.
 
@@ -115,14 +97,11 @@ def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[st
     return found
 
 
-def run(
-    problem: tuple[str, ...] = PROBLEMS, resolution: int = 128, spp: int = 16, default_resolution: int | None = None
-) -> dict[str, Any]:
+def run(problem: tuple[str, ...] = PROBLEMS, resolution: int = 128, spp: int = 16) -> dict[str, Any]:
     """All parts.
 
     Args:
-        problem: of the variances and the time outside kernels
-        default_resolution: of the time outside kernels (each problem's own)
+        problem: of the variances
     """
 
     def room() -> ur.Problem:  # one for each contender, whose scenes hold its own parameters
@@ -133,14 +112,10 @@ def run(
     primal, stock = primal_costs(room(), spp), stock_time(room(), spp)
     times = turns({"leave-one-out": stepper(room(), plain), "rcv": stepper(room(), rcv)})
     steps = {"stock": stock, **{name: percentiles(values) for name, values in times.items()}}
-    sized = {"resolution": default_resolution} if default_resolution else {}
     half = {name: ur.gallery.problem(name, resolution=resolution // 2, loss="L2") for name in problem}
-    defaults = {name: ur.gallery.problem(name, **sized) for name in problem}
-    small = ur.PathGradient(control_variate, spp=2)
     return {
         "primal_ms": primal,
         "step_ms": steps,
         "step_ratios": {f"{name}/stock": steps[name][0] / stock for name in ("leave-one-out", "rcv")},
         "gradient_variance": {name: gradient_variance(made, spp) for name, made in half.items()},
-        "outside_kernels": {name: outside_kernels(made, small) for name, made in defaults.items()},
     }

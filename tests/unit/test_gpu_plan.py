@@ -8,15 +8,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from benchmarks.gpu import cli, execute, outcomes, page
+from benchmarks.gpu import cli, execute, outcomes
 from benchmarks.gpu.plan import SLICES, Command, Slice
 from benchmarks.gpu.states import Folder, device, full
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.options import add_options
+from benchmarks.runner.results_page import on_a_gpu
 from unrender.backend import variant
 
 NOWHERE = {"name": "a device", "variant": "llvm_ad_rgb"}
@@ -56,6 +56,12 @@ def test_every_benchmark_of_the_plan_has_its_options(name: str) -> None:
     for command in (c for c in COMMANDS if c.name == name):
         for small in (False, True):
             parser.parse_args(command.arguments(small))  # exits where there is no such option or choice
+
+
+def test_toy_commands_keep_names_and_leave_sizes_to_the_benchmark() -> None:
+    command = Command("suite --problem lamp 'a, b' --seconds 10 --spp 4 16 --only uniform", 1.0)
+    assert command.arguments(False)[1:3] == ["lamp", "a, b"]
+    assert command.arguments(True) == ["--quick", "--problem", "lamp", "a, b", "--only", "uniform"]
 
 
 def test_tests_of_the_plan_are_there() -> None:
@@ -182,25 +188,21 @@ def test_tests_go_on_after_the_process_has_ended(tmp_path: Path) -> None:
         assert outcomes.counts(file) == expected
 
 
-def record(**more: Any) -> dict[str, Any]:
-    versions, hardware = {"mitsuba": "3"}, {"processor": "p", "cores": 2}
-    return {"command": "a command", "date": "2026-01-02", "versions": versions, "hardware": hardware, **more}
-
-
 @pytest.mark.mitsuba
 def test_figures_of_a_gpu_stand_beside_those_of_the_processor(folder: Folder) -> None:
     part = next(part for part in SLICES if part.name == "speed")
-    sizes = {"16": {"ms": {"image": [7.25, 7, 8]}, "bytes": 0}}
-    file = folder.records / "speed" / "speed.sizes" / "results.json"
+    measured = json.loads((ALL["speed"].folder / "results.json").read_text())
+    measured["step_ms"]["rcv"][0] = 7.3
+    file = folder.records / "speed" / "speed" / "results.json"
     file.parent.mkdir(parents=True)
-    file.write_text(json.dumps(record(settings={"spp": 1}, sizes=sizes)))
-    assert page.beside(ALL["speed.sizes"], folder) == []  # not ended
+    file.write_text(json.dumps(measured))
+    assert on_a_gpu(ALL["speed"], folder) == []  # not ended
     where = {"name": "A fast GPU", "variant": "cuda_ad_rgb"}
     folder.note(part, part.commands[0], where, {"ended": "done", "seconds": 5.0})
-    (told,) = page.beside(ALL["speed.sizes"], folder)
+    (told,) = on_a_gpu(ALL["speed"], folder)
     assert "A fast GPU" in told
-    assert "| image | 7.25 |" in told
-    assert page.beside(ALL["speed"], folder) == []
+    assert "| control variate | 7.3 |" in told
+    assert on_a_gpu(ALL["suite"], folder) == []
 
 
 def test_a_record_of_a_gpu_is_of_a_gpu() -> None:

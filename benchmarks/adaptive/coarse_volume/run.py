@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, SampleRequest, Tree, arrays, prepare
-from benchmarks.measured_races import UNIT, Scaled
+from benchmarks.image_errors import ImageErrors
 from benchmarks.pixel_schemes import pixels
-from benchmarks.races import TUNING_SEED, median_and_range, over, reached, search
+from benchmarks.races import Entrant, over, race, reached, scaled
 from benchmarks.runner.timing import work_time
 
 UNSEEN = 4
@@ -45,50 +44,6 @@ class Falling:
     def __call__(self, step: float) -> float:
         share = min(max((step - self.start) / max(self.end - self.start, 1), 0.0), 1.0)
         return 0.05 + 0.95 * (1 + float(np.cos(np.pi * share))) / 2
-
-
-class PictureErrors:
-    """How far renders of some views are from their references, relative to the start."""
-
-    def __init__(self, made: ur.Problem, options: dict[str, Any], groups: dict[str, list[int]], spp: int = 8):
-        own = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1})
-        self.session, self.groups, self.spp = prepare(own, made.initial()), groups, spp
-        self.views = made.views
-        self.start = self.errors(made.initial())
-
-    def __call__(self, parameters: Tree) -> dict[str, float]:
-        return {name: error / self.start[name] for name, error in self.errors(parameters).items()}
-
-    def errors(self, parameters: Tree) -> dict[str, float]:
-        """Root mean square over each group's views."""
-        found = {}
-        for name, group in self.groups.items():
-            squares = []
-            for number in group:
-                request = SampleRequest(self.views[number].sensor, self.spp, Key(424_242, number).uint32(), 2)
-                images = arrays.numpy(self.session.image(parameters, request).images).astype(np.float64)
-                a, b = images - np.asarray(self.views[number].reference, np.float64)
-                squares.append(float(np.mean(a * b)))
-            found[name] = max(float(np.mean(squares)), 0.0) ** 0.5
-        return found
-
-
-class Recorder(ur.protocols.Callback):
-    """(processor seconds, paths, error) along a run, for each error; its own time is not the run's."""
-
-    def __init__(self, errors: PictureErrors, array: Any, every: int):
-        self.errors, self.array, self.every, self.clock = errors, array, every, 0.0
-        self.points: dict[str, list[tuple[float, float, float]]] = {name: [(0.0, 0.0, 1.0)] for name in errors.start}
-        self.since = work_time()
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        self.clock += work_time() - self.since
-        if run.step % self.every == 0:
-            full = {key: self.array(value) for key, value in run.full().items()}
-            for name, error in self.errors(full).items():
-                self.points[name].append((self.clock, float(record["samples"]), error))
-        self.since = work_time()
 
 
 def resolutions(grid: int, every: int) -> tuple[int, ...]:
@@ -127,42 +82,25 @@ def run(
     unseen = [((2 * number + 1) * len(made.views)) // (2 * UNSEEN) for number in range(UNSEEN)]
     seen = [number for number in range(len(made.views)) if number not in unseen]
     groups = {"seen": seen[:: max(len(seen) // UNSEEN, 1)][:UNSEEN], "unseen": unseen}
-    errors = PictureErrors(made, options, groups)
+    errors = ImageErrors(made, options, groups, 8)
 
     def problem(coarse: bool) -> ur.Problem:
         way = ur.scene.CoarseToFine(changes, states="carry") if coarse else None
         parameters = [replace(parameter, coarse_to_fine=way) for parameter in made.parameters]
         return made.replaced(parameters=parameters, views=[made.given_views[number] for number in seen])
 
-    def descend(name: str, rate: float, seed: int, points: int) -> dict[str, list[tuple[float, float, float]]]:
-        scheme, coarse = WAYS[name]
-        schedule = Scaled(rate / UNIT, Falling(changes[-1], steps))
-        recorder = Recorder(errors, made.renderer.array, max(steps // points, 1))
-        estimator = ur.PathGradient(pixels=pixels(scheme, count), spp=2)
-        adam = ur.optimizers.Adam(UNIT, schedule=schedule)
-        result = ur.optimize(problem(coarse), estimator, adam, steps=steps, seed=seed, callbacks=[recorder])
+    def ended(name: str, seed: int, result: ur.Result) -> None:
         if result.warnings:
-            raise RuntimeError(f"{name}: {result.warnings}")
-        return recorder.points
+            raise RuntimeError(f"{name}, seed {seed}: {result.warnings}")
 
+    adam = scaled(ur.optimizers.Adam, Falling(changes[-1], steps))
+    conditions = {**options, "changes": changes, "steps": steps, "count": count, "seeds": seeds}
     for name in only:
-
-        def final(rate: float, name: str = name) -> float:
-            error = descend(name, rate, TUNING_SEED, 1)["seen"][-1][2]
-            print(f"{name} rate {rate:g}: {error:.4f}", flush=True)
-            return error
-
-        rate, tried = search(RATES, final)
-        runs: dict[str, list[Any]] = {group: [] for group in groups}
-        for seed in range(seeds):
-            for group, found in descend(name, rate, seed, POINTS).items():
-                runs[group].append(found)
-        last = {group: median_and_range([run[-1][2] for run in found]) for group, found in runs.items()}
-        print(name, rate, last, flush=True)
-        yield {
-            "conditions": {**options, "changes": changes, "steps": steps, "count": count, "seeds": seeds},
-            "methods": {name: {"rate": rate, "tried": tried, "runs": runs, "final": last}},
-        }
+        scheme, coarse = WAYS[name]
+        entrant = Entrant(name, name, ur.PathGradient(pixels=pixels(scheme, count), spp=2), adam, RATES)
+        budget = {"steps": steps, "clock": work_time, "points": POINTS}
+        methods = race(problem(coarse), [entrant], seeds, measure=errors, by="seen", ended=ended, **budget)
+        yield {"conditions": conditions, "methods": methods}
 
 
 def summarize(record: dict[str, Any]) -> dict[str, Any]:

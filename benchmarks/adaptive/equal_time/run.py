@@ -3,8 +3,7 @@
 
 Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many
 pixels for all, Adam, the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have
-fewer sampled pixels per texel than texels, as in the paper. On `plain-and-textured` also five levels; `two-planets,
-memories` adds, on small images, a control variate and coupled meta-estimation, with mini-batches and with whole images.
+fewer sampled pixels per texel than texels, as in the paper. On `plain-and-textured` also five levels.
 Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios are to uniform mini-batches,
 at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may change between
 runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
@@ -23,7 +22,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.pixel_schemes import pixels
-from benchmarks.races import Entrant, Runs, over, race, reached, tenths
+from benchmarks.races import Entrant, Runs, follow, over, race, reached, tenths
 from benchmarks.runner.timing import work_time
 
 FINE = {"resolution": 192, "texture_resolution": 192}
@@ -35,20 +34,13 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
     "plain-and-textured": ("plain-and-textured", FINE, 2048),
     "two-planets": ("two-planets", {"resolution": 128, "texture_resolution": 128}, 2048),
     "mirror-trio": ("mirror-trio", {"resolution": 192}, 2048),
-    "two-planets, memories": ("two-planets", {}, 2048),
     "three-textures": ("three-textures", FINE, 2048),
-    "globe-and-mirror": (
-        "globe-and-mirror",
-        {"resolution": 4096, "texture_resolution": 256, "reference_spp": 4},
-        2048,
-    ),
+    "globe-and-mirror": ("globe-and-mirror", {"resolution": 4096, "texture_resolution": 256, "reference_spp": 4}, 2048),
     "sunlit-vase": ("sunlit-vase", {**MANY, "views": 16, "loss": "L2"}, 2048),
     "sun-glossy, 32 views": ("sun-glossy", {**MANY, "views": 32}, 2048),
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
-META_RATES = (0.001, 0.003)
-CV = ur.images.RecursiveControlVariate
 MERGE = ("entries.*.methods", "seconds_per_path.*")
 QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 
@@ -64,47 +56,11 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
 
     found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        found.append(
-            entrant(
-                "adaptive, as the paper",
-                "adaptive",
-                relative=False,
-                levels=4,
-                uniform=0.1,
-                learn_from_draws=False,
-                by_cost=False,
-            )
-        )
+        paper = {"relative": False, "levels": 4, "uniform": 0.1, "learn_from_draws": False, "by_cost": False}
+        found.append(entrant("adaptive, as the paper", "adaptive", **paper))
     if task == "plain-and-textured":
         found.append(entrant("adaptive, five levels", "adaptive", levels=4))
-    if task == "two-planets, memories":
-        adaptive = pixels("adaptive", count)
-        meta = ur.optimizers.MetaAdam
-        found += [
-            Entrant("adaptive, rcv", "adaptive, rcv", ur.PathGradient(CV(), adaptive, spp=2), adam, RATES),
-            Entrant("all, rcv", "all, rcv", ur.PathGradient(CV(), spp=2), adam, RATES),
-            Entrant(
-                "adaptive, coupled",
-                "adaptive, coupled",
-                ur.MetaEstimator(coupled=True, spp=2, pixels=adaptive),
-                meta,
-                META_RATES,
-            ),
-            Entrant("all, coupled", "all, coupled", ur.MetaEstimator(coupled=True, spp=2), meta, META_RATES),
-        ]
     return found
-
-
-class Clock(ur.protocols.Callback):
-    """(seconds of the processor, paths so far) of each step."""
-
-    def __init__(self) -> None:
-        self.found: list[tuple[float, float]] = []
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        del run
-        self.found.append((work_time(), float(record["samples"])))
 
 
 def costs(
@@ -114,10 +70,8 @@ def costs(
     found: dict[str, list[float]] = {entrant.name: [] for entrant in chosen}
     for turn in range(rounds):
         for entrant in chosen:
-            clock = Clock()
-            options: dict[str, Any] = {"steps": steps, "seed": turn, "callbacks": [clock]}
-            ur.optimize(problem, entrant.estimator, entrant.optimizer(rate), **options)
-            (begun, before), (ended, after) = clock.found[steps // 3], clock.found[-1]
+            points = follow(problem, entrant, rate, turn, points=2 * steps, clock=work_time, steps=steps).points[""]
+            (begun, before, _), (ended, after, _) = points[steps // 3], points[-1]
             found[entrant.name].append((ended - begun) / (after - before))
     return {name: float(np.median(times)) for name, times in found.items()}
 

@@ -21,16 +21,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import (
-    Key,
-    PixelSampler,
-    Tree,
-    element_scales,
-    gradient_of,
-    mi,
-    pixel_shares,
-    second_moments,
-)
+from benchmarks.internals import Key, PixelSampler, Tree, element_scales, gradient_of, mi, pixel_shares, second_moments
 from benchmarks.suite.scenes import problem as foreign_problem
 
 GALLERY: dict[str, dict[str, Any]] = {

@@ -167,11 +167,7 @@ def train(data: Data, method: str, rate: float, seconds: float, seed: int, sampl
 
 
 def run(
-    task: tuple[str, ...] = tuple(ANSWERS),
-    runs: int = 3,
-    seconds: float = 120.0,
-    images: int = 16,
-    size: int = 32,
+    task: tuple[str, ...] = tuple(ANSWERS), runs: int = 3, seconds: float = 120.0, images: int = 16, size: int = 32
 ) -> Iterator[dict[str, Any]]:
     """A part per task.
 

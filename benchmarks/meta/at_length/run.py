@@ -15,14 +15,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 
 import unrender as ur
 from benchmarks.internals import Estimator, Optimizer
-from benchmarks.races import TUNING_SEED, median_and_range, search, total_error
+from benchmarks.races import TUNING_SEED, Entrant, Points, follow, median_and_range, search
 from benchmarks.runner.timing import work_time
 from unrender.schedules import Cosine
 
@@ -34,8 +34,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 """Noise of references is a part of the loss's minimum, which long descents reach: where it tells, they have 16 times the samples."""
 BETA = 0.999
 FLOOR = 0.02
-POINTS = 60
-"""Measurements along a run."""
 TRIAL = 8
 """Steps that tell the cost of one."""
 USUAL_RESOLUTION = 64
@@ -44,18 +42,6 @@ LOWER = 4
 PAPER = "meta, 1 + 2"
 MERGE = ("entries.*.methods",)
 QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
-
-Points = list[tuple[float, float, float]]
-
-
-@dataclass(frozen=True)
-class Entrant:
-    """A method; `optimizer` makes its optimizer from a learning rate and a schedule."""
-
-    group: str
-    estimator: Estimator
-    optimizer: Callable[..., Optimizer]
-    rates: tuple[float, ...]
 
 
 RATES: dict[str, dict[str, tuple[float, float]]] = {
@@ -94,49 +80,21 @@ def entrants(problem: str) -> dict[str, Entrant]:
             "coupled", ur.MetaEstimator(coupled=True, spp=3, image=control, beta_proportional=BETA), meta
         ),
     }  # fmt: skip
-    return {name: Entrant(*made[name], rates) for name, rates in RATES[problem].items()}
-
-
-class Recorder(ur.protocols.Callback):
-    """Keeps (processor seconds, samples, error) at some steps of a run and at its last."""
-
-    def __init__(self, problem: ur.Problem, steps: int):
-        self.problem, self.steps, self.every = problem, steps, max(1, steps // POINTS)
-        self.start = problem.parameter_error(problem.initial())
-        self.points: Points = []
-        self.begun = self.spent = 0.0
-
-    def on_start(self, run: Any) -> None:
-        """See `Callback.on_start`."""
-        del run
-        self.begun = work_time()
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        if run.step % self.every and run.step != self.steps:
-            return
-        now = work_time()
-        self.spent += now - self.begun
-        error = total_error(self.problem.parameter_error(run.parameters), self.start)
-        self.points.append((round(self.spent, 3), float(record["samples"]), error))
-        self.begun = work_time()
+    return {name: Entrant(name, *made[name], rates) for name, rates in RATES[problem].items()}
 
 
 def descend(problem: ur.Problem, entrant: Entrant, rate: float, seed: int, steps: int) -> Points:
     """One run with a falling rate."""
-    recorder = Recorder(problem, steps)
-    optimizer = entrant.optimizer(rate, schedule=Cosine(steps, FLOOR))
-    ur.optimize(problem, entrant.estimator, optimizer, steps=steps, seed=seed, callbacks=[recorder])
-    return recorder.points
+    falling = replace(entrant, optimizer=functools.partial(entrant.optimizer, schedule=Cosine(steps, FLOOR)))
+    return follow(problem, falling, rate, seed, clock=work_time, steps=steps).points[""]
 
 
 def cost(problem: ur.Problem, entrant: Entrant) -> float:
-    """Processor seconds of a step."""
-    recorder = Recorder(problem, TRIAL)  # the first steps compile
-    optimizer = entrant.optimizer(entrant.rates[0])
-    ur.optimize(problem, entrant.estimator, optimizer, steps=TRIAL, seed=TUNING_SEED, callbacks=[recorder])
-    halfway = TRIAL // 2
-    return (recorder.points[-1][0] - recorder.points[halfway - 1][0]) / (TRIAL - halfway)
+    """Processor seconds of a step; the first steps compile."""
+    points = follow(
+        problem, entrant, entrant.rates[0], TUNING_SEED, points=2 * TRIAL, clock=work_time, steps=TRIAL
+    ).points[""]
+    return (points[-1][0] - points[TRIAL // 2][0]) / (TRIAL - TRIAL // 2)
 
 
 def measure(

@@ -1,13 +1,10 @@
-"""Finite differences of gradients (Meta Eq. 14 and section 7): what they cost, and how their variance falls with the step.
+"""Finite differences of gradients (Meta Eq. 14 and section 7): how their variance falls with the step.
 
 Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose
 length is varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with
-its log-log slope. Cost: an estimate by plain gradients, of the paper's meta-estimation and of the coupled form, and the
-parts of a meta step. Noise: the variance of plain gradients by samples per pixel, near the truth, summed over elements:
+its log-log slope. Noise: the variance of plain gradients by samples per pixel, near the truth, summed over elements:
 where that of images and adjoints multiply, it falls with the square of the samples, and many in one step serve a descent
-better than as many over several. Images of F: with the loss derivatives of ΔF at images of its own, and at F's, the
-processor time of a step on one thread, the variance of the meta-estimate along a fixed path, beside the one that it
-states, and the errors that descents end with.
+better than as many over several.
 """
 
 from __future__ import annotations
@@ -18,10 +15,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, SampleRequest, arrays, coupled_gradients, loss_derivative, prepare, trees
-from benchmarks.meta.differences.images_of_f import OPTIONS, images_of_f
+from benchmarks.internals import Key, arrays, coupled_gradients, trees
 from benchmarks.paths import truth
-from benchmarks.runner.timing import medians, turns
 
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
 STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
@@ -29,11 +24,8 @@ STEPS = (0.3, 0.1, 0.03, 0.01, 0.003)
 NOISE_SPP = (2, 4, 8, 16, 64)
 NEAR = 0.9
 """Share of the way at which the noise is measured."""
-MERGE = ("variance.problems", "cost", "noise.problems", "images_of_f.problems")
-QUICK = {
-    "problem": ("chalice",), "resolution": 8, "cost_resolution": (8,), "runs": 3, "spp": 2, "noise_runs": 3,
-    "images_resolution": 8, "images_runs": 3, "steps": 3, "seeds": 1,
-}  # fmt: skip
+MERGE = ("variance.problems", "noise.problems")
+QUICK = {"problem": ("chalice",), "resolution": 8, "runs": 3, "spp": 2, "noise_runs": 3}
 
 
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
@@ -56,48 +48,6 @@ def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
         slope = float(np.polyfit(np.log(STEPS), np.log(rows), 1)[0])
         found[space] = {"gradient": gradient, "difference": rows, "slope": slope}
         print(problem.name, space, f"slope {slope:.3f}", [f"{r / gradient:.2g}" for r in rows], flush=True)
-    return found
-
-
-def costs(problem: ur.Problem) -> dict[str, float]:
-    """Milliseconds of whole estimates, and of the parts of a meta step."""
-    parameters = problem.initial()
-    previous = trees.map(lambda x: x * 0.99, parameters)
-    estimators = {
-        "plain 4 spp": ur.PathGradient(spp=4),
-        "meta 2 + 1": ur.MetaEstimator(),
-        "coupled 3 spp": ur.MetaEstimator(coupled=True, spp=3),
-        "coupled 4 spp": ur.MetaEstimator(coupled=True, spp=4),
-        "plain 2 spp": ur.PathGradient(spp=2),
-    }
-    found: dict[str, float] = {}
-    for name, estimator in estimators.items():
-        states = [estimator.init(problem, parameters)]
-
-        def step(seed: int, estimator: Any = estimator, states: list[Any] = states) -> None:
-            # A new array per step, as in a descent, so that the scenes are updated.
-            moved = trees.map(lambda x: x * 1.0, (parameters, previous)[seed % 2])
-            states[0] = estimator.estimate(problem, moved, states[0], Key(0, seed))[1]
-
-        found |= medians(turns({name: step}))
-    session = prepare(problem, parameters, "path")
-
-    def request(seed: int) -> SampleRequest:
-        return SampleRequest(problem.views[0].sensor, 1, seed)
-
-    pair = session.image_pair(parameters, previous, request(5), "path")
-    weights = loss_derivative(problem, 0, pair.images)
-    parts = {
-        "one pair of images, 1 spp": lambda n: session.image_pair(parameters, previous, request(n), "path"),
-        "one pair of adjoints, 1 spp": lambda n: session.adjoint_pair(
-            parameters, previous, pair.paths, weights, weights
-        ),
-        "one image, 1 spp": lambda n: session.image(parameters, request(n)),
-        "one adjoint, 1 spp": lambda n: session.adjoint(parameters, pair.paths, weights),
-    }
-    found |= medians(turns(parts))
-    found["meta / plain 4 spp"] = found["meta 2 + 1"] / found["plain 4 spp"]
-    print(problem.name, {k: round(v, 2) for k, v in found.items()}, flush=True)
     return found
 
 
@@ -125,18 +75,13 @@ def noise(problem: ur.Problem, runs: int) -> list[float]:
 
 def run(
     problem: tuple[str, ...] = PROBLEMS,
-    part: tuple[str, ...] = ("variance", "cost", "noise", "images of F"),
+    part: tuple[str, ...] = ("variance", "noise"),
     resolution: int = 32,
-    cost_resolution: tuple[int, ...] = (96, 256),
     spp: int = 4,
     runs: int = 48,
     noise_runs: int = 64,
-    images_resolution: int = 64,
-    images_runs: int = 96,
-    steps: int = 300,
-    seeds: int = 3,
 ) -> Iterator[dict[str, Any]]:
-    """Costs at each size, then variances.
+    """Variances of differences, then of gradients.
 
     Args:
         part: measured; the other's figures stay
@@ -144,15 +89,8 @@ def run(
         spp: of the variances
         runs: of the variances
         noise_runs: of the noise
-        images_resolution: of the images of F
-        images_runs: of their variances
-        steps: of their descents
-        seeds: of their descents
     """
     loss = "RelativeL2"
-    for size in cost_resolution if "cost" in part else ():
-        options = {"resolution": size, "reference_spp": 16, "loss": loss}
-        yield {"cost": {str(size): {name: costs(ur.gallery.problem(name, **options)) for name in problem}}}
     if "variance" in part:
         options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
         found = {name: variances(ur.gallery.problem(name, **options), spp, runs) for name in problem}
@@ -164,6 +102,3 @@ def run(
             size = {**options, "texture_resolution": 1} if name == "spiral" else options
             found[name] = noise(ur.gallery.problem(name, **size), noise_runs)
         yield {"noise": {"resolution": resolution, "runs": noise_runs, "spp": NOISE_SPP, "problems": found}}
-    if "images of F" in part:
-        names = tuple(name for name in problem if name in OPTIONS)
-        yield {"images_of_f": images_of_f(names, images_resolution, images_runs, steps, seeds)}

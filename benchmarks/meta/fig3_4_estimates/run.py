@@ -1,134 +1,166 @@
-"""Gradient estimates and predicted deviations on a fixed path of parameters (Meta Figs 3 and 4).
+"""Derivatives of pixels and predicted deviations on a fixed path of parameters (Meta Figs 3 and 4).
 
-On `indirect-room`, without an optimizer, so that nothing feeds back: the parameters go from the start to the truth in
-equal steps (Fig. 3), or by steps that halve their distance (Fig. 4). Each method sees as many paths per step: the mean
-that Adam keeps of plain gradients (decay 0.9) with the deviation that its two moments predict for it, the paper's
-meta-estimate, and the coupled one. Three texels are shown: the one with the noisiest gradient, the 75th percentile, the
-median.
-
-The paper's own figures are of forward derivatives of pixels by one colour, here the left wall's blue while it and those of
-floor and ceiling change, from one sample per pixel and step: `pixels.py` has them for all runs at once. Adam sees the
-proportional samples alone. Beside the deviations it compares the variances that single runs estimate, and their α, with the
-actual ones and the best α.
+On `indirect-room`, without an optimizer, so that nothing feeds back: the left wall's blue and those of floor and ceiling go from
+start to end in equal steps (Fig. 3), or by steps that halve their distance (Fig. 4). Forward derivatives of all pixels by the wall's
+blue are taken from one sample per pixel and step, for all runs at once. Adam's mean (decay 0.9), which sees the proportional samples
+alone, stands beside the paper's meta-estimate, with α from its own samples and from those of another run. Deviations that single
+runs predict, their variances and their α are compared with the actual ones and the best α.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, Tree, arrays
-from benchmarks.meta.fig3_4_estimates import pixels
-from benchmarks.paths import geometric, straight
+from benchmarks.internals import Key, RenderSession, SampleRequest, arrays, prepare
+from unrender.statistics import meta
 
-BETA_1, BETA_2 = 0.9, 0.999
-METHODS = {
-    "plain": ur.PathGradient(spp=4),
-    "adam": ur.PathGradient(spp=4),
-    "meta": ur.MetaEstimator(),
-    "coupled": ur.MetaEstimator(coupled=True, spp=4),
+COLOUR = "left.bsdf.reflectance.value"
+MOVED = {
+    COLOUR: (0.06, 0.8),
+    "floor.bsdf.reflectance.value": (0.75, 0.35),
+    "ceiling.bsdf.reflectance.value": (0.75, 0.35),
 }
+"""The blue reflectances that change along the path, from and to."""
+BLUE, WIDTH = 2, 0.02
+DEPTH = 5
+"""Longest paths, below the depth of Russian roulette: on equal random numbers an image is then a polynomial of the reflectances."""
+DEGREE = 6
 HALF_LIFE = 8.0
-TRUTH_SEED = 1_000_000
-MERGE = ("sizes", "paths", "pixels")
-QUICK = {
-    "runs": 3, "steps": 6, "resolution": 8, "pixel_runs": 20, "pixel_steps": 30, "pixel_resolution": 4,
-}  # fmt: skip
+QUICK = {"runs": 20, "steps": 30, "resolution": 4}
+SETTLED = 10
+"""Steps that a memory has before its prediction is judged."""
+METHODS = ("adam", "meta", "independent")
+"""Adam's mean; the paper's estimate, with α from its own samples, and from those of another run."""
+BETA_1, BETA_2 = 0.9, 0.999
 
 
-def estimates_along(
-    problem: ur.Problem, method: str, path: list[Tree], seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(steps, n) each: the estimate, the deviation predicted for it, the weight of the past."""
-    estimator = METHODS[method]
-    state = estimator.init(problem, path[0])
-    rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+def shares(name: str, steps: int) -> np.ndarray:
+    """(steps,) shares of the way: "linear", or "decaying" by halves."""
+    return np.linspace(0, 1, steps) if name == "linear" else 1 - 0.5 ** (np.arange(steps) / HALF_LIFE)
+
+
+class Derivatives:
+    """Forward derivatives of all pixels by the wall's blue, one sample per pixel and run; blue channel alone."""
+
+    def __init__(self, resolution: int, runs: int):
+        self.problem = ur.gallery.problem(
+            "indirect-room", resolution=resolution, texture_resolution=8, reference_spp=16, max_depth=DEPTH
+        )
+        self.runs, self.start = runs, self.problem.renderer.values(list(MOVED))
+        self.session: RenderSession = prepare(self.problem, self.start)
+
+    def image(self, share: float, offset: float, seed: int) -> np.ndarray:
+        """(runs, pixels) of the scene at a share of the way, the wall's blue off by `offset`."""
+        parameters = {}
+        for key, (first, last) in MOVED.items():
+            value = np.array(arrays.numpy(self.start[key]), np.float32)
+            value[BLUE] = first + share * (last - first) + (offset if key == COLOUR else 0.0)
+            parameters[key] = self.problem.renderer.array(value)
+        request = SampleRequest(self.problem.views[0].sensor, self.runs, Key(5, seed).uint32(), self.runs)
+        found = arrays.numpy(self.session.image(parameters, request).images)
+        return found[..., BLUE].reshape(self.runs, -1).astype(np.float64)
+
+    def __call__(self, share: float, seed: int) -> np.ndarray:
+        """(runs, pixels): a central difference on equal random numbers."""
+        return (self.image(share, WIDTH, seed) - self.image(share, -WIDTH, seed)) / (2 * WIDTH)
+
+
+def along(derivatives: Derivatives, path: np.ndarray) -> dict[str, Any]:
+    """The samples and the estimates at each step, (steps, runs, pixels) each, in single precision."""
+    length = np.sqrt(sum((last - first) ** 2 for first, last in MOVED.values()))
+    steps, kept = len(path), {}
     first = second = np.zeros(1)
+    state: Any = None
+    other: Any = None
 
-    def flat(tree: Tree) -> np.ndarray:
-        return np.concatenate([arrays.numpy(x).ravel().astype(np.float64) for x in tree.values()])
+    def keep(index: int, **values: np.ndarray) -> None:
+        for name, value in values.items():
+            kept.setdefault(name, np.zeros((steps, *value.shape), np.float32))[index] = value
 
-    for step, parameters in enumerate(path):
-        found, state = estimator.estimate(problem, parameters, state, Key(seed, step))
-        gradient = flat(found.gradient if found.preconditioned else problem.coordinates.pull_back(found.gradient, {}))
-        if found.variance is not None:
-            rows.append((gradient, np.sqrt(flat(found.variance)), flat(found.info["alpha"])))
-            continue
-        first = BETA_1 * first + (1 - BETA_1) * gradient
-        second = BETA_2 * second + (1 - BETA_2) * gradient**2
-        count = step + 1
-        mean, square = first / (1 - BETA_1**count), second / (1 - BETA_2**count)
-        # Of a weighted mean of independent samples whose mean square is their variance.
-        shrink = (1 - BETA_1) / (1 + BETA_1) * (1 + BETA_1**count) / (1 - BETA_1**count)
-        if method == "adam":
-            rows.append((mean, np.sqrt(square * shrink), np.full_like(gradient, BETA_1)))
+    for i, share in enumerate(path):
+        F = derivatives(share, 2 * i)
+        if state is None:
+            state, other, change = meta.init(F), meta.init(F), 0.0 * F
         else:
-            rows.append((gradient, np.sqrt(square), np.zeros_like(gradient)))
-    a, b, c = (np.array([row[n] for row in rows]) for n in range(3))
-    return a, b, c
+            change = derivatives(share, 2 * i + 1) - derivatives(path[i - 1], 2 * i + 1)
+        moved = float(length * abs(share - path[max(i - 1, 0)]))
+        gradient, variance, alpha, state = meta.update(state, F, change, moved)
+        observed = np.roll(F, 1, axis=0), np.roll(change, 1, axis=0)  # another run's
+        independent, its_variance, _, other = meta.update(other, F, change, moved, observed=observed)
+        var_f = state.proportional.square / state.proportional.weight
+        var_d = state.difference.square / max(float(state.difference.weight), 1e-30) * moved**2
+        first, second = BETA_1 * first + (1 - BETA_1) * F, BETA_2 * second + (1 - BETA_2) * F * F
+        weight = 1 - BETA_1 ** (i + 1)
+        shrink = (1 - BETA_1) / (1 + BETA_1) * (1 + BETA_1 ** (i + 1)) / weight
+        adam_variance = second / (1 - BETA_2 ** (i + 1)) * shrink
+        keep(i, F=F, change=change, meta=gradient, meta_variance=variance, alpha=alpha, var_f=var_f, var_d=var_d)
+        keep(i, independent=independent, independent_variance=its_variance)
+        keep(i, adam=first / weight, adam_variance=adam_variance)
+    return kept
 
 
-def measure(problem: ur.Problem, path: list[Tree], runs: int) -> dict[str, Any]:
-    """Per method: the actual deviation and error beside the predicted deviation, over all texels and for three of them."""
-    taken = {method: [estimates_along(problem, method, path, seed) for seed in range(runs)] for method in METHODS}
-    stacked = {m: [np.array([r[n] for r in rows]) for n in range(3)] for m, rows in taken.items()}
-    others = np.array([estimates_along(problem, "plain", path, TRUTH_SEED + seed)[0] for seed in range(runs)])
-    truth = others.mean(0)
-    of_truth = others.var(0, ddof=1) / runs  # per step and texel, what the noise of the truth adds to a squared error
-    order = np.argsort(of_truth.mean(0))
-    shown = [int(order[-1]), int(order[int(0.75 * len(order))]), int(order[len(order) // 2])]
-    found: dict[str, Any] = {"texels": shown, "truth": truth[:, shown].tolist(), "methods": {}}
-    for method, (estimate, predicted, alpha) in stacked.items():
-        deviation = estimate.std(0, ddof=1)
-        bias = estimate.mean(0) - truth
-        known = np.sqrt(np.mean(predicted**2, 0))
-        ratio = known[1:] / np.maximum(deviation[1:], 1e-30)
-        # The mean over runs has noise of its own, so bias² counts deviation² / runs twice.
-        error = deviation**2 * (1 - 1 / runs) + bias**2 - of_truth
+def lag(mean: np.ndarray, truth: np.ndarray, window: slice) -> float:
+    """By how many steps the mean estimate trails the truth, over pixels and a window of steps: least squares."""
+    slope = np.gradient(truth, axis=0)[window]
+    return float(np.sum((truth - mean)[window] * slope) / np.sum(slope**2))
+
+
+def measure(derivatives: Derivatives, name: str, steps: int) -> dict[str, Any]:
+    """One path: errors, lag and predicted over actual deviations over all pixels, and three pixels in full."""
+    path = shares(name, steps)
+    kept = along(derivatives, path)
+    mean_f, mean_d = kept["F"].mean(1, dtype=np.float64), kept["change"].mean(1, dtype=np.float64)
+    powers = np.polynomial.polynomial.polyvander(path, DEGREE)
+    truth = powers @ np.linalg.lstsq(powers, mean_f, rcond=None)[0]
+    actual = {k: kept[k].std(1, ddof=1, dtype=np.float64) for k in ("F", "change", *METHODS)}
+    order = np.argsort(actual["F"].mean(0))
+    pixels = [int(order[-1]), int(order[int(0.75 * len(order))]), int(order[len(order) // 2])]
+    window = slice(2 * SETTLED, steps) if name == "linear" else slice(2, max(4, round(3 * HALF_LIFE)))
+    found: dict[str, Any] = {"pixels": pixels, "truth": truth[:, pixels].tolist(), "methods": {}}
+    plain = np.sqrt(np.mean((kept["F"] - truth[:, None]) ** 2, axis=(1, 2)))
+    for method in METHODS:
+        predicted = np.sqrt(kept[f"{method}_variance"].astype(np.float64))
+        ratio = predicted[SETTLED:] / actual[method][SETTLED:, None]
+        of_rms = np.sqrt(np.mean(predicted[SETTLED:] ** 2, axis=1)) / actual[method][SETTLED:]
+        error = np.sqrt(np.mean((kept[method] - truth[:, None]) ** 2, axis=(1, 2)))
         found["methods"][method] = {
-            "run": estimate[0][:, shown].tolist(),
-            "run_predicted": predicted[0][:, shown].tolist(),
-            "deviation": deviation[:, shown].tolist(),
-            "mean": estimate.mean(0)[:, shown].tolist(),
-            "predicted": known[:, shown].tolist(),
-            "alpha": alpha.mean((0, 2)).tolist(),
-            "error": np.sqrt(np.maximum(np.mean(error, 1), 0)).tolist(),
-            "predicted_over_actual": [float(q) for q in np.quantile(ratio, [0.05, 0.25, 0.5, 0.75, 0.95])],
-        }
-        print(f"{method}: last error {found['methods'][method]['error'][-1]:.3g}, predicted / actual "
-              f"{[round(q, 2) for q in found['methods'][method]['predicted_over_actual']]}", flush=True)  # fmt: skip
+            "error": (error / plain).tolist(),
+            "variance_over_plain": [float(np.mean(actual[method][n] ** 2) / np.mean(actual["F"][n] ** 2))
+                                    for n in (steps // 2, steps - 1)],
+            "lag": lag(kept[method].mean(1, dtype=np.float64), truth, window),
+            "predicted_over_actual": [float(q) for q in np.quantile(of_rms, [0.05, 0.25, 0.5, 0.75, 0.95])],
+            "within_half_to_two": float(np.mean((ratio > 0.5) & (ratio < 2.0))),
+            "run": kept[method][:, 0][:, pixels].tolist(),
+            "run_predicted": predicted[:, 0][:, pixels].tolist(),
+        }  # fmt: skip
+    # Rows 3 to 5 of Fig. 4: variances over the runs beside the estimates of single runs, and α beside the best one.
+    best = np.zeros_like(actual["F"])
+    variance = actual["F"][0] ** 2
+    for i in range(1, steps):
+        f, d = actual["F"][i] ** 2, actual["change"][i] ** 2
+        best[i] = f / (f + variance + d)
+        variance = best[i] ** 2 * (variance + d) + (1 - best[i]) ** 2 * f
+    late = slice(SETTLED, steps)
+    for key, real in (("var_f", actual["F"] ** 2), ("var_d", actual["change"] ** 2)):
+        thought = kept[key].mean(1, dtype=np.float64)
+        found[f"{key}_over_actual"] = float(np.median(thought[late] / np.maximum(real[late], 1e-30)))
+    off = (kept["alpha"][late] - best[late, None]).astype(np.float64)
+    found["alpha_below_best"] = float(np.mean(off < 0))
+    found["alpha_off"] = [float(q) for q in np.quantile(off, [0.05, 0.5, 0.95])]
+    found["change_mean_error"] = float(np.sqrt(np.mean((mean_d[1:] - np.diff(truth, axis=0)) ** 2)))
+    print(name, {m: (f["error"][-1], f["lag"], f["predicted_over_actual"][2], f["within_half_to_two"])
+                 for m, f in found["methods"].items()}, found["alpha_off"], flush=True)  # fmt: skip
     return found
 
 
-def run(
-    runs: int = 200,
-    steps: int = 40,
-    resolution: int = 24,
-    part: tuple[str, ...] = ("texels", "pixels"),
-    pixel_runs: int = 400,
-    pixel_steps: int = 100,
-    pixel_resolution: int = 12,
-) -> Iterator[dict[str, Any]]:
-    """Both paths, of texels' gradients and of pixels' derivatives.
+def run(runs: int = 400, steps: int = 100, resolution: int = 12) -> dict[str, Any]:
+    """Both paths.
 
     Args:
-        part: measured; the other's figures stay
-        pixel_runs: of the pixels' derivatives, rendered at once
-        pixel_steps: of the pixels' derivatives
-        pixel_resolution: of the pixels' derivatives
+        runs: rendered at once
     """
-    if "texels" in part:
-        problem = ur.gallery.problem(
-            "indirect-room", resolution=resolution, texture_resolution=8, loss="RelativeL2", reference_spp=1024
-        )
-        paths = {"linear": straight(problem, steps), "decaying": geometric(problem, steps, HALF_LIFE)}
-        conditions = {"resolution": resolution, "steps": steps, "runs": runs}
-        yield {"sizes": conditions, "paths": {name: measure(problem, path, runs) for name, path in paths.items()}}
-    if "pixels" in part:
-        derivatives = pixels.Derivatives(pixel_resolution, pixel_runs)
-        found = {name: pixels.measure(derivatives, name, pixel_steps, HALF_LIFE) for name in ("linear", "decaying")}
-        sizes = {"resolution": pixel_resolution, "steps": pixel_steps, "runs": pixel_runs}
-        yield {"pixels": {**sizes, "paths": found}}
+    derivatives = Derivatives(resolution, runs)
+    return {"paths": {name: measure(derivatives, name, steps) for name in ("linear", "decaying")}}

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import unrender as ur
-from benchmarks.races import Entrant, descend, median_and_range, race
+from benchmarks.races import Entrant, follow, median_and_range, race
 
 RATES = (0.0003, 0.001)
 ABLATIONS: dict[str, dict[str, Any]] = {
@@ -24,7 +24,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "not decoupled": {"decouple": False},
 }
 FORMS = {"meta": {}, "coupled": {"coupled": True, "spp": 3}}
-POINTS = 60
 DIVERGED = 0.5
 MERGE = ("methods", "at length.methods")
 QUICK = {"seconds": 0.1, "seeds": 2, "resolution": 8, "steps": 4, "long_seeds": 1, "long_resolution": 8}
@@ -40,11 +39,10 @@ def entrants() -> list[Entrant]:
 
 
 def descents(problem: ur.Problem, entrant: Entrant, rate: float, seeds: int, steps: int) -> dict[str, Any]:
-    """One form at a rate that is not tuned, so that a part left out is all that differs; its runs thinned."""
+    """One form at a rate that is not tuned, so that a part left out is all that differs."""
     runs = []
     for seed in range(seeds):
-        points = descend(problem, entrant, rate, seed, steps=steps)
-        runs.append(points[:: max(1, len(points) // POINTS)] + points[-1:])
+        runs.append(follow(problem, entrant, rate, seed, steps=steps).points[""])
         print(f"{problem.name} {entrant.name} seed {seed}: final {runs[-1][-1][2]:.4f}", flush=True)
     highest = [max(point[2] for point in run) for run in runs]
     return {

@@ -19,7 +19,6 @@ ADJOINT_SPP = 4
 RATES = (0.03, 0.06, 0.12)
 FLOOR = 0.02
 """Of the falling rate, at the end."""
-POINTS = 30
 """Of a run that are kept."""
 
 
@@ -60,7 +59,5 @@ def descents(loss: Loss, resolution: int, reference_spp: int, steps: int, seeds:
         if seed == 0:
             walls[f"wall/{name}"] = result.parameters[WALL]
 
-    found = race(problem, entrants(steps), seeds, ended=ended, steps=steps)
-    for entry in found.values():
-        entry["runs"] = [[*run[: -1 : max(1, len(run) // POINTS)], run[-1]] for run in entry["runs"]]
+    found = race(problem, entrants(steps), seeds, ended=ended, points=30, steps=steps)
     return found, {name: np.asarray(arrays.numpy(wall)) for name, wall in walls.items()}

@@ -31,7 +31,7 @@ QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3}
 
 
 def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> dict[str, Any]:
-    """Weights, variance and bias of each rule over independent runs; the last weights of one run as maps."""
+    """Weights, variance and bias of each rule over independent runs."""
     problem = ur.gallery.problem(
         "indirect-room", resolution=resolution, texture_resolution=resolution, reference_spp=16
     )
@@ -39,7 +39,6 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
     images: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
     weights: dict[str, Moments] = {rule: Moments() for rule in RULES}
     spread: dict[str, list[np.ndarray]] = {rule: [] for rule in RULES}
-    maps: dict[str, np.ndarray] = {}
     for number in range(runs):
         kept, used = one_run(problem, [problem.initial()] * steps, spp, number, ("plain", *RULES))
         for F in kept["plain"]:
@@ -48,7 +47,6 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
             images[rule].append(kept[rule].astype(np.float32))
             weights[rule].add(used[rule].mean(axis=(1, 2, 3)))
             spread[rule].append(np.percentile(used[rule], [10, 90], axis=(1, 2, 3)))
-            maps.setdefault(rule, used[rule][-1].mean(axis=-1))
         print(f"run {number + 1} of {runs}", flush=True)
     unit, brightness = float(single.variance.sum()), float(single.mean.mean())
     rules = {}
@@ -64,4 +62,4 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
             "bias": float(extra.mean()),
             "bias_error": float(extra.std(ddof=1) / np.sqrt(runs)),
         }
-    return {"rules": rules, "maps": maps}
+    return {"rules": rules}

@@ -42,10 +42,7 @@ class UpdatedBeforeUse(ur.images.RecursiveControlVariate):
         return memory
 
 
-ORDERS = {
-    "before": UpdatedBeforeUse(),
-    "after": ur.images.RecursiveControlVariate(),
-}
+ORDERS = {"before": UpdatedBeforeUse(), "after": ur.images.RecursiveControlVariate()}
 PILOT_SEEDS = (1_000_001, 1_000_002)
 QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3, "reference_spp": 128}
 
@@ -72,8 +69,8 @@ def fixed(problem: ur.Problem, path: list[Tree], weights: list[Any], spp: int, s
 
 def measure(
     problem: ur.Problem, path: list[Tree], spp: int, runs: int, steps: list[int], reference_spp: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Bias and variance of every method at the chosen steps of one path; maps of the paired |bias| at the last."""
+) -> dict[str, Any]:
+    """Return bias and variance of every method at the chosen steps of one path."""
     references: dict[int, Moments] = {}
     for step in steps:
         same = next((s for s in references if path[s] is path[step]), None)
@@ -107,8 +104,7 @@ def measure(
     for name, moments in paired.items():
         rows = [{"step": step, **paired_bias(moments[step], scales[step])} for step in steps]
         methods.setdefault(name, {})["paired"] = rows
-    maps = {name: np.abs(paired[name][end].mean).mean(axis=-1) / scales[end] for name in ORDERS}
-    return {"methods": methods}, {**maps, "reference": references[end].mean}
+    return {"methods": methods}
 
 
 def run(
@@ -129,8 +125,5 @@ def run(
     )
     chosen = sorted({*(2**k for k in range(1, 12) if 2**k < steps - 1), steps - 1})
     paths = {"still": [problem.initial()] * steps, "drift": geometric(problem, steps, half_life)}
-    found, maps = {}, {}
-    for name, path in paths.items():
-        found[name], images = measure(problem, path, spp, runs, chosen, reference_spp)
-        maps.update({f"{name}/{key}": value for key, value in images.items()})
-    return {"paths": found, "maps": maps}
+    found = {name: measure(problem, path, spp, runs, chosen, reference_spp) for name, path in paths.items()}
+    return {"paths": found}

@@ -30,39 +30,32 @@ QUICK = {"scene": ("glossy-room",), "resolution": 8, "spp": 2, "steps": 4, "runs
 
 def measure(
     problem: ur.Problem, path: list[Tree], spp: int, runs: int, every: int, reference_spp: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Weights, variances and errors of every method along the path; weight maps of the last step."""
+) -> dict[str, Any]:
+    """Return weights, variances and errors of every method along the path."""
     checked = sorted({*range(0, len(path), every), len(path) - 1})
     references = {step: converged(problem, path[step], reference_spp) for step in checked}
     # What noise the references add to a mean square error.
     floor = {step: float(np.mean(reference.error**2)) for step, reference in references.items()}
     result: dict[str, Any] = {"checked": checked, "methods": {}}
-    maps: dict[str, np.ndarray] = {}
     for name, estimator in METHODS.items():
         seen = [Moments() for _ in path]
         weights = [Moments() for _ in path]
         errors = {step: Moments() for step in checked}
-        last = Moments()
         for run in range(runs):
             for step, estimate in enumerate(follow(problem, estimator, path, spp, run)):
                 image = arrays.numpy(estimate.mean()).astype(np.float64)
                 seen[step].add(image)
-                weight = weight_of(estimate, image)
-                weights[step].add(weight.mean())
+                weights[step].add(weight_of(estimate, image).mean())
                 if step in errors:
                     errors[step].add(np.mean((image - references[step].mean) ** 2) - floor[step])
-                if step == len(path) - 1:
-                    last.add(weight)
         result["methods"][name] = {
             "weight": [w.level for w in weights],
             "variance": [float(m.variance.mean()) for m in seen],
             "error": [errors[step].level for step in checked],
             "error_error": [errors[step].level_error for step in checked],
         }
-        maps[name] = last.mean.mean(axis=-1)
         print(f"{problem.name}, {name}: done", flush=True)
-    maps["reference"] = references[checked[-1]].mean
-    return result, maps
+    return result
 
 
 def costs(problem: ur.Problem, path: list[Tree], spp: int) -> dict[str, dict[str, float]]:
@@ -118,14 +111,13 @@ def run(
     Args:
         every: steps between converged images
     """
-    entries, maps = {}, {}
+    entries = {}
     for name in scene:
         problem = ur.gallery.problem(name, resolution=resolution, texture_resolution=max(16, resolution // 2))
         estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=spp)
         path = descent(problem, estimator, RATE, steps)
-        entry, images = measure(problem, path, spp, runs, every, reference_spp)
+        entry = measure(problem, path, spp, runs, every, reference_spp)
         entry["costs"] = costs(problem, path, spp)
         entry["summary"] = summarise(entry)
         entries[name] = entry
-        maps.update({f"{name}/{key}": value for key, value in images.items()})
-    return {"rate": RATE, "scenes": entries, "maps": maps}
+    return {"rate": RATE, "scenes": entries}

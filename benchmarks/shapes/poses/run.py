@@ -7,7 +7,7 @@ as in Table 2 of HO, on a plateau. Methods:
     paths         `PathGradient` with boundary terms, plain images, Adam
     smoothed      `SmoothedDerivatives` with products, Newton-CG, as method `smoothed`
     together      path gradients with boundary terms, a memory of images and one of gradients, and samples where the gradient's variance
-                  is, MetaAdam: all ingredients of `benchmarks/together` that poses alone admit. Its fourth, perturbed renders beside path
+                  is, MetaAdam: all ingredients of the method `hybrid` that poses alone admit. Its fourth, perturbed renders beside path
                   gradients of other parameters, needs other parameters
     gauss-newton  `GaussNewton` and `AveragedNewton`, what `auto` takes for cameras
 

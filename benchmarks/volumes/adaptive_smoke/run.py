@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import Any
 
 import unrender as ur
-from benchmarks.measured_races import compete, scaled
 from benchmarks.pixel_schemes import SCHEMES, pixels
-from benchmarks.races import Entrant, over
+from benchmarks.races import Entrant, over, race, scaled
 from benchmarks.volumes.smoke_error import measure
 
 RATES = (0.003, 0.01)
@@ -36,5 +35,5 @@ def run(
     for scheme in SCHEMES:
         estimator = ur.PathGradient(pixels=pixels(scheme, count), spp=2)
         entrants.append(Entrant(scheme, scheme, estimator, adam, RATES))
-    methods = compete(problem, entrants, measure(problem), "both", seeds, seconds=seconds)
+    methods = race(problem, entrants, seeds, measure=measure(problem), by="both", seconds=seconds)
     return {"methods": methods, "over uniform": over({n: e["runs"]["both"] for n, e in methods.items()}, "uniform")}

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.measured_races import compete, scaled
-from benchmarks.races import Entrant
+from benchmarks.races import Entrant, race, scaled
 from benchmarks.volumes.fig11_smoke.scenes import FILE, problem, smoothed
 from benchmarks.volumes.smoke_error import measure
 
@@ -119,9 +118,9 @@ def run(
         fine = grid != USUAL_GRID
         if fine:
             made = smoothed(made)
-        limit = {"seconds": seconds} if by == "time" else {"steps": steps}
+        limit: dict[str, Any] = {"seconds": seconds} if by == "time" else {"steps": steps}
         chosen = [entrant for entrant in entrants(by, fine) if not only or entrant.name in only]
-        methods = compete(made, chosen, measure(made), "both", seeds, **limit)
+        methods = race(made, chosen, seeds, measure=measure(made), by="both", **limit)
         label = f"{by}, {grid}³" if fine else by
         yield {
             "budgets": {label: {**limit, "seeds": seeds, "resolution": resolution, "grid": grid, "methods": methods}}

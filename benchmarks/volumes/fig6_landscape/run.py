@@ -14,8 +14,8 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Tree
-from benchmarks.loss_landscape import LOSSES, SPP, Values, check, places, sample, statistics
 from benchmarks.paths import converged
+from benchmarks.volumes.fig6_landscape.landscape import LOSSES, SPP, Values, check, places, sample, statistics
 
 KEY = "fog.interior_medium.sigma_t.value.value"
 CHECK_FACTOR, CHECK_SPP = 1.2, 4

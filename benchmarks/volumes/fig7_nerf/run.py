@@ -15,12 +15,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
 import unrender as ur
-from benchmarks.internals import Estimator, Key, SampleRequest, Tree, arrays, dr, prepare
-from benchmarks.measured_races import compete, follow, scaled
-from benchmarks.races import TUNING_SEED, Entrant
+from benchmarks.image_errors import ImageErrors
+from benchmarks.internals import Estimator, dr
+from benchmarks.races import AT_END, TUNING_SEED, Entrant, follow, race, scaled
 from benchmarks.runner.timing import work_time
 from unrender.schedules import Constant, Cosine, Schedule
 
@@ -59,40 +57,17 @@ def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
     return found + [Entrant(name, "meta", estimator, meta, RATES["meta", kind]) for name, estimator in others.items()]
 
 
-class ImageErrors:
-    """How far images of all views are from their references, relative to the start; by a renderer of its own."""
-
-    def __init__(self, made: ur.Problem, options: dict[str, Any], spp: int = 16):
-        own = ur.gallery.problem("nerf-volume", **{**options, "reference_spp": 1})
-        self.session = prepare(own, made.initial())
-        self.references = [np.asarray(view.reference, np.float64) for view in made.views]
-        self.sensors, self.spp = [view.sensor for view in made.views], spp
-        self.start = self.errors(made.initial())
-
-    def __call__(self, parameters: Tree) -> dict[str, float]:
-        return {name: error / self.start[name] for name, error in self.errors(parameters).items()}
-
-    def errors(self, parameters: Tree) -> dict[str, float]:
-        """Root mean square over the views "seen", and over those "unseen"."""
-        squares: dict[str, list[float]] = {"seen": [], "unseen": []}
-        for number, (sensor, reference) in enumerate(zip(self.sensors, self.references, strict=True)):
-            request = SampleRequest(sensor, self.spp, Key(424_242, number).uint32(), 2)
-            a, b = arrays.numpy(self.session.image(parameters, request).images).astype(np.float64) - reference
-            squares["unseen" if number in UNSEEN else "seen"].append(float(np.mean(a * b)))
-        return {name: max(float(np.mean(x)), 0.0) ** 0.5 for name, x in squares.items()}
-
-
 def steps_in(problem: ur.Problem, entrant: Entrant, errors: ImageErrors, seconds: float, processor: bool) -> int:
     """How many steps fit into so many seconds. Compiles and records what is left after a warm-up, measured as the runs are."""
     rate = entrant.rates[0]
-    recorder = follow(problem, entrant, errors, rate, TUNING_SEED, 0.2, steps=15)
+    recorder = follow(problem, entrant, rate, TUNING_SEED, errors, 5, steps=15)
     clocks = [clock for clock, _, _ in recorder.points["seen"]]
     of_three = (clocks[-1] - clocks[-3]) / 2
     if processor:
         spent = []
         for steps in (3, 6):
             began = work_time()
-            follow(problem, entrant, errors, rate, TUNING_SEED, 2, steps=steps)
+            follow(problem, entrant, rate, TUNING_SEED, errors, AT_END, steps=steps)
             spent.append(work_time() - began)
         of_three = spent[1] - spent[0]
     return max(1, round(3 * seconds / of_three))
@@ -108,8 +83,8 @@ def measure(
 
     steps = steps_in(problem, entrant(Constant()), errors, seconds, processor)
     schedule = Constant() if kind == "constant" else Cosine(steps, FLOOR)
-    budget = {"steps": steps} if processor else {"seconds": seconds}
-    return compete(problem, [entrant(schedule)], errors, "seen", seeds, **budget)
+    budget: dict[str, Any] = {"steps": steps} if processor else {"seconds": seconds}
+    return race(problem, [entrant(schedule)], seeds, measure=errors, by="seen", **budget)
 
 
 def label(kind: str, grid: int, balls: int) -> str:
@@ -147,7 +122,11 @@ def run(
     problem = made.replaced(views=views)
     if processor:
         dr.set_thread_count(1)
-    errors, conditions = ImageErrors(made, options), {"seconds": seconds, "seeds": seeds, "resolution": resolution}
+    groups = {"seen": [n for n in range(VIEWS) if n not in UNSEEN], "unseen": list(UNSEEN)}
+    errors, conditions = (
+        ImageErrors(made, options, groups, 16),
+        {"seconds": seconds, "seeds": seeds, "resolution": resolution},
+    )
     conditions |= {"processor": processor}
     for kind in schedule:
         for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):

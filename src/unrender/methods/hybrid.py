@@ -31,8 +31,7 @@ from unrender.scene.problem import Problem
 __all__ = ["HybridMethod"]
 
 _IMAGE_MEMORY, _GRADIENT_MEMORY = 0.95, 0.8
-"""Greatest weights of the past, of images and gradients: what is remembered for longer is noise that no optimizer averages, see
-`benchmarks/together`."""
+"""Greatest weights of the past, of images and gradients: what is remembered for longer is noise that no optimizer averages."""
 
 
 @register(name="hybrid", position=7)

@@ -1,1 +1,0 @@
-"""Images of two states of a mesh."""
