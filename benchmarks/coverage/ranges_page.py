@@ -72,7 +72,9 @@ def page() -> str:
             if row.kind == kind
         }
         head = ["plugin", "key", "low", "high", "unit", "singular at"]
-        table = markdown.table(" | ".join(head), [[f"`{line[0]}`", f"`{line[1]}`", *line[2:]] for line in sorted(lines)])
+        table = markdown.table(
+            " | ".join(head), [[f"`{line[0]}`", f"`{line[1]}`", *line[2:]] for line in sorted(lines)]
+        )
         parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
     return "\n\n".join(parts) + "\n"
 

@@ -13,15 +13,6 @@ _MOST_REGRET = 1.15
 """Of the error at the end, that counts as chosen well."""
 
 
-def readme_rows(record: Record) -> list[str]:
-    """The rows of README's table: errors at the end, and how much earlier `auto` is at the loop's best."""
-    rows = []
-    for name, entry in record["problems"].items():
-        speed = f"{entry['speed']:.2g}" if entry["speed"] else "never"
-        rows.append(f"| {name} | {entry['loop'][-1]:.2f} | {entry['auto'][-1]:.2f} | {speed} |")
-    return rows
-
-
 def _tuned(entry: Record) -> str:
     """How much faster with the option that `auto` was tuned to."""
     found = entry.get("tuned")

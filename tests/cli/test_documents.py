@@ -24,7 +24,11 @@ DOCS = ROOT / "docs"
 # CONTRIBUTING.md has tests of its own, that follow its text; results.md is made of benchmarks, whose commands take hours.
 PAGES = [
     ROOT / "README.md",
-    *sorted(page for page in DOCS.rglob("*.md") if page.name not in ("results.md", "contributing.md")),
+    *sorted(
+        page
+        for page in DOCS.rglob("*.md")
+        if page.name not in ("results.md", "contributing.md") and "benchmarks" not in page.parts
+    ),
 ]
 SLOW = {
     "README.md",

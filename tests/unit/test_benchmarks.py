@@ -16,7 +16,6 @@ from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 from benchmarks.runner.machine import Load
 from benchmarks.runner.options import add_options, defaults
 from benchmarks.runner.timing import ratio, turns
-from benchmarks.suite.report import readme_rows
 
 ALL = benchmarks()
 TOY = ["--seeds", "2", "--tuning-seeds", "1", "--steps", "3", "5", "--rates", "1"]
@@ -48,13 +47,6 @@ def test_notes_are_dated_by_the_figures_they_speak_of(benchmark: Benchmark) -> N
         record["date"]
     ]
     assert record["command"].startswith(f"python -m benchmarks {benchmark.name}")
-
-
-def test_the_table_of_the_readme_is_what_the_suite_found() -> None:
-    rows = readme_rows(json.loads((ROOT / "benchmarks" / "suite" / "results.json").read_text()))
-    page = (ROOT / "README.md").read_text()
-    assert "\n".join(rows) in page
-    assert len(rows) >= 12
 
 
 def test_every_benchmark_has_a_page(tmp_path: Path) -> None:

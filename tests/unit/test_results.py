@@ -1,4 +1,4 @@
-"""docs/results.md quotes numbers that the pages of the benchmarks have."""
+"""README.md and docs/results.md quote numbers that the pages of the benchmarks have."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.results_page import section
 
 PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 NUMBER = r"(?<![\w.,])\d+(?:\.\d+)?(?![\w³])"
 
 
@@ -32,11 +33,13 @@ def wrong(page: str) -> list[str]:
 
 
 def test_every_number_is_on_its_benchmarks_page() -> None:
-    assert wrong(PAGE) == []
+    assert wrong(PAGE) + wrong(README) == []
+    assert sum(len(numbers) for _, numbers in quoted(README)) >= 4
     assert sum(len(numbers) for _, numbers in quoted(PAGE)) > 25
 
 
 def test_a_wrong_number_is_seen() -> None:
+    assert "suite: 8.43" in wrong(README.replace("| 8.42 |", "| 8.43 |"))
     assert "own_loop: 0.97" in wrong(PAGE.replace("error 0.96 (L2)", "error 0.97 (L2)"))
 
 
