@@ -117,9 +117,9 @@ def measure(benchmark: Benchmark, settings: dict[str, Any], folder: Path, keep: 
 
 def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
     """Write the figure of a record. Return whether it could be drawn: some figures need images that a record may lack."""
-    import matplotlib
+    import matplotlib.pyplot as plt
 
-    matplotlib.use("Agg")
+    plt.switch_backend("Agg")
     plot = benchmark.plot
     if plot is None:
         return False
@@ -131,6 +131,7 @@ def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
         print("no figure: this record keeps no images", file=sys.stderr)
         return False
     figure.savefig(file, dpi=100)
+    plt.close(figure)
     print(f"wrote {file}", flush=True)
     return True
 
