@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.runner import records
-from benchmarks.runner.catalogue import Benchmark, benchmarks
+from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 from benchmarks.runner.machine import Load
 from benchmarks.runner.options import add_options, defaults
 from benchmarks.runner.records import Record, scratch
+from unrender.io import confinement
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -105,24 +106,25 @@ def measure(benchmark: Benchmark, settings: dict[str, Any], folder: Path, keep: 
     if getattr(module, "RENDERS", True):
         print(f"variant {ur.use()}", flush=True)
     load = Load()
-    found = module.run(**settings)
-    for part in found if isinstance(found, Iterator) else (found,):
-        record: Record = {**records.provenance(), "load": load.after(), "settings": _plain(settings), **part}
-        old = records.read(folder) if keep else None
-        keep = True
-        if old is not None:
-            for path in getattr(module, "MERGE", ()):
-                record = records.merge(old, record, path.split("."))
-        if hasattr(module, "summarize"):
-            record |= module.summarize(record)
-        records.write(folder, record)
+    with confinement.within(Path(ROOT.anchor)):  # scenes are the project's own, or of a folder that an option names
+        found = module.run(**settings)
+        for part in found if isinstance(found, Iterator) else (found,):
+            record: Record = {**records.provenance(), "load": load.after(), "settings": _plain(settings), **part}
+            old = records.read(folder) if keep else None
+            keep = True
+            if old is not None:
+                for path in getattr(module, "MERGE", ()):
+                    record = records.merge(old, record, path.split("."))
+            if hasattr(module, "summarize"):
+                record |= module.summarize(record)
+            records.write(folder, record)
 
 
 def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
     """Write the figure of a record. Return whether it could be drawn: some figures need images that a record may lack."""
-    import matplotlib
+    import matplotlib.pyplot as plt
 
-    matplotlib.use("Agg")
+    plt.switch_backend("Agg")
     plot = benchmark.plot
     if plot is None:
         return False
@@ -134,6 +136,7 @@ def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
         print("no figure: this record keeps no images", file=sys.stderr)
         return False
     figure.savefig(file, dpi=100)
+    plt.close(figure)
     print(f"wrote {file}", flush=True)
     return True
 

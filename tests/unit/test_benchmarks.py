@@ -9,8 +9,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from benchmarks import figures, markdown
 from benchmarks.runner import cli, records, results_page
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 from benchmarks.runner.machine import Load
@@ -56,6 +58,48 @@ def test_every_benchmark_has_a_page(tmp_path: Path) -> None:
         assert page.startswith(f"# {results_page.split_notes(each)[0]}\n")
         assert f"\n{name}\n" in index
     assert len(list(tmp_path.glob("*.md"))) == len(ALL) + 1
+
+
+@pytest.mark.slow
+def test_every_figure_is_drawn_from_its_record(benchmark: Benchmark, tmp_path: Path) -> None:
+    record = records.read(benchmark.folder)
+    assert record is not None
+    assert cli.draw(benchmark, record, tmp_path / "figure.png") == (benchmark.plot is not None)
+
+
+def test_templates_take_entries_of_records() -> None:
+    entry = {
+        "name": "a",
+        "runs": [[1.0, 2.0], [3.0, 4.5]],
+        "final": {"both": [0.5, 0.25, 1.0]},
+        "ends": [3.0, 1.0, 2.0],
+    }
+    assert markdown.fill("{name}: {runs[-1][1]:g}, {final[both]!m}", entry) == "a: 4.5, 0.500 (0.250 to 1.000)"
+    assert markdown.fill("{ends!v} {spp}", entry, {"spp": 4}) == "2.000 (1.000 to 3.000) 4"
+    with pytest.raises(KeyError):
+        markdown.fill("{rate}", entry)
+
+
+def test_entries_have_the_keys_on_the_way() -> None:
+    record = {"x": {"spp": 2, "methods": {"a": {"rate": 1}, "b": {"rate": 3}}}}
+    rows = list(markdown.named(record, "task", "methods", "method"))
+    assert [(row["task"], row["method"], row["rate"], row["spp"]) for row in rows] == [
+        ("x", "a", 1, 2),
+        ("x", "b", 3, 2),
+    ]
+    assert list(markdown.named({"u": {"v": {"n": 1}}}, "one", "", "two")) == [{"n": 1, "two": "v", "one": "u"}]
+    table = markdown.records("task | rate", "{task}, {method} | {rate:g}", rows)
+    assert table.splitlines() == ["| task | rate |", "|---|---|", "| x, a | 1 |", "| x, b | 3 |"]
+
+
+def test_curves_show_the_median_and_the_range_of_runs() -> None:
+    runs = [([0.0, 1.0], [level, level]) for level in (1.0, 2.0, 4.0)]
+    figure = figures.curves({"left": {"a": runs}, "empty": {}}, "seconds")
+    (axis,) = figure.axes
+    assert np.array_equal(np.asarray(axis.lines[0].get_ydata()), [2.0, 2.0])
+    (patch,) = axis.collections
+    heights = np.asarray(patch.get_paths()[0].vertices)[:, 1]
+    assert (heights.min(), heights.max()) == (1.0, 4.0)
 
 
 def test_a_record_keeps_six_digits_and_reads_back(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
 def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
     """One of `TASKS`."""
     if task == "SUZANNE":
-        return shapes.suzanne(resolution, views, meshes)
+        return shapes.suzanne(resolution, views, vertices, meshes)
     return shapes.banana(resolution, views, vertices)
 
 
@@ -98,7 +98,7 @@ def run(
     Args:
         seconds: processor time of a run
         views: pictures from around
-        vertices: of BANANA's sphere
+        vertices: of BANANA's sphere, and the most of SUZANNE's
         meshes: folder of suzanne.ply
         strength: λ of LargeSteps, 0 for none
         only: methods to run; the others' figures stay

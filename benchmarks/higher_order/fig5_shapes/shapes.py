@@ -16,21 +16,15 @@ from benchmarks.internals import mi, parts
 
 VERTICES = 2737
 """Of BANANA, as in the paper."""
-_SUBDIVISIONS = 4
-"""Of SUZANNE's sphere: 2562 vertices."""
 _DEPTH = 2
 _GREY = 0.5
 
 
-def suzanne(resolution: int, views: int, meshes: Path) -> ur.Problem:
-    """2562 vertices. Raises `InputError` where the file is missing."""
-    return ur.gallery.problem(
-        "sphere-to-mesh",
-        subdivisions=_SUBDIVISIONS,
-        resolution=resolution,
-        views=views,
-        mesh=str(meshes / "suzanne.ply"),
-    )
+def suzanne(resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
+    """A subdivided icosahedron of at most `vertices` vertices, 2562 for the paper's. Raises `InputError` where the file is missing."""
+    subdivisions = int(np.log2((vertices - 2) / 10) / 2)
+    options = {"subdivisions": subdivisions, "resolution": resolution, "views": views}
+    return ur.gallery.problem("sphere-to-mesh", **options, mesh=str(meshes / "suzanne.ply"))
 
 
 def banana(resolution: int, views: int, vertices: int) -> ur.Problem:

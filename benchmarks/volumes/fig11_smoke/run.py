@@ -41,7 +41,7 @@ OTHERS = ("lit inside", "tutorial")
 """Volumes beside `smoke`, at equal steps."""
 USUAL_GRID = 16
 MERGE = ("budgets.*.methods",)
-QUICK = {"budget": ("steps", "lit inside"), "steps": 2, "seeds": 2, "resolution": 8, "grid": 8}
+QUICK = {"budget": ("steps", "lit inside"), "steps": 2, "seconds": 0.3, "seeds": 2, "resolution": 8, "grid": 8}
 
 
 def entrants(budget: str, fine: bool = False) -> list[Entrant]:
