@@ -206,7 +206,7 @@ class AutoMethod(Options):
         tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         coarse_steps = {
-            key: f"resolution doubled at step {' and '.join(map(str, steps))}" for key, steps in coarse.items()
+            key: f"resolution doubled by step {' and '.join(map(str, steps))}" for key, steps in coarse.items()
         }
         first = grouped({key: f"{rate:.3g}" for key, rate in (rates | problem.learning_rates).items()})
         reasons = (
