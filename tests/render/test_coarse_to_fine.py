@@ -532,6 +532,48 @@ def test_a_plan_brings_resolutions_and_a_resumed_run_is_the_uninterrupted_one(tm
     assert present.seen == [(8, 6, 1)] * 3 + [TRUTH.shape]
 
 
+class Ticks:
+    """A clock of which each look takes 20 ms."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        self.now += 0.02
+        return self.now
+
+
+def test_resolutions_follow_the_time_at_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few steps in the budget bring a plan's changes forward, many or a budget of steps do not; a resumed run knows."""
+
+    def changes(result: ur.Result) -> list[tuple[int, tuple[int, ...]]]:
+        return [(h["step"], tuple(h["resolution"][KEY])) for h in result.history if "resolution" in h]
+
+    plan = planned(problem(None), coarse_to_fine=ur.scene.CoarseToFine((10, 40), states="carry"))
+    slow = [(0, (4, 3)), (3, (8, 6)), (12, (16, 12))]
+    budgets: list[tuple[Any, Any]] = [
+        ({"seconds": 0.61}, slow),
+        ({"seconds": 0.07}, [(0, (4, 3)), (3, (16, 12))]),
+        ({"seconds": 2.5}, [(0, (4, 3)), (10, (8, 6)), (40, (16, 12))]),
+        ({"steps": 31}, [(0, (4, 3)), (10, (8, 6))]),
+    ]
+    found = []
+    for budget, wanted in budgets:
+        monkeypatch.setattr(loop, "time", Ticks())
+        found.append(ur.optimize(problem(None), plan, **budget, progress=False))
+        assert changes(found[-1]) == wanted
+    monkeypatch.setattr(loop, "time", Ticks())
+    asked = ur.optimize(problem((10, 40)), plan, seconds=0.61, progress=False)
+    assert changes(asked) == [(0, (4, 3)), (10, (8, 6))]  # the problem's own steps stay
+    for stop in (3, 8, 20):
+        monkeypatch.setattr(loop, "time", Ticks())
+        folder = tmp_path / str(stop)
+        ur.optimize(problem(None), plan, steps=stop, seconds=0.61, run_directory=folder, checkpoint_every=1)
+        resumed = ur.resume(folder, problem(None), steps=found[0].steps, seconds=0.61)
+        assert changes(resumed) == slow
+        np.testing.assert_array_equal(resumed.parameters[KEY], found[0].parameters[KEY])
+
+
 def test_resolutions_of_a_plan_that_make_no_sense_are_refused() -> None:
     def descend(steps: Any) -> None:
         ur.optimize(problem(None), planned(problem(None), coarse_to_fine=ur.scene.CoarseToFine(steps)), steps=1)

@@ -1,4 +1,4 @@
-"""`auto` recovers a few numbers with which the picture changes its form: lamps, lenses, indices of refraction, skies."""
+"""`auto` recovers a few numbers with which the picture changes its form: lamps, lenses, indices of refraction, skies, poses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.methods import method
 
 Scene = dict[str, Any]
 SIZE, STEPS = 32, 30
@@ -91,11 +92,26 @@ def sky() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     return made, {"sky.turbidity": 3.0}, {"sky.turbidity": 6.0}, 0.7  # the reference has noise
 
 
+def pose() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    place = mi.ScalarTransform4f().translate([0.3, 0.35, 0.2]).rotate([0, 1, 0], 25).scale([0.3, 0.35, 0.2])
+    walls = {"type": "diffuse", "reflectance": rgb(0.6, 0.5, 0.4)}
+    made = {
+        "type": "scene",
+        "cam": camera("perspective", [0, 2, 4]),
+        "floor": floor(walls, 0.0, 2.5),
+        "block": {"type": "cube", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": rgb(0.7, 0.3, 0.15)}},
+        "sky": {"type": "constant"},
+    }
+    truth = {"block.translation": [0.0, 0.0, 0.0], "block.rotation.y": 0.0}
+    return made, truth, {"block.translation": [0.25, 0.0, -0.2], "block.rotation.y": 0.5}, 0.05
+
+
 CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float]]] = {
     "lamps": lamps,
     "lens": lens,
     "glass": glass,
     "sky": sky,
+    "pose": pose,
 }
 
 
@@ -111,3 +127,15 @@ def test_auto_finds_the_right_values(name: str) -> None:
     assert result.status == "finished"
     errors = problem.parameter_error(result.parameters)
     assert max(errors.values()) < tolerance, errors
+
+
+def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:
+    """Derivative images explain a residual that overlaps the block, and none beside it."""
+    scene, _, _, _ = pose()
+    reference = np.array(mi.render(mi.load_dict(scene), integrator=mi.load_dict({"type": "path"}), spp=256))
+    chosen = {}
+    for name, place in {"near": 0.25, "far": -1.2}.items():
+        unknown = [ur.Parameter("block.translation.x", initial=place)]
+        plan = method("auto").plan(ur.Problem(scene, unknown, [ur.View(reference)]))
+        chosen[name] = type(plan.estimator).__name__
+    assert chosen == {"near": "GaussNewton", "far": "SmoothedDerivatives"}

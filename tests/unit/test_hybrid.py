@@ -252,7 +252,7 @@ def test_methods_choose_it_and_give_what_is_perturbed_a_rate_of_its_own() -> Non
     assert isinstance(optimizer, ur.optimizers.MetaAdam)
     assert optimizer.learning_rate == pytest.approx({"*": 0.01, "pose": 0.03})
     assert ur.optimize(asked, estimator, optimizer, steps=2).skipped == 0
-    assert isinstance(method("auto").plan(problem(keys=("pose",))).estimator, ur.SmoothedDerivatives)
+    assert isinstance(method("auto").plan(problem(keys=("pose",))).estimator, ur.GaussNewton)
     assert isinstance(method("auto").plan(problem(keys=("map",))).estimator, ur.PathGradient)
 
 

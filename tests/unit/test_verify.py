@@ -160,6 +160,19 @@ def test_a_descent_from_the_truth_that_leaves_it_is_told() -> None:
     assert result.best is result.parameters
 
 
+@pytest.mark.parametrize(("known", "told"), [({"x": 0.9, "y": -2.0}, ["y"]), ({"x": 0.9}, []), ({}, [])])
+def test_a_parameter_that_ends_further_from_its_truth_is_told(known: dict[str, float], told: list[str]) -> None:
+    """The picture shows x + y / 10 alone: equal steps of Adam reach it with a y that is further away."""
+    matrix = np.tile([[1.0, 0.1]], (SIDE * SIDE * 3, 1))
+    renderer = AnalyticRenderer({"x": np.zeros(()), "y": np.zeros(())}, matrix, noise=0.1, shape=(SIDE, SIDE))
+    reference = (matrix @ [0.9, -2.0]).reshape(SIDE, SIDE, 3)
+    truth = {key: np.array(value) for key, value in known.items()}
+    problem = ur.Problem(renderer, [ur.Parameter("x"), ur.Parameter("y")], [ur.View(reference)], truth=truth)
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.05), steps=40)
+    assert (result.status, result.verification["best"]) == ("finished", "end")
+    assert [line.split()[0] for line in result.warnings if "further from the truth" in line] == told
+
+
 def test_values_that_render_no_number_are_worse() -> None:
     class Broken(AnalyticRenderer):
         """Renders no number where the parameters are above 0.3, and more than one group is asked for."""

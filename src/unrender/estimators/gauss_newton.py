@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,12 +22,14 @@ from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["GaussNewton", "GaussNewtonState"]
+__all__ = ["GaussNewton", "GaussNewtonState", "explained"]
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Of the widths: passes of their own before the first estimate, and factors by which a width changes at most, there and later."""
 _VALUES = 1 << 20
 """Of an image, that are turned into double precision at once."""
+_TRIAL, _LEAST_EIGENVALUE = 3, 0.01
+"""Stream of the trial of a start; eigenvalues of its matrix, relative to the largest, that count as 0."""
 _IMAGE = 2
 """Stream of a view's key: of the image. Those below are of the two halves of the derivative images."""
 
@@ -72,6 +74,8 @@ class GaussNewton:
         shift: in pixels, > 0. Smaller ones are sharper, with more noise at edges.
         width: of the differences before the first estimate finds better ones, in units of the parameter, > 0.
         tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
+        largest: {key: largest width, > 0}; no limit for the others. A pose of one shape needs it: the shape covers a part of the picture,
+            so no shift of it differs from the picture by as much as a shift of the whole.
     """
 
     spp: int = 256
@@ -79,8 +83,11 @@ class GaussNewton:
     shift: float = 0.3
     width: float = 0.01
     tolerance: float = 2.0
+    largest: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
+        for key, width in self.largest.items():
+            checks.number("GaussNewton", f"largest of {key}", width, above=0.0)
         for name in ("spp", "derivative_spp"):
             checks.integer("GaussNewton", name, getattr(self, name), at_least=2)
         for name in ("shift", "width", "tolerance"):
@@ -109,7 +116,7 @@ class GaussNewton:
         """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view."""
         point = _Point(self, problem, parameters)
         if not state.widths:
-            state = GaussNewtonState(dict.fromkeys(parameters, self.width))
+            state = GaussNewtonState({key: min(self.width, self.largest.get(key, math.inf)) for key in parameters})
             for index in range(_PASSES):
                 found = point.system(state.widths, key.fold(1 + index), derivatives=False)
                 state = self._next(state, found, parameters, _FIRST_CHANGE)
@@ -130,8 +137,34 @@ class GaussNewton:
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
             wanted = self.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
-            widths[key] = float(np.clip(wanted, width / change, width * change))
+            widths[key] = float(np.clip(wanted, width / change, min(width * change, self.largest.get(key, math.inf))))
         return GaussNewtonState(widths)
+
+
+def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
+    """Return the share of the initial loss that the quadratic model at the start promises to remove.
+
+    It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not add to it: gradients and images come from
+    two independent estimates. The loss must be linear in its derivative, such as L2.
+    """
+    first = problem.initial()
+    state, found, losses, images = estimator.init(problem, first), [], [], []
+    for step in range(2):
+        estimate, state = estimator.estimate(problem, first, state, Key(seed, step, stream=_TRIAL))
+        found.append(estimate)
+        losses.append(estimate.loss)
+        images.append(estimate.info["images"])
+    mean = sum(
+        arrays.number(problem.loss_value(view, 0.5 * (image + images[1][view]))) for view, image in images[0].items()
+    )
+    loss = 2.0 * mean - 0.5 * sum(losses)
+    hessian = 0.5 * sum(arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in found)
+    one, other = (vectors.ravel(estimate.gradient) for estimate in found)
+    units = np.sqrt(np.abs(np.diag(hessian)))
+    if loss <= 0.0 or not np.isfinite(hessian).all() or not units.all():
+        return 0.0
+    inverse = np.linalg.pinv(hessian / np.outer(units, units), rcond=_LEAST_EIGENVALUE, hermitian=True)
+    return float(0.5 * (one / units) @ inverse @ (other / units) / loss)
 
 
 @dataclass

@@ -15,7 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import grouped, listed
 from unrender.estimators.base import Estimator
-from unrender.estimators.gauss_newton import GaussNewton
+from unrender.estimators.gauss_newton import GaussNewton, explained
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
@@ -25,7 +25,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import Options, method, parameterised
 from unrender.methods.first_rates import first_rates, logarithms
 from unrender.methods.plan import Plan
-from unrender.methods.smoothed import parse_widths
+from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
@@ -68,6 +68,8 @@ _NUMBER_PATHS, _FEWEST_NUMBER, _MOST_NUMBER = 1 << 16, 4, 256
 """Of such a step: so many paths in all images, as far as that is between 4 and 256 samples per pixel."""
 _DIFFERENCE_PATHS, _MOST_DIFFERENCE = 1 << 20, 8
 """Paths of all derivative images, as far as that is between 2 and 8 samples per pixel; 16 times as many are too dear."""
+_TRIAL_SPP, _EXPLAINED = 4, 0.1
+"""Of poses of shapes: samples of the derivative images at the start, and the share of the loss that they must explain."""
 _FRESH_FROM = 12
 """Of `PathGradient`: the step from which fresh gradients tell whether detail is smoothed away."""
 _CORRELATION = Sobolev().correlation
@@ -103,7 +105,8 @@ class AutoMethod(Options):
     loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
     the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
     steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside
-    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps. Grids of
+    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps, and so do poses
+    of shapes from a start that overlaps enough. Grids of
     volumes are coarse in the first steps. Every choice can be set.
     """
 
@@ -165,13 +168,9 @@ class AutoMethod(Options):
 
     def _hybrid(self, problem: Problem, perturbed: Sequence[str]) -> Plan:
         """Where some parameters are beyond path gradients, and `problem` differentiates the others alone."""
-        widths = parse_widths(self.sigma)
-        each = widths if isinstance(widths, dict) else {"*": widths}
-        rates = {key: _STEP * each.get(key, each["*"]) for key in perturbed}
-        plan = self._of_paths(problem, rates)
-        smoothing = SmoothedDerivatives(
-            widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=Exponential(*_ANNEALING), debiased=True
-        )
+        plan = self._of_paths(problem, {key: _STEP * width for key, width in widths_of(self.sigma, perturbed).items()})
+        annealing, widths = Exponential(*_ANNEALING), parse_widths(self.sigma)
+        smoothing = SmoothedDerivatives(widths, _PERTURBED, spp=_PERTURBED_SPP, schedule=annealing, debiased=True)
         estimator = HybridGradient(plan.estimator, smoothing, tuple(perturbed))
         known = problem.renderer.parameters()
         reason = f"perturbed renders of {', '.join(f'{key}: {known[key].reason}' for key in perturbed)}"
@@ -179,9 +178,8 @@ class AutoMethod(Options):
 
     def _of_paths(self, problem: Problem, given: Mapping[str, float] | None = None) -> Plan:
         """By path gradients; `given`: first rates that are known already."""
-        given = given or {}
         sampler, drawn = self._sampler(problem)
-        meshes = tuple(problem.faces)
+        meshes, given = tuple(problem.faces), given or {}
         image = self._image(problem, _shows_half(problem, sampler), bool(meshes))
         spp, smoothed = self._samples(problem, sampler), self._smoothed(problem)
         moved = logarithms(problem) if self.parameterise else {}
@@ -208,9 +206,9 @@ class AutoMethod(Options):
         tolerance = self.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
         kind = {"plain": "a fresh rendering each step", "rcv": "recursive control variates"}[image.name]
         coarse_steps = {
-            key: f"resolution doubled at step {' and '.join(map(str, steps))}" for key, steps in coarse.items()
+            key: f"resolution doubled by step {' and '.join(map(str, steps))}" for key, steps in coarse.items()
         }
-        first = grouped({key: f"{rate:.3g}" for key, rate in {**rates, **problem.learning_rates}.items()})
+        first = grouped({key: f"{rate:.3g}" for key, rate in (rates | problem.learning_rates).items()})
         reasons = (
             f"{kind}, {spp} samples per pixel: {image.reason}",
             drawn,
@@ -221,8 +219,7 @@ class AutoMethod(Options):
             f"large steps of {listed(meshes)}: one rate for all vertices, λ {_strength(problem):.2g}" if meshes else "",
             f"schedule-free Adam, first rate {first}" if len(meshes) < len(rates) else f"Adam, first rate {first}",
         )
-        remembers = image.name == "rcv" and isinstance(sampler, pixels.All)
-        fresh_from = _FRESH_FROM if smoothed and remembers else 0
+        fresh_from = _FRESH_FROM if smoothed and image.name == "rcv" and isinstance(sampler, pixels.All) else 0
         estimator = PathGradient(image.estimator, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
         if meshes:
             rate = min(rates[key] for key in meshes)
@@ -244,33 +241,43 @@ class AutoMethod(Options):
             f"Gauss-Newton steps of cameras by perturbed renders, {spp} samples per pixel of the image, {derivative_spp} of those; "
             "the mean of all steps' models"
         )
-        tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
-        return Plan(problem, GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), reasons=(reason,))
+        estimator = GaussNewton(spp, derivative_spp, tolerance=self._damping(problem))
+        return Plan(problem, estimator, AveragedNewton(), reasons=(reason,))
 
     def _of_numbers(self, problem: Problem) -> Plan | None:
-        """Gauss-Newton steps where few numbers are unknown and the picture changes its form with one of them; else None."""
+        """Gauss-Newton steps where few numbers are unknown and the picture changes its form with one of them; else None.
+
+        Of poses of shapes, where derivative images at the start explain the residual: on a plateau a smoothed loss is needed.
+        """
         known, shapes = problem.renderer.parameters(), problem.shapes()
         elements = sum(math.prod(shape) for shape in shapes.values())
-        numbers = all(
-            len(shape) <= 1 and math.prod(shape) <= _NUMBER_SIZE and known[key].perturbable and not known[key].rigid
-            for key, shape in shapes.items()
-        )
+        poses = [key for key in shapes if known[key].rigid]
+        cameras = [key for key in poses if known[key].viewpoint]
+        small = all(len(shape) <= 1 and math.prod(shape) <= _NUMBER_SIZE for shape in shapes.values())
+        numbers = small and all(known[key].perturbable and key not in cameras for key in shapes)
+        nonlinear = poses or [key for key in shapes if known[key].nonlinear]
         differences = _DIFFERENCE_PATHS // (2 * elements * problem.pixels)
-        if not numbers or elements > _FEW_NUMBERS or not any(known[key].nonlinear for key in shapes):
+        dear = elements > _FEW_NUMBERS or 4 * elements * problem.pixels > 16 * _DIFFERENCE_PATHS
+        if not numbers or dear or not nonlinear or 0 < len(poses) < len(shapes):
             return None
-        if self.image is not None or self.pixels is not None or not problem.loss.pixelwise:
-            return None
-        if problem.preconditioners or 4 * elements * problem.pixels > 16 * _DIFFERENCE_PATHS:
+        if self.image is not None or self.pixels is not None or not problem.loss.pixelwise or problem.preconditioners:
             return None
         spp = self.spp or min(max(_NUMBER_PATHS // problem.pixels, _FEWEST_NUMBER), _MOST_NUMBER)
         spp, derivative_spp = max(spp, 2), min(max(differences, 2), _MOST_DIFFERENCE)
-        nonlinear = listed([key for key in shapes if known[key].nonlinear])
+        largest = widths_of(self.sigma, poses)
+        trial = GaussNewton(spp, _TRIAL_SPP, largest=largest)
+        if poses and (not problem.loss.linear or not explained(problem, trial) > _EXPLAINED):
+            return None
         reason = (
             f"Gauss-Newton steps of {elements} number{'s' * (elements > 1)} by perturbed renders, {spp} samples per pixel of the image, "
-            f"{derivative_spp} of those: pictures change their form with {nonlinear}"
+            f"{derivative_spp} of those: pictures change their form with {listed(nonlinear)}"
         )
-        tolerance = {} if problem.loss.linear or not self.tolerance else {"tolerance": self.tolerance}
-        return Plan(problem, GaussNewton(spp, derivative_spp, **tolerance), AveragedNewton(), reasons=(reason,))
+        estimator = replace(trial, derivative_spp=derivative_spp, tolerance=self._damping(problem))
+        return Plan(problem, estimator, AveragedNewton(), reasons=(reason,))
+
+    def _damping(self, problem: Problem) -> float:
+        """κ of Gauss-Newton steps; 0 is not allowed there."""
+        return _TOLERANCE if problem.loss.linear or not self.tolerance else self.tolerance
 
     def _of_cameras_by_paths(self, problem: Problem) -> Plan:
         """Likewise, by path gradients: where they are asked for, by an image or pixels, and where there is no Gauss-Newton step."""

@@ -21,7 +21,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.adam_options import AdamOptions
 from unrender.methods.base import parse_schedule
 from unrender.methods.plan import Plan
-from unrender.methods.smoothed import parse_widths
+from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
@@ -70,9 +70,8 @@ class HybridMethod(AdamOptions):
         known, keys = problem.renderer.parameters(), list(problem.shapes())
         own = beyond_paths(known, keys) if self._keys is None else self._keys
         space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
-        widths = parse_widths(self.sigma)
-        each = widths if isinstance(widths, dict) else {"*": widths}
-        rates = {key: self.step * each.get(key, each["*"]) for key in own if key in keys}
+        widths = widths_of(self.sigma, [key for key in own if key in keys])
+        rates = {key: self.step * width for key, width in widths.items()}
         reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
         return Plan(problem, *self._parts(space, rates), reasons=(reason,) if own else ())
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 import pydantic
@@ -17,7 +17,7 @@ from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.methods.base import Options, parse_schedule
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["SmoothedMethod", "parse_widths"]
+__all__ = ["SmoothedMethod", "parse_widths", "widths_of"]
 
 _WIDTH = pydantic.TypeAdapter(PositiveFloat)
 
@@ -84,3 +84,10 @@ def parse_widths(given: float | str) -> float | dict[str, float]:
     if "*" not in widths:
         raise InputError(f"sigma: expected a number for all others too, as in 0.2, mug.rotation.y=0.6, got {given!r}")
     return widths if len(widths) > 1 else widths["*"]
+
+
+def widths_of(given: float | str, keys: Iterable[str]) -> dict[str, float]:
+    """The width of each of these parameters, see `parse_widths`."""
+    widths = parse_widths(given)
+    each = widths if isinstance(widths, dict) else {"*": widths}
+    return {key: each.get(key, each["*"]) for key in keys}

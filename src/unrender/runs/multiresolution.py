@@ -15,12 +15,28 @@ from unrender.runs.run import Run, RunState
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.upsampling import NotCarried, Upsampler, restarted, upsampled
 
-__all__ = ["is_due", "refine", "unfinished"]
+__all__ = ["hurry", "is_due", "refine", "unfinished"]
+
+_MEASURED, _COARSE_SHARE = 3, 0.4
+"""Steps whose time tells how many the budget allows; share of these after which all resolutions are the scene's own."""
+
+
+def hurry(run: Run) -> None:
+    """Bring the changes of resolution forward where the time of the first steps tells that the budget ends too early.
+
+    It happens once, and the checkpoint remembers it. Steps at which the problem itself asks for a change stay.
+    """
+    ways = run.problem.coarse_to_fine
+    if run.step != _MEASURED or not run.seconds or not ways or run.plan.problem.coarse_to_fine:
+        return
+    allowed = _COARSE_SHARE * run.seconds * run.step / max(run.clock, 1e-9)
+    last = max(way.steps[-1] for way in ways.values())
+    run.ahead = max(0, last - max(int(allowed), run.step)) if last < NEVER else 0
 
 
 def is_due(run: Run) -> bool:
     """Whether the next step is the first of another resolution."""
-    return bool(run.problem.coarse_to_fine) and trees.shapes(run.parameters) != run.problem.shapes(run.step)
+    return bool(run.problem.coarse_to_fine) and trees.shapes(run.parameters) != run.problem.shapes(run.step + run.ahead)
 
 
 def unfinished(run: Run) -> list[str]:
@@ -38,7 +54,7 @@ def unfinished(run: Run) -> list[str]:
 def refine(run: Run, state: RunState) -> float:
     """Bring parameters and states to the resolution of the next step. Returns the seconds it took."""
     started = time.perf_counter()
-    upsampler = Upsampler(run.problem, run.step, run.parameters)
+    upsampler = Upsampler(run.problem, run.step + run.ahead, run.parameters)
     asked = {way.states for key, way in run.problem.coarse_to_fine.items() if key in upsampler.shares}
     carry = {"estimator": "reset" not in asked, "optimizer": asked == {"carry"}}
     run.parameters = upsampler.tree(run.parameters)

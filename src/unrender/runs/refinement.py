@@ -24,6 +24,7 @@ class Refinement(Hook):
 
     def before_step(self, descent: Descent) -> None:
         """See `Hook.before_step`."""
+        multiresolution.hurry(descent.run)
         self._refined = multiresolution.is_due(descent.run)
         if self._refined:
             descent.log.warmup_seconds += multiresolution.refine(descent.run, descent.state) + descent.warm_up()[0]

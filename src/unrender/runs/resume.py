@@ -31,6 +31,7 @@ from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fi
 from unrender.runs.optimize import assemble_hooks, check, open_writer
 from unrender.runs.result import NON_FINITE, Result, deciding_versions
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
+from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.fingerprint import differences
 from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
@@ -39,7 +40,9 @@ __all__ = ["StoredRun", "load_run", "resume_run"]
 
 _MOST_SHOWN = 6
 _WARNINGS = "warnings"
-_SENT, _CANDIDATE = "sent", "candidate"
+_SENT, _CANDIDATE, _AHEAD = "sent", "candidate", "ahead"
+_OPTIONAL = (_CANDIDATE, _AHEAD)
+"""Parts of a snapshot that only some runs have."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,8 @@ def resume_run(
                 )
             _check_budget_left(folder, method, source.checkpoint)
             if source.checkpoint is not None:
-                initialize(run, state, max(source.checkpoint.manifest.step - 1, 0))
+                run.ahead = _ahead(source.checkpoint)
+                initialize(run, state, max(source.checkpoint.manifest.step - 1 + run.ahead, 0))
             restoring = _Restore(stored.record, source, changes, writer)
             log = _metadata(run, stored, initial, fingerprint)
             try:
@@ -268,17 +272,21 @@ def _unpack(
             "as 16-bit differences: resume it with --workers and --compress",
         )
         raise _SentOtherwise(f"{where}: the run sent its parameters {words[_SENT in saved]}")
-    if not isinstance(saved, dict) or [n for n in saved if n != _CANDIDATE] != list(fresh):
+    if not isinstance(saved, dict) or [n for n in saved if n not in _OPTIONAL] != [
+        n for n in fresh if n not in _OPTIONAL
+    ]:
         raise InputError(f"{where}: expected the state of a run, got {repr(saved)[:60]}")
     warnings = saved[_WARNINGS]
     if not isinstance(warnings, list) or not all(isinstance(line, str) for line in warnings):
         raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
-        if name not in (_WARNINGS, _SENT, _CANDIDATE):
+        if name not in (_WARNINGS, _SENT, *_OPTIONAL):
             check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
             raise InputError(f"{where}: {name}: expected a number of at least 0, got {saved[name]}")
+    if saved.get(_AHEAD, 0) != _ahead(found):
+        raise InputError(f"{where}: {_AHEAD}: expected a number of steps, got {saved[_AHEAD]!r:.60}")
     if saved["step"] != found.manifest.step:
         raise InputError(f"{where}: step: expected {found.manifest.step}, got {saved['step']}")
     expected = trees.shapes(fresh["parameters"])
@@ -292,6 +300,15 @@ def _unpack(
     if _CANDIDATE in saved:
         _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
     return saved
+
+
+def _ahead(found: Checkpoint) -> int:
+    """How far resolutions are ahead of their schedule in a checkpoint, which is not put together yet: its shapes depend on that."""
+    match found.packed.skeleton:
+        case {"dict": list(pairs)}:
+            number = next((pair[1] for pair in pairs if isinstance(pair, list) and pair[:1] == [_AHEAD]), 0)
+            return number if type(number) is int and 0 <= number < NEVER else 0
+    return 0
 
 
 def _check_candidate(found: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:

@@ -49,6 +49,7 @@ class Run:
         parameters: the current ones (the renderer's arrays), at the present resolution where the problem has them coarse at first.
         estimate: the last one.
         skipped: steps not applied so far.
+        ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `multiresolution.hurry`.
         warnings: one line each.
         stopped: why it ends after the present step; "" while it goes on.
     """
@@ -66,6 +67,7 @@ class Run:
     clock: float = 0.0
     estimate: Estimate | None = None
     skipped: int = 0
+    ahead: int = 0
     warnings: list[str] = field(default_factory=list)
     stopped: str = ""
 
@@ -142,7 +144,7 @@ class RunState:
 def snapshot(run: Run, state: RunState) -> dict[str, Any]:
     """All that decides what the next steps do: what a checkpoint holds, for `state.pack`."""
     noise, executor = state.noise, run.problem.executor
-    sent = executor.snapshot()
+    parts = {"sent": executor.snapshot(), "candidate": _packed(state.candidate), "ahead": run.ahead or None}
     return {
         "parameters": run.parameters,
         "step": run.step,
@@ -156,7 +158,7 @@ def snapshot(run: Run, state: RunState) -> dict[str, Any]:
         "samples": state.samples,
         "skipped_in_a_row": state.skipped_in_a_row,
         "next_error": state.next_error,
-    } | {name: part for name, part in (("sent", sent), ("candidate", _packed(state.candidate))) if part is not None}
+    } | {name: part for name, part in parts.items() if part is not None}
 
 
 def _packed(candidate: Candidate | None) -> dict[str, Any] | None:
@@ -170,7 +172,7 @@ SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "n
 def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
     """Bring a run to where `snapshot` was taken. The snapshot has been checked to be one of this run's."""
     run.parameters, run.step, run.clock = saved["parameters"], saved["step"], saved["clock"]
-    run.skipped, run.warnings = saved["skipped"], list(saved["warnings"])
+    run.skipped, run.warnings, run.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
     state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
     state.noise = GradientNoise(**saved["noise"])
     state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
