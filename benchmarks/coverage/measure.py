@@ -105,6 +105,12 @@ def _gradient(renderer: Any, key: str, info: Any) -> dict[str, Any]:
     along, weights = _direction(key, at, _scale(at, info), info.welded), _weights(renderer.resolutions()[0])
     given = renderer.array(weights)
     width = 2.0 if info.rigid or info.welded or info.viewpoint or key.endswith("control_points") else 0.2
+    reach = 0.5 * width * np.abs(along)  # differences must not leave the range
+    if info.lowest is not None and (at - reach < info.lowest).any():
+        at = np.maximum(at, info.lowest + reach)
+    if info.highest is not None and (at + reach > info.highest).any():
+        at = np.minimum(at, info.highest - reach)
+    value = renderer.array(at.astype(np.float32))
     adjoints, differences = [], []
     found = None
     for number in range(_MOST_RUNS):
