@@ -49,6 +49,14 @@ def bitmap(seed: int = 2, channels: int = 3, low: float = 0.2, high: float = 0.8
     return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
 
 
+def normals(seed: int = 4) -> Description:
+    """Directions up to 0.3 beside the surface's own, of length 1."""
+    beside = np.random.default_rng(seed).uniform(-0.3, 0.3, (4, 4, 2))
+    upwards = np.sqrt(1 - (beside**2).sum(-1, keepdims=True))
+    values = 0.5 + 0.5 * np.concatenate([beside, upwards], axis=-1)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values.astype(np.float32)), "raw": True}
+
+
 def grid(channels: int = 1, low: float = 0.2, high: float = 0.8) -> Description:
     values = np.random.default_rng(3).uniform(low, high, (3, 3, 3, channels)).astype(np.float32)
     return {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True, "to_world": unit_cube()}
@@ -204,6 +212,10 @@ def distances(folder: Path) -> Any:
 
 def centred(folder: Path) -> Any:
     return unit_cube()
+
+
+def halved(folder: Path) -> Any:
+    return mi.ScalarTransform4f().scale(0.5)
 
 
 def attribute(folder: Path) -> Description:

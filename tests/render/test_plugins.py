@@ -128,15 +128,16 @@ def test_phase_functions_load_without_a_word(capfd: pytest.CaptureFixture[str]) 
     assert capfd.readouterr().err == ""
 
 
-def test_a_weight_and_a_light_without_a_derivative_are_refused_by_name() -> None:
+def test_a_weight_without_a_derivative_is_refused_by_name() -> None:
     weight = "ball.interior_medium.phase_function.weight.value.value"
     assert "blendphase passes no derivative to its weight" in refusal(built("blendphase"), weight, derivatives=False)
-    key = "lamp.emitter.radiance.value"
-    renderer = MitsubaRenderer(built("directionalarea"), 3)
-    session, values = renderer.prepare([key], None), renderer.values([key])
-    paths = session.image(values, SampleRequest(0, 4, 1)).paths
-    with pytest.raises(ur.InputError, match=rf"parameter {key}: the picture depends on it through nothing"):
-        session.adjoint(values, paths, renderer.array(np.ones((1, 16, 16, 3), np.float32)))
+
+
+def test_an_emitter_that_no_path_finds_is_refused_and_leaves_other_scenes_alone() -> None:
+    """A living one would fail the calls of every other scene's emitters."""
+    assert "cannot find the light of a directionalarea emitter" in refusal(built("directionalarea"))
+    other = MitsubaRenderer(built("projector"), 3)
+    assert np.isfinite(np.array(other.prepare([], None, False).image({}, SampleRequest(0, 4, 1)).images)).all()
 
 
 def test_a_mesh_of_ellipsoids_moves_in_perturbed_renders_only() -> None:
@@ -148,6 +149,21 @@ def test_what_roughplastic_tabulates_has_no_path_gradient(leaf: str) -> None:
     """Finite differences: path gradients were .2 (alpha) and -15 (eta) times what they should be."""
     line = refusal(built("roughplastic"), f"ball.bsdf.{leaf}", derivatives=False)
     assert "tabulates its transmittance from it without a derivative" in line
+
+
+def test_the_sun_s_disk_has_no_path_gradient() -> None:
+    """Finite differences: path gradients were .80 +- .03 times what they should be."""
+    line = refusal(built("sunsky, direction"), "light.sun_direction", derivatives=False)
+    assert "it moves the sun's disk, whose border path gradients do not follow" in line
+
+
+def test_normals_without_a_direction_are_refused_with_what_to_give() -> None:
+    """Path gradients were 2e5 at 0.5, which stands for a vector of length 0."""
+    key, views = "ball.bsdf.normalmap.data", [ur.View(np.zeros((16, 16, 3)))]
+    with pytest.raises(ur.InputError, match=r"initial: 16 of 16 normals have no direction.*such as \[0.5, 0.5, 1\]"):
+        ur.Problem(built("normalmap"), [ur.Parameter(key, initial=0.5)], views)
+    ur.Problem(built("normalmap"), [ur.Parameter(key)], views)
+    ur.Problem(built("normalmap"), [ur.Parameter(key, initial=[0.5, 0.5, 1.0])], views)
 
 
 def test_texture_coordinates_that_a_mesh_does_not_have_are_refused() -> None:

@@ -70,10 +70,6 @@ EMITTERS: dict[str, Callable[[], dict[str, dict[str, Any]]]] = {
     "cylinder": lambda: {"lamp": lamp("cylinder")},
     "cube": lambda: {"lamp": lamp("cube"), "sky": sky()},
     "textured rectangle": lambda: {"lamp": lamp("rectangle", zoo.texture(3, low=0, high=20))},
-    "directional area": lambda: {
-        "lamp": {**lamp("rectangle"), "emitter": {"type": "directionalarea", "radiance": rgb(5, 5, 5)}},
-        "sky": sky(),
-    },
     "point": lambda: {"lamp": {"type": "point", "position": [0.3, 0.5, 2.5], "intensity": rgb(9, 8, 7)}},
     "spot": lambda: {"lamp": {"type": "spot", "to_world": to().look_at([1, -1, 3], [0, 0, 0], [0, 1, 0]), "intensity": rgb(30, 30, 30)}},
     "directional": lambda: {"lamp": {"type": "directional", "direction": [0.3, 0.2, -1], "irradiance": rgb(2, 2, 2)}},

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from unrender.gallery import meshes
+from unrender.rendering.mitsuba.integrators.boundary_sampling import EmitterPoints
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -94,6 +96,18 @@ def sky() -> dict[str, Any]:
     return found | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(light)}}
 
 
+def lamps() -> dict[str, Any]:
+    """The block out of doors between two square lamps, which have one normal each, under a sky and a sun."""
+    place = mi.ScalarTransform4f().look_at([0.7, 0.9, -0.5], [0.1, -0.4, 0.1], [0, 1, 0]).scale(0.2)
+    other = mi.ScalarTransform4f().look_at([-0.6, 0.9, -0.4], [0.1, -0.4, 0.1], [0, 1, 0]).scale(0.15)
+    shine = {"type": "area", "radiance": {"type": "rgb", "value": 60.0}}
+    return sky() | {
+        "lamp": {"type": "rectangle", "to_world": place, "emitter": shine},
+        "other-lamp": {"type": "rectangle", "to_world": other, "emitter": shine},
+        "sun": {"type": "directional", "direction": [-0.5, -1, -0.3], "irradiance": {"type": "rgb", "value": 1.0}},
+    }
+
+
 def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool = True) -> np.ndarray:
     """(RUNS, n)."""
     renderer = MitsubaRenderer(description, depth, [key])
@@ -140,6 +154,26 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
     assert np.abs(scores(interior + 0.6 * (found - interior), expected)).max() > LIMIT
 
 
+def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None:
+    """Of two square lamps above a point, one of them in the distance, and a sky; their points are drawn side by side."""
+    half, heights, each = 0.3, (1.0, 2.5), 4096
+
+    def lamp(height: float) -> dict[str, Any]:
+        place = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], 90).scale(half)
+        return {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+
+    lamps = {f"lamp_{n}": lamp(height) for n, height in enumerate(heights)}
+    scene: Any = mi.load_dict({"type": "scene", **lamps, "sky": {"type": "constant"}}, optimize=False)
+    points = EmitterPoints(scene, 3, 3 * each, mi.Float(0))
+    which = dr.arange(mi.UInt32, points.count)
+    direction, distance = points.seen_from(mi.Point3f(0), which)
+    measures = np.array(points.measure(mi.Point3f(0), which, distance, direction)).reshape(3, -1).astype(float)
+    sums, errors = measures.sum(axis=1), measures.std(axis=1) * np.sqrt(measures.shape[1])
+    squares = [4 * np.arcsin(half**2 / (half**2 + height**2)) for height in heights]  # a pyramid with a square base
+    order = np.argsort(sums)
+    np.testing.assert_array_less(np.abs(sums[order] - np.sort([*squares, 4 * np.pi])), 4 * errors[order] + 1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("description", "key", "depth"),
@@ -156,6 +190,8 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
         (beside(type="conductor"), "moving.translation.y", 3),
         (sky, "moving.translation.x", 2),
         (sky, "moving.scale", 3),
+        (lamps, "moving.translation.x", 2),
+        (lamps, "moving.rotation.y", 3),
     ],
 )
 def test_poses_at_several_depths(description: Any, key: str, depth: int) -> None:

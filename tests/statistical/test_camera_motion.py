@@ -206,6 +206,12 @@ def test_the_stock_loop_names_cameras_that_it_cannot_move() -> None:
         ur.optimize(problem, "stock", steps=1)
 
 
+def test_pixels_by_the_variance_of_camera_gradients_are_refused_with_what_to_do() -> None:
+    problem = ur.gallery.problem("camera", resolution=8, reference_spp=16)
+    with pytest.raises(ur.InputError, match=r"adaptive pixels do not know .*: --method plain, or .*scheme = uniform"):
+        ur.optimize(problem, "adaptive", steps=1, progress=False)
+
+
 @pytest.mark.slow
 def test_auto_finds_cameras() -> None:
     """Three of 2 degrees and 2 % off, from pictures of 24² pixels. A fifth of what is asked of larger ones."""

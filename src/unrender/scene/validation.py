@@ -49,6 +49,8 @@ __all__ = [
 
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
+_SHORTEST_NORMAL = 0.1
+"""Length of a vector of a normal map below which its direction is arbitrary; it should be 1."""
 
 
 @runtime_checkable
@@ -159,6 +161,7 @@ def check_parameter(
 
     with checking("initial"):
         start, notice = _initial(parameter, info, renderer)
+        _check_normals(start, info)
     with checking("bounds"):
         bounds, narrowed = check_bounds(parameter.bounds, info, start)
     rate = parameter.learning_rate
@@ -286,6 +289,18 @@ def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> t
     if not np.isfinite(start).all():
         raise InputError("the scene's own value is not finite; give another")
     return start, ""
+
+
+def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
+    """Raise `InputError` for a normal map with vectors too short to have a direction: derivatives grow as one over the length."""
+    if info.role != "normal":
+        return
+    short = np.linalg.norm(2.0 * start.reshape(-1, 3) - 1.0, axis=-1) < _SHORTEST_NORMAL
+    if short.any():
+        raise InputError(
+            f"{int(short.sum())} of {len(short)} normals have no direction: a value x stands for 2 x - 1, which is near zero; "
+            "expected vectors of length 1, such as [0.5, 0.5, 1] for a flat surface"
+        )
 
 
 def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:

@@ -16,7 +16,7 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
-__all__ = ["CameraTerm", "lens_parameters", "moved_sensor", "sensor_obstacle", "translation_obstacle"]
+__all__ = ["CameraTerm", "lens_parameters", "moved_sensor", "no_tangents", "sensor_obstacle", "translation_obstacle"]
 
 _STREAM = 4
 """Of the key of a request: numbers that neither its paths nor boundaries have."""
@@ -62,6 +62,14 @@ def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:
                 why = "it changes what the sensor sees"
                 found[key] = ParameterInfo((), True, False, why, limits.low, limits.high, viewpoint=True, sensor=index)
     return found
+
+
+def no_tangents(keys: Iterable[str]) -> str:
+    """Return why pixels cannot be drawn by the variance of these derivatives, all by parameters of sensors."""
+    return (
+        f"parameter {', '.join(sorted(keys))}: adaptive pixels do not know how derivatives by a sensor vary: "
+        "--method plain, or draw pixels uniformly (scheme = uniform)"
+    )
 
 
 class CameraTerm:

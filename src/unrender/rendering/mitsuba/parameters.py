@@ -126,6 +126,9 @@ def _traits_of(chain: list[Any], leaf: str) -> ParameterTraits:
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
             return ParameterTraits(True, "it moves an emitter")
+        if leaf == "sun_direction":
+            why = "it moves the sun's disk, whose border path gradients do not follow"
+            return ParameterTraits(False, why, replayable=False)
         return ParameterTraits(False, "")
     if any(isinstance(n, mi.Medium) for n in chain):
         if any(

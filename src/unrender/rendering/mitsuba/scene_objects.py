@@ -39,6 +39,11 @@ def refusal(scene: Any, objects: Iterable[Any]) -> str:
             "the integrator volprim_rf_basic renders ellipsoids as a radiance field, and paths see surfaces there; "
             "give the field as a medium of type emissive"
         )
+    if "DirectionalArea" in names:
+        return (
+            "paths from the camera cannot find the light of a directionalarea emitter, so the picture would lack it; "
+            "give a directional, spot or projector emitter in its place"
+        )
     return ""
 
 

@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
-from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor
+from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, no_tangents
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
@@ -272,10 +272,10 @@ class MitsubaSession:
     def tangent_moment(
         self, parameters: Tree, paths: Paths, tangents: Tree, combined: tuple[float, ...] | None = None
     ) -> mi.TensorXf:
-        """Return the squared derivative of each path along the tangents (path replay in forward mode), and of moving edges.
-
-        `combined` holds weights of the channels in a sum to square; None for each channel. See `RenderSession.tangent_moment`."""
+        """Return the squared derivative of each path, and of moving edges, along the tangents. See `RenderSession.tangent_moment`."""
         self._check_keys(parameters)
+        if not self._replays:
+            raise InputError(no_tangents(parameters))
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
             paths = self.image(parameters, paths.request).paths

@@ -152,15 +152,21 @@ def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any
     shape = emitter.get_shape()
     zero = dr.zeros(mi.Float, count)
     pointer = dr.repeat(mi.EmitterPtr(emitter), count)
+
+    def spread(values: Any) -> list[Any]:
+        """Components of full width. Points may share one value, such as the normal of a flat shape."""
+        return [component + zero for component in values]
+
     if shape is not None:
         ps = shape.sample_position(0.0, sample)
+        direction, density, kind = mi.Vector3f(zero), ps.pdf + zero, mi.UInt32(zero) + _AREA
         return (
-            mi.Point3f(ps.p),
-            mi.Normal3f(ps.n),
-            mi.Vector3f(zero),
-            ps.uv,
-            ps.pdf + zero,
-            mi.UInt32(zero) + _AREA,
+            mi.Point3f(*spread(ps.p)),
+            mi.Normal3f(*spread(ps.n)),
+            direction,
+            mi.Point2f(*spread(ps.uv)),
+            density,
+            kind,
             pointer,
         )
     ds, _ = emitter.sample_direction(it, sample)
@@ -169,8 +175,8 @@ def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any
     )
     density = dr.select(ds.delta, 1, ds.pdf) + zero
     kind = mi.UInt32(zero) + (_DISTANT if distant else _POINT)
-    wide = mi.Point3f(zero)
-    return wide + ds.p, mi.Normal3f(zero), mi.Vector3f(zero) + ds.d, mi.Point2f(zero) + ds.uv, density, kind, pointer
+    direction, uv = mi.Vector3f(*spread(ds.d)), mi.Point2f(*spread(ds.uv))
+    return mi.Point3f(*spread(ds.p)), mi.Normal3f(zero), direction, uv, density, kind, pointer
 
 
 def lane_sampler(seed: int, period: int, lanes: int) -> RepeatingSampler:
