@@ -105,7 +105,7 @@ def descend(problem: ur.Problem, method: str, seed: int) -> Trajectory:
     from unrender.methods import method as named
 
     choice, trajectory = named(method).plan(problem, METHODS[method]), Trajectory()
-    ur.optimize(problem, choice, STEPS, seed=seed, callbacks=[trajectory], progress=False)
+    ur.optimize(problem, choice, steps=STEPS, seed=seed, callbacks=[trajectory], progress=False)
     return trajectory
 
 
