@@ -151,6 +151,21 @@ def test_what_roughplastic_tabulates_has_no_path_gradient(leaf: str) -> None:
     assert "tabulates its transmittance from it without a derivative" in line
 
 
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("roughdielectric", "ball.bsdf.eta"),
+        ("roughdielectric", "ball.bsdf.alpha.value"),
+        ("roughdielectric, anisotropic", "ball.bsdf.alpha_v.value"),
+        ("sggx", "ball.interior_medium.phase_function.S.data"),
+    ],
+)
+def test_path_gradients_that_differences_refute_are_refused(name: str, key: str) -> None:
+    """Ratios: 1.06 for glass in air, -3 to .3 for air in glass, 4 to 11 for sggx. Perturbed renders stay."""
+    assert "disagree with finite differences" in refusal(built(name), key, derivatives=False)
+    MitsubaRenderer(built(name), 3).prepare([key], None, False)
+
+
 def test_the_sun_s_disk_has_no_path_gradient() -> None:
     """Finite differences: path gradients were .80 +- .03 times what they should be."""
     line = refusal(built("sunsky, direction"), "light.sun_direction", derivatives=False)

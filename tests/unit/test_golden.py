@@ -41,3 +41,9 @@ def test_optimizers_take_the_recorded_steps(name: str) -> None:
     found = summary(lambda seed: cases.optimize(name, seed), seeds=1)
     assert not compare(KNOWN[f"optimizer/{name}"], found).startswith("differs")
     assert found["losses"] == pytest.approx(KNOWN[f"optimizer/{name}"]["losses"], rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["plain", "rcv"])
+def test_a_descent_takes_the_recorded_steps(method: str) -> None:
+    found = summary(lambda seed: cases.descend(cases.PROBLEMS["linear"](), method, seed), seeds=1)
+    assert not compare(KNOWN[f"linear/{method}"], found).startswith("differs")

@@ -33,6 +33,7 @@ _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
+_ROUGH_SLOTS = {"alpha", "alpha_u", "alpha_v", "eta"}
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
 _DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
@@ -88,12 +89,12 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
     if isinstance(node, mi.Mesh) and _is_attribute(leaf):
         readers = graph.attribute_readers(node, leaf)
         chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
-        return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in chains], ParameterTraits(False, ""))
+        return functools.reduce(_joined, [_traits_of(chain, key) for chain in chains], ParameterTraits(False, ""))
     chains = list(graph.chains(node))
     used = [
         chain for chain in chains if len(chain) > 2
     ] or chains  # a texture that the scene holds, too, has no effect there
-    return functools.reduce(_joined, [_traits_of(chain, leaf) for chain in used])
+    return functools.reduce(_joined, [_traits_of(chain, key) for chain in used])
 
 
 def _is_attribute(leaf: str) -> bool:
@@ -115,12 +116,16 @@ def _joined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:
     )
 
 
-def _traits_of(chain: list[Any], leaf: str) -> ParameterTraits:
+def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
     """From one chain of objects, the one that holds the parameter first."""
+    leaf = key.rsplit(".", 1)[-1]
     bsdfs = [n for n in chain if isinstance(n, mi.BSDF)]
     if bsdfs:
         if bsdfs[0].class_name() == "RoughPlastic" and leaf in ("alpha", "eta"):
             why = "Mitsuba's roughplastic tabulates its transmittance from it without a derivative"
+            return ParameterTraits(False, why, replayable=False)
+        if bsdfs[0].class_name() == "RoughDielectric" and _ROUGH_SLOTS & set(key.split(".")):
+            why = "path gradients of a roughdielectric's roughness and index disagree with finite differences"
             return ParameterTraits(False, why, replayable=False)
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
@@ -136,6 +141,9 @@ def _traits_of(chain: list[Any], leaf: str) -> ParameterTraits:
             for held, n in pairwise(chain)
         ):
             why = "Mitsuba's blendphase passes no derivative to its weight"
+            return ParameterTraits(False, why, replayable=False, phase=True)
+        if any(n.class_name() == "SGGXPhaseFunction" for n in chain):
+            why = "path gradients of Mitsuba's sggx disagree with finite differences"
             return ParameterTraits(False, why, replayable=False, phase=True)
         volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
         return ParameterTraits(False, "", medium=volume, phase=phase)
