@@ -151,7 +151,7 @@ def test_a_run_that_is_given_up_is_no_success(unrender, monkeypatch: pytest.Monk
     assert "to try once more from its last step: unrender resume run" in answer.out
     assert json.loads(Path("run/run.json").read_text())["status"] == "failed"
     assert "failed, given up: gradients were not finite" in Path("run/report.html").read_text()
-    methods = ["--methods", "plain,rcv", "--seconds", 0.05, "--final-spp", 1]
+    methods = ["--methods", "plain,rcv", "--seconds", 0.5, "--final-spp", 1]
     answer = unrender("compare", "exponential", *methods, "--out", "both", "--variant", mitsuba_variant)
     assert answer.status == 4
     assert "failed after" in Path("both/compare.html").read_text()
