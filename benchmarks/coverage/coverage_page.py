@@ -22,8 +22,10 @@ Written by `python -m benchmarks coverage` from a scene of 16 x 16 pixels for ea
 {descent}
 *refused* is followed by the line that a user reads. *perturbed* means that there is no path gradient, so `--method smoothed` recovers the
 parameter from perturbed renders. *weak* means that noise would hide a difference of 3 % of a picture, or of the whole gradient."""
-_DESCENT = "| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away; "
+_DESCENT = (
+    "| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away; "
     "*unseen* where the pictures hardly differ |\n"
+)
 
 
 def page(record: dict[str, Any]) -> str:
