@@ -19,20 +19,34 @@ Written by `python -m benchmarks coverage` from a scene of 16 x 16 pixels for ea
 |---|---|
 | image | mean of our picture over Mitsuba's, and the largest difference of 2 x 2 pixels in standard errors |
 | gradient | path gradient over finite difference along a random direction, with its standard error |
-| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away |
-
+{descent}
 *refused* is followed by the line that a user reads. *perturbed* means that there is no path gradient, so `--method smoothed` recovers the
-parameter from perturbed renders. *weak* means that the comparison is too noisy to see a difference of 3 %. *unseen* means that the
-pictures hardly depend on the parameter."""
+parameter from perturbed renders. *weak* means that noise would hide a difference of 3 % of a picture, or of the whole gradient."""
+_DESCENT = (
+    "| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away; "
+    "*unseen* where the pictures hardly differ |\n"
+)
 
 
 def page(record: dict[str, Any]) -> str:
-    """Return the text of the page."""
-    parts = [_HEAD]
+    """Return the text of the page. The last column is left out where no descent was measured."""
+    entries = [entry for found in record.values() for entry in found.get("parameters", {}).values()]
+    columns = 5 if any("descent" in entry for entry in entries) else 4
+    parts = [_HEAD.format(descent=_DESCENT if columns == 5 else "")]
     kinds = sorted({plugin.kind for plugin in PLUGINS.values()}, key=str.lower)
     for kind in kinds:
+<<<<<<< HEAD
         rows = [row for name, plugin in PLUGINS.items() if plugin.kind == kind for row in _rows(name, record.get(name))]
         table = markdown.table("plugin | parameter | image | gradient | descent", rows)
+=======
+        rows = [
+            row[:columns]
+            for name, plugin in PLUGINS.items()
+            if plugin.kind == kind
+            for row in _rows(name, record.get(name))
+        ]
+        table = markdown.table(["plugin", "parameter", "image", "gradient", "descent"][:columns], rows)
+>>>>>>> d2
         parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
     return "\n\n".join(parts) + "\n"
 

@@ -33,7 +33,11 @@ _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
-_ROUGH_SLOTS = {"alpha", "alpha_u", "alpha_v", "eta"}
+_REFUTED = {
+    "RoughDielectric": {"alpha", "alpha_u", "alpha_v", "eta"},
+    "PrincipledThin": {"roughness", "anisotropic"},
+}
+"""{class of a BSDF: slots whose path gradients disagree with finite differences}."""
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
 _DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
@@ -124,8 +128,8 @@ def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
         if bsdfs[0].class_name() == "RoughPlastic" and leaf in ("alpha", "eta"):
             why = "Mitsuba's roughplastic tabulates its transmittance from it without a derivative"
             return ParameterTraits(False, why, replayable=False)
-        if bsdfs[0].class_name() == "RoughDielectric" and _ROUGH_SLOTS & set(key.split(".")):
-            why = "path gradients of a roughdielectric's roughness and index disagree with finite differences"
+        if _REFUTED.get(bsdfs[0].class_name(), set()) & set(key.split(".")):
+            why = f"path gradients of it disagree with finite differences ({bsdfs[0].class_name()})"
             return ParameterTraits(False, why, replayable=False)
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
@@ -143,7 +147,7 @@ def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
             why = "Mitsuba's blendphase passes no derivative to its weight"
             return ParameterTraits(False, why, replayable=False, phase=True)
         if any(n.class_name() == "SGGXPhaseFunction" for n in chain):
-            why = "path gradients of Mitsuba's sggx disagree with finite differences"
+            why = "path gradients of it disagree with finite differences (SGGXPhaseFunction)"
             return ParameterTraits(False, why, replayable=False, phase=True)
         volume, phase = (any(isinstance(n, kind) for n in chain) for kind in (mi.Volume, mi.PhaseFunction))
         return ParameterTraits(False, "", medium=volume, phase=phase)
