@@ -35,18 +35,13 @@ def page(record: dict[str, Any]) -> str:
     parts = [_HEAD.format(descent=_DESCENT if columns == 5 else "")]
     kinds = sorted({plugin.kind for plugin in PLUGINS.values()}, key=str.lower)
     for kind in kinds:
-<<<<<<< HEAD
-        rows = [row for name, plugin in PLUGINS.items() if plugin.kind == kind for row in _rows(name, record.get(name))]
-        table = markdown.table("plugin | parameter | image | gradient | descent", rows)
-=======
         rows = [
             row[:columns]
             for name, plugin in PLUGINS.items()
             if plugin.kind == kind
             for row in _rows(name, record.get(name))
         ]
-        table = markdown.table(["plugin", "parameter", "image", "gradient", "descent"][:columns], rows)
->>>>>>> d2
+        table = markdown.table(" | ".join(["plugin", "parameter", "image", "gradient", "descent"][:columns]), rows)
         parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
     return "\n\n".join(parts) + "\n"
 
