@@ -20,7 +20,7 @@ from unrender.app.cli import signals as handled
 from unrender.core.errors import InputError
 from unrender.runs.folder import reader
 
-COUNT = int(os.environ.get("UNRENDER_SIGNALS", "20"))
+COUNT = int(os.environ.get("UNRENDER_SIGNALS", "10"))
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 RUN = [
     "run",
@@ -28,7 +28,7 @@ RUN = [
     "--method",
     "plain",
     "--steps",
-    "400",
+    "100",
     "--checkpoint-every",
     "20",
     "--final-spp",
@@ -133,7 +133,8 @@ def test_an_interrupt_waits_for_the_end_of_an_import(tmp_path: Path) -> None:
 
 
 def test_a_program_that_imports_the_package_keeps_its_handlers() -> None:
-    code = "import signal, unrender; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import unrender; "
+    code += "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
     assert handled.WORDS[130] == "interrupted"

@@ -24,7 +24,7 @@ def camera(kind: str, origin: list[float], **options: Any) -> Scene:
 
 
 def rgb(*values: float) -> Scene:
-    return {"type": "rgb", "value": list(values) if len(values) > 1 else values[0]}
+    return {"type": "rgb", "value": list(values) if len(values) > 1 else float(*values)}
 
 
 def checkers(scale: float) -> Scene:

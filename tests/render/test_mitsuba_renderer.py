@@ -14,6 +14,7 @@ import unrender as ur
 from kernels import recorded
 from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
 from unrender.rendering.renderer import SampleRequest
 
@@ -244,6 +245,7 @@ def test_replayed_kernels_follow_every_value_that_numpy_hands_over(channels: int
 
     renderer = MitsubaRenderer(description, 3)
     session = renderer.prepare([key], None)
+    assert isinstance(session, MitsubaSession)
     values = [rng.uniform(0.1, 0.9, (8, 8, channels)).astype(np.float32) for _ in range(12)]
     replayed = [np.array(session.image({key: renderer.array(v)}, SampleRequest(0, 4, 5)).images) for v in values]
     for value, image in zip(values, replayed, strict=True):

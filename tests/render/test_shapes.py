@@ -21,6 +21,7 @@ from unrender.methods.base import method
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import SampleRequest
 
@@ -163,6 +164,7 @@ def test_moments_of_pixels_have_the_boundary_term() -> None:
     samples. Its square is what a moment has more than path replay tells."""
     renderer = MitsubaRenderer(scene, 2)
     session, values = renderer.prepare([KEY], None), renderer.values([KEY])
+    assert isinstance(session, MitsubaSession)
     random = np.random.default_rng(0)
     weights, tangent = random.normal(size=(SIZE, SIZE, 3)), random.normal(size=np.array(values[KEY]).shape)
     pixels = random.permutation(SIZE * SIZE)[:100]

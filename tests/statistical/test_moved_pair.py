@@ -17,6 +17,7 @@ from unrender.gallery import meshes
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids, bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import SampleRequest, Space
 
 VERTICES, SCALE, DEPTH = "ball.vertex_positions", "ball.scale", 4
@@ -108,6 +109,7 @@ def crowded(tracer: MovedPair, sky: bool = False) -> tuple[Any, Any, Any]:
 
     of = MitsubaRenderer(scene, DEPTH, [VERTICES])
     session, before = of.prepare([VERTICES], "path"), of.values([VERTICES])
+    assert isinstance(session, MitsubaSession)
     session._moved_kernel = tracer
     return session, {VERTICES: of.array(np.array(before[VERTICES]) + 0.15)}, before
 

@@ -61,7 +61,7 @@ def test_samples_that_are_not_finite_are_dropped_counted_and_reported(caplog: py
     assert np.isfinite(images).all()
     lost = ~np.isfinite(np.array([found.paths.radiance[channel].numpy() for channel in range(3)])).all(axis=0)
     assert lost.sum() == dropped
-    untouched = ~lost.reshape(SIZE, SIZE, 2, -1).any(axis=-1).transpose(2, 0, 1)
+    untouched = ~lost.reshape(SIZE, SIZE, 2, -1).any(axis=-1).transpose((2, 0, 1))
     assert untouched.any()
     np.testing.assert_allclose(images[untouched], expected[untouched], rtol=1e-5)
     for current, previous in ((good, bad), (bad, good)):
