@@ -122,14 +122,16 @@ def test_outside_of_runs_both_interrupt(unrender, monkeypatch: pytest.MonkeyPatc
         assert (answer.status, answer.error) == (status, f"unrender: {words}\n")
 
 
-def test_a_process_that_ends_ignores_a_late_ctrl_c() -> None:
-    before = signal.getsignal(signal.SIGINT)
+def test_a_process_that_ends_ignores_late_signals() -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
     try:
         with Signals(process=True):
             assert hasattr(signal.getsignal(signal.SIGTERM), GRACEFUL)
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        assert [signal.getsignal(number) for number in numbers] == [signal.SIG_IGN] * 2
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_a_run_that_is_given_up_is_no_success(unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str) -> None:

@@ -30,7 +30,7 @@ class Signals:
     """Handles both signals, as a context manager, in the main thread.
 
     Args:
-        process: whether the process ends with the command: then a Ctrl-C that comes after it is ignored.
+        process: whether the process ends with the command: then a signal that comes after it is ignored: all is written.
 
     Attributes:
         status: the exit status of the signal that came; 0 for none.
@@ -54,8 +54,7 @@ class Signals:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for number, handler in self._before.items():
-            ignored = self._process and number == signal.SIGINT
-            signal.signal(number, signal.SIG_IGN if ignored else handler)
+            signal.signal(number, signal.SIG_IGN if self._process else handler)
 
     def receive(self, number: int, frame: FrameType | None) -> None:
         """End the command where it is; at once where it is busy with that already.
