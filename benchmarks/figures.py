@@ -90,6 +90,18 @@ def points(runs: Sequence[Any], column: int = 0) -> Curves:
     return [(run[:, column], run[:, 2]) for run in map(np.array, runs)]
 
 
+def error_panels(entries: Mapping[str, Any], seconds: str = "seconds") -> dict[str, dict[str, Curves]]:
+    """Return panels for `curves`: each entry's errors over seconds and over paths, a curve for each method and its rate."""
+    return {
+        f"{name}, over {unit}": {
+            f"{method}, rate {found['rate']:g}": points(found["runs"], column)
+            for method, found in entry["methods"].items()
+        }
+        for name, entry in entries.items()
+        for column, unit in enumerate((seconds, "paths"))
+    }
+
+
 def over_steps(*runs: Values) -> Curves:
     """Return curves of values at steps 0, 1, ..."""
     return [(range(len(run)), run) for run in runs]

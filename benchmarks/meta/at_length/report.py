@@ -30,12 +30,4 @@ def table(record: Record) -> str:
 
 def plot(record: Record) -> figures.Figure:
     """Error over seconds and over paths."""
-    panels = {
-        f"{name}, over {unit}": {
-            f"{method}, rate {found['rate']:g}": figures.points(found["runs"], column)
-            for method, found in entry["methods"].items()
-        }
-        for name, entry in record["entries"].items()
-        for column, unit in enumerate(("processor seconds", "paths"))
-    }
-    return figures.curves(panels, "", columns=2)
+    return figures.curves(figures.error_panels(record["entries"], "processor seconds"), "", columns=2)

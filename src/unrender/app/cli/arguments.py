@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import re
+import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -296,6 +297,11 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
     if not os.access(given, os.W_OK | os.X_OK):
         raise InputError(f"--out {given}: not writable")
     return given
+
+
+def command_line(context: typer.Context) -> str:
+    """Return what the user typed, quoted for a shell."""
+    return shlex.join(context.find_root().obj or ["unrender"])
 
 
 def finished_run(directory: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import secrets
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,7 +100,7 @@ def compare(
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
-            command = shlex.join(context.find_root().obj or ["unrender"])
+            command = arguments.command_line(context)
             job = _job(what[0], options, not no_cache, command, folder)
             turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
             runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]

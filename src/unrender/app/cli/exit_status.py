@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["DOUBTFUL", "ENVIRONMENT", "FAILED", "INPUT", "INTERRUPTED", "TERMINATED", "WORDS"]
 
 INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
-"""What the user gave is wrong; this machine cannot; a run was given up; fresh pictures contradict a run."""
+"""Invalid input; the machine lacks something; the run was given up; the check by fresh pictures failed."""
 INTERRUPTED, TERMINATED = 130, 143
 """Ctrl-C, and SIGTERM: 128 and the number of the signal, as shells and schedulers expect."""
 WORDS = {

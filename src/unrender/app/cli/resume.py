@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -50,7 +49,7 @@ def resume(
         if force:
             raise InputError(f"{directory}: --force goes with the run folder of a stage")
         stages.refuse_workers(workers)
-        command = shlex.join(context.find_root().obj or ["unrender"])
+        command = arguments.command_line(context)
         with Progress(console) as progress:
             return stages.run_remaining(
                 stages.reopen(directory, (steps, seconds), variant, threads, command), console, progress

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -80,7 +80,7 @@ def run(
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
-    console, command = Console(highlight=False), shlex.join(context.find_root().obj or ["unrender"])
+    console, command = Console(highlight=False), arguments.command_line(context)
     given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
@@ -167,19 +167,15 @@ def _budget_settings(
     given: dict[str, str], steps: int | None, seconds: float | None
 ) -> tuple[int | None, float | None]:
     """The budget, which may also stand among the settings (--set steps=300): it is taken from there."""
-    for name, option in (("steps", steps), ("seconds", seconds)):
-        if name in given and option is not None:
+    budget: dict[str, Any] = {"steps": steps, "seconds": seconds}
+    for name in budget:
+        if name in given and budget[name] is not None:
             raise InputError(f"--set {name}={given[name]}: --{name} is given, too")
-    if "steps" in given:
-        text = given.pop("steps")
-        try:
-            steps = int(text)
-        except ValueError as error:
-            raise InputError(f"--set steps={text}: expected a whole number") from error
-    if "seconds" in given:
-        text = given.pop("seconds")
-        try:
-            seconds = float(text)
-        except ValueError as error:
-            raise InputError(f"--set seconds={text}: expected a number") from error
-    return steps, seconds
+    for name, number, expected in (("steps", int, "a whole number"), ("seconds", float, "a number")):
+        if name in given:
+            text = given.pop(name)
+            try:
+                budget[name] = number(text)
+            except ValueError as error:
+                raise InputError(f"--set {name}={text}: expected {expected}") from error
+    return budget["steps"], budget["seconds"]

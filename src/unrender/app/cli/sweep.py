@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,7 +120,7 @@ def sweep(
         plan, found = search_of(plan_of(names))
     folder = arguments.folder(out, f"{arguments.short_name(what)}-sweep", overwrite, MARK)
     try:
-        record = SweepRecord(command=shlex.join(context.find_root().obj or ["unrender"]), plan=plan)
+        record = SweepRecord(command=arguments.command_line(context), plan=plan)
         run_trials(console, Session(folder, where, threads, fresh=True), record, found)
     finally:
         arguments.remove_if_empty(folder)

@@ -174,8 +174,7 @@ def estimate_hvp(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`hvp` with its options in one object."""
     function = SmoothedFunction("hvp", f, theta, sigma, options, sides=2)
-    direction = function.vector("v", v)
-    length = float(np.sqrt(np.sum((direction / function.sigma) ** 2)))
+    direction, length = function.direction(v)
     step = checks.number("smoothed.hvp", "epsilon", options.epsilon, above=0.0)
     if length == 0.0:
         return np.zeros(function.n), np.zeros(function.n)
@@ -218,8 +217,7 @@ def estimate_gradient_and_product(
     """
     function = SmoothedFunction("gradient", f, theta, sigma, options)
     function.draws = max(options.samples // 4, 1)
-    direction = function.vector("v", v)
-    length = float(np.sqrt(np.sum((direction / function.sigma) ** 2)))
+    direction, length = function.direction(v)
     z, ratio = function.draw_aggregate(gaussian.gradient_mixture, gaussian.gradient_ratio)
     moved = options.epsilon / length * direction
     ahead, behind = function.odd_at(z, [function.theta + side * moved for side in (1, -1)])

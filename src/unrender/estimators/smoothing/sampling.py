@@ -65,6 +65,11 @@ class SmoothedFunction:
             raise InputError(f"{self.owner}: {name} must be a finite number or a vector ({self.n},), got {given!r}")
         return np.broadcast_to(found, (self.n,)).copy()
 
+    def direction(self, v: Any) -> tuple[np.ndarray, float]:
+        """A direction (n,), and its length in units of σ."""
+        found = self.vector("v", v)
+        return found, float(np.sqrt(np.sum((found / self.sigma) ** 2)))
+
     def draw(self, sampler: Callable[..., np.ndarray], stream: int = 0) -> np.ndarray:
         """(draws, n): `sampler` of uniform choices (B,), uniform numbers (B, n) and standard normals (B, n)."""
         if not self.low_discrepancy:

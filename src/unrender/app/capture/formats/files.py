@@ -18,7 +18,7 @@ _MASK_FOLDERS = ("masks", "mask")
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that no file can have is that of none."""
+    """Whether the file exists. A name that the system does not allow counts as absent."""
     try:
         return path.is_file()
     except OSError:
