@@ -223,7 +223,7 @@ def test_adaptive_mini_batches_find_the_silhouettes(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         BoundaryTerm,
         "tangent_moment",
-        lambda self, scene, request: mi.TensorXf(dr.zeros(mi.Float, 3 * dr.width(request.pixels))),
+        lambda self, scene, request, combined: mi.TensorXf(dr.zeros(mi.Float, 3 * dr.width(request.pixels))),
     )
     assert variance(sampler) > 0.7 * uniform
 
