@@ -18,8 +18,11 @@ from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
 from unrender.io import toml_lines
 from unrender.methods import auto as module
-from unrender.methods import first_rates, method
+from unrender.methods import method
 from unrender.methods.plan import Plan
+from unrender.methods.rules import first_rates, sampling
+from unrender.methods.rules.constants import CONSTANTS
+from unrender.methods.rules.traits import Traits
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
@@ -44,6 +47,11 @@ def problem(loss: Any = None, shares_paths: bool = True, noise: float = 0.3, **o
     return Problem(renderer, unknown, [View(renderer.exact(TRUTH))], loss=loss or losses.L2(), truth=TRUTH)
 
 
+def constants(monkeypatch: pytest.MonkeyPatch, **other: Any) -> None:
+    """Let `auto` use other numbers."""
+    monkeypatch.setattr(module, "CONSTANTS", dataclasses.replace(CONSTANTS, **other))
+
+
 def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
     choice = method("auto").plan(made, settings)
     return choice.estimator, choice.optimizer
@@ -52,9 +60,9 @@ def chosen(made: Problem, **settings: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("loss", [losses.L1(), losses.L2()])
 def test_images_have_a_memory(loss: Any) -> None:
     estimator, _ = chosen(problem(loss))
-    tolerance = 0.0 if loss.linear else module._TOLERANCE
-    fresh = {"spp": module._MOST, "tolerance": tolerance, "fresh_from": module._FRESH_FROM}
-    memory = module._LINEAR_MEMORY if loss.linear else module._MEMORY
+    tolerance = 0.0 if loss.linear else CONSTANTS.tolerance
+    fresh = {"spp": CONSTANTS.spp[1], "tolerance": tolerance, "fresh_from": CONSTANTS.fresh_from}
+    memory = CONSTANTS.linear_memory if loss.linear else CONSTANTS.memory
     assert estimator == PathGradient(images.RecursiveControlVariate("path", max_weight=memory), **fresh)
     estimator, _ = chosen(problem(loss, shares_paths=False))
     assert estimator.image == images.RecursiveControlVariate("primary", max_weight=memory)
@@ -130,16 +138,14 @@ def test_the_problem_is_kept_as_it_was_given() -> None:
 
 def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     for paths, spp in ((1, 2), (16, 2), (63, 2), (64, 4), (200, 8), (1 << 15, 16)):
-        monkeypatch.setattr(module, "_PATHS", paths)
+        constants(monkeypatch, paths=paths)
         assert chosen(problem())[0].spp == spp, paths
     assert chosen(problem(), spp=5)[0].spp == 5
     assert chosen(problem())[1].wiener
 
 
 def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MOST_PIXELS", 10)
-    monkeypatch.setattr(module, "_DRAWN", 5)
-    monkeypatch.setattr(module, "_DRAWN_PATHS", 20)
+    constants(monkeypatch, most_pixels=10, drawn=5, drawn_paths=20)
     estimator, optimizer = chosen(problem(losses.L1()))
     assert estimator.pixels == pixels.Uniform(5)
     assert estimator.spp == 4
@@ -256,20 +262,29 @@ def test_textures_of_one_material_share_the_rate() -> None:
 def test_mini_batches_of_views_are_damped_as_whole_views_are(loss: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of pixels here and there are not: their noise is not known."""
     for sampler, damped in ((pixels.All(), True), (pixels.Views(1), True), (pixels.Uniform(4), False)):
-        monkeypatch.setattr(module.AutoMethod, "_sampler", lambda self, problem, sampler=sampler: (sampler, ""))
-        expected = module._TOLERANCE if damped and not loss.linear else 0.0
+        monkeypatch.setattr(sampling, "sampler", lambda traits, sampler=sampler: (sampler, ""))
+        expected = CONSTANTS.tolerance if damped and not loss.linear else 0.0
         assert chosen(problem(loss))[0].tolerance == expected
 
 
-def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
+def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     """And where a step shows half of the views."""
-    auto = module.AutoMethod.model_validate({})
-    for loss, name in ((losses.L1(), "rcv"), (losses.Huber(), "rcv"), (losses.L2(), "plain")):
-        assert auto._image(problem(loss), True, True).name == name
-    assert auto._image(problem(losses.L1()), False, True).name == "plain"
+
+    def image(loss: Any, sampler: Any) -> str:
+        made = problem(loss)
+        monkeypatch.setattr(made, "faces", {"map": None})
+        return type(sampling.image(Traits(made, module.AutoMethod(), CONSTANTS), sampler)[0]).__name__
+
+    for loss, name in (
+        (losses.L1(), "RecursiveControlVariate"),
+        (losses.Huber(), "RecursiveControlVariate"),
+        (losses.L2(), "Plain"),
+    ):
+        assert image(loss, pixels.All()) == name
+    assert image(losses.L1(), pixels.Uniform(4)) == "Plain"
     many: Any = SimpleNamespace(views=[None] * 16)
-    found = [module._shows_half(many, s) for s in (pixels.All(), pixels.Views(8), pixels.Views(7), pixels.Uniform(4))]
-    assert found == [True, True, False, False]
+    samplers = (pixels.All(), pixels.Views(8), pixels.Views(7), pixels.Uniform(4))
+    assert [sampling.renders_half(many, sampler) for sampler in samplers] == [True, True, False, False]
 
 
 def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,13 +298,13 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
     plan = method("auto").plan(made)
-    assert plan.estimator == GaussNewton(module._MOST_NUMBER, module._MOST_DIFFERENCE)
+    assert plan.estimator == GaussNewton(CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1])
     assert isinstance(plan.optimizer, optimizers.AveragedNewton)
     assert "4 numbers" in plan.reasons[0]
     assert "with place" in plan.reasons[0]
     for settings in ({"image": "plain"}, {"pixels": 8}):
         assert isinstance(chosen(made, **settings)[0], PathGradient)
-    monkeypatch.setattr(module, "_FEW_NUMBERS", 3)
+    constants(monkeypatch, few_numbers=3)
     assert isinstance(chosen(made)[0], PathGradient)
     monkeypatch.undo()
     result = optimize(made, plan, steps=40, progress=False)
@@ -302,7 +317,7 @@ def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(m
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
     estimator, optimizer = chosen(problem())
-    assert estimator == GaussNewton(module._MOST_IMAGE, module._MOST_IMAGE // module._PER_DERIVATIVE)
+    assert estimator == GaussNewton(CONSTANTS.image_spp[1], CONSTANTS.image_spp[1] // CONSTANTS.per_derivative)
     assert isinstance(optimizer, optimizers.AveragedNewton)
     assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0)
     for settings in ({"image": "plain"}, {"pixels": 8}):

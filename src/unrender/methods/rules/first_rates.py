@@ -8,44 +8,38 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from unrender.methods.rules.constants import CONSTANTS, Constants
 from unrender.scene.bounds import MARGIN
 from unrender.scene.problem import Problem
 
 __all__ = ["first_rates", "logarithms"]
 
-_MESH_SHARE = 4.0
-"""First steps of vertices, as a share of the mesh's radius, over `learning_rate`."""
-_ALBEDO, _EXTINCTION, _ALBEDO_SHARE = ".albedo.", ".sigma_t.", 0.2
-"""An albedo moves by this part of a tenth of its range where the extinction beside it is unknown, too: pictures of a thin medium show their
-product, and the extinction, whose range is open, has further to go."""
-_NORMALS, _NORMALS_SHARE = ".normalmap.", 0.1
-"""A normal map moves by this part of a tenth of its range, or its surface by ten degrees a step, and highlights jump."""
+_ALBEDO, _EXTINCTION, _NORMALS = ".albedo.", ".sigma_t.", ".normalmap."
+"""Parts of keys: of a medium's grids, and of a normal map."""
 _TEXELS = ".data"
 """End of the key of a texture's texels."""
-_MOST_NUMBERS, _MOST_MARGINS = 4, 10
-"""Elements of a number or colour; and the distance from its bound of one that moves as its logarithm, at least, in margins."""
-_NUMBER_SHARE = 0.3
-"""Of a tenth of its range, for a number or colour. Too high a rate falls late: what a memory of images repeats looks like agreement."""
 _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
 
 
-def logarithms(problem: Problem) -> dict[str, str]:
-    """{key: "log"} of single numbers, colours and textures that are positive, without an upper bound: radiances, environment maps,
-    extinctions. Not where a learning rate is given, which is in the parameter's units; nor of grids, parts of which may have to be 0."""
-    return {
-        key: "log"
+def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
+    """Return the keys of single numbers, colours and textures that are positive, without an upper bound: radiances, environment maps.
+
+    Not where a learning rate is given, which is in the parameter's units; nor of grids, parts of which may have to be 0.
+    """
+    return [
+        key
         for key, value in problem.initial_values().items()
         if (low := problem.bounds[key][0]) is not None
         and problem.bounds[key][1] is None
         and key not in problem.learning_rates
         and key not in problem.parameterisations
-        and (value.ndim == _TEXTURE or _is_number(value))
-        and (value > low + _MOST_MARGINS * MARGIN).all()
-    }
+        and (value.ndim == _TEXTURE or _is_number(value, constants))
+        and (value > low + constants.margins * MARGIN).all()
+    ]
 
 
-def first_rates(problem: Problem, share: float) -> Mapping[str, float]:
+def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS) -> Mapping[str, float]:
     """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
     values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
     residuals and would together go too far; less for numbers with two ends. With a parameterisation, that of u for such a step."""
@@ -60,13 +54,13 @@ def first_rates(problem: Problem, share: float) -> Mapping[str, float]:
         else:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
         if key in problem.faces:
-            size = _MESH_SHARE * _radius(value)
+            size = constants.mesh_share * _radius(value)
         if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
-            size *= _ALBEDO_SHARE
-        elif _is_number(value) and low is not None and high is not None:
-            size *= _NUMBER_SHARE
+            size *= constants.albedo_share
+        elif _is_number(value, constants) and low is not None and high is not None:
+            size *= constants.number_share
         if _NORMALS in key:
-            size *= _NORMALS_SHARE
+            size *= constants.normals_share
         if key in materials:
             size /= math.sqrt(textures[materials[key]])
         if key in problem.coordinates.transforms:
@@ -81,9 +75,9 @@ def _owner(key: str) -> str:
     return key.rsplit(".", 2)[0]
 
 
-def _is_number(value: np.ndarray) -> bool:
+def _is_number(value: np.ndarray, constants: Constants) -> bool:
     """Whether it is a single number or a colour."""
-    return value.ndim <= 1 and value.size <= _MOST_NUMBERS
+    return value.ndim <= 1 and value.size <= constants.number_size
 
 
 def _radius(positions: np.ndarray) -> float:

@@ -1,0 +1,99 @@
+"""Rules by kind of unknown, among path gradients: textures, volumes, positive numbers, meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from unrender.core.text import grouped, listed
+from unrender.methods.rules.first_rates import logarithms
+from unrender.methods.rules.traits import Traits
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.preconditioners import LargeSteps, grid
+from unrender.scene.coarse_to_fine import CoarseToFine
+from unrender.scene.parameter import ParameterSettings
+from unrender.schedules import InverseRoot
+
+__all__ = ["KINDS", "Part"]
+
+_GRID = 4
+"""Dimensions of a grid, (Z, Y, X, C)."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a plan for the unknowns of one kind.
+
+    Attributes:
+        keys: Of the unknowns.
+        reason: What was chosen; "" where there is no such unknown.
+        settings: Settings of unknowns by key.
+        smoothed: Whether they move along Sobolev gradients.
+        optimizer: Makes an optimizer of their own from the smallest of their first rates; None for that of all others.
+    """
+
+    keys: tuple[str, ...] = ()
+    reason: str = ""
+    settings: Mapping[str, ParameterSettings] = field(default_factory=dict)
+    smoothed: bool = False
+    optimizer: Callable[[float], Optimizer] | None = None
+
+
+def textures(traits: Traits) -> Part:
+    """Textures, grids and values at vertices without a preconditioner of their own move along Sobolev gradients."""
+    shapes, infos = traits.problem.shapes(), traits.infos
+    keys = tuple(
+        key
+        for key, info in infos.items()
+        if traits.options.smooth
+        and key not in traits.problem.preconditioners
+        and (grid.is_map(shapes[key]) or (info.mesh is not None and not info.welded))
+    )
+    return Part(keys, f"Sobolev gradients of {listed(keys)}", smoothed=True) if keys else Part()
+
+
+def volumes(traits: Traits) -> Part:
+    """Grids without detail at the start are coarse in the first steps: a few cells show with less noise where there is something.
+
+    Textures are not, since smoothed gradients do the same; nor are grids beside a mesh.
+    """
+    problem, start, found = traits.problem, traits.problem.initial_values(), {}
+    for key, shape in problem.shapes().items() if traits.options.coarse and not traits.meshes else ():
+        ways = [steps for cells, steps in traits.constants.coarse if len(shape) == _GRID and min(shape[:-1]) >= cells]
+        own = key in problem.coarse_to_fine or key in problem.preconditioners
+        if ways and not own and traits.infos[key].resizable and not (start[key] != start[key][:1, :1, :1]).any():
+            found[key] = ways[0]
+    steps = {key: f"resolution doubled by step {' and '.join(map(str, each))}" for key, each in found.items()}
+    settings = {
+        key: ParameterSettings(coarse_to_fine=CoarseToFine(each, states="carry")) for key, each in found.items()
+    }
+    return Part(tuple(found), f"coarse to fine: {grouped(steps)}", settings) if found else Part()
+
+
+def positive_values(traits: Traits) -> Part:
+    """Positive numbers, colours and textures without an upper bound move as their logarithms."""
+    given, found = traits.problem.parameterisations, logarithms(traits.problem, traits.constants)
+    moved = {key: "log" for key in found if traits.options.parameterise and key not in traits.rates}
+    named = {key: type(own).__name__.lower() for key, own in given.items()} | moved
+    settings = {key: ParameterSettings(parameterisation=name) for key, name in moved.items()}
+    return Part(tuple(named), f"moved as {grouped(named)}", settings) if named else Part()
+
+
+def meshes(traits: Traits) -> Part:
+    """Vertices move by large steps, at one rate for all, which falls with the root of the steps."""
+    keys, constants = traits.meshes, traits.constants
+    if not keys:
+        return Part()
+    fewest = min(traits.problem.initial_values()[key].size // 3 for key in keys)
+    strength = float(np.clip(fewest / constants.vertices_per_strength, *constants.strengths))
+    reason = f"large steps of {listed(keys)}: one rate for all vertices, λ {strength:.2g}"
+    settings = {key: ParameterSettings(preconditioner=LargeSteps(strength)) for key in keys}
+    schedule = InverseRoot(constants.mesh_time)
+    return Part(keys, reason, settings, optimizer=lambda rate: Adam(rate, schedule=schedule, uniform=True))
+
+
+KINDS: tuple[Callable[[Traits], Part], ...] = (textures, volumes, positive_values, meshes)
+"""In the order of their reasons."""

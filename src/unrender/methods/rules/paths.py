@@ -1,0 +1,107 @@
+"""Rules for path gradients, for perturbed renders beside them, and for a smoothed loss where there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from unrender import pixels
+from unrender.core.text import grouped
+from unrender.estimators.hybrid import HybridGradient, beyond_paths
+from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives
+from unrender.images.plain import Plain
+from unrender.methods.base import method
+from unrender.methods.plan import Plan
+from unrender.methods.rules import sampling
+from unrender.methods.rules.first_rates import first_rates
+from unrender.methods.rules.kinds import KINDS
+from unrender.methods.rules.traits import Traits, refusal
+from unrender.methods.smoothed import parse_widths, widths_of
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.partitioned import Partitioned
+from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.preconditioners import Sobolev
+from unrender.rendering.partial import PartialDerivatives
+from unrender.scene.parameter import ParameterSettings
+from unrender.schedules import Exponential
+
+__all__ = ["paths", "paths_and_perturbed", "perturbed"]
+
+
+def paths_and_perturbed(traits: Traits) -> Plan | None:
+    """Return path gradients beside perturbed renders of what they do not reach; None where they reach all, or nothing."""
+    constants, problem, sigma = traits.constants, traits.problem, traits.options.sigma
+    keys = beyond_paths(traits.infos, list(traits.infos))
+    others = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(keys)))
+    if not 0 < len(keys) < len(traits.infos) or refusal(others):
+        return None
+    rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, keys).items()}
+    plan = paths(replace(traits, problem=others, rates=rates))
+    smoothing = SmoothedDerivatives(
+        parse_widths(sigma),
+        constants.perturbed,
+        spp=constants.perturbed_spp,
+        schedule=Exponential(*constants.annealing),
+        debiased=True,
+    )
+    reason = f"perturbed renders of {', '.join(f'{key}: {traits.infos[key].reason}' for key in keys)}"
+    estimator = HybridGradient(plan.estimator, smoothing, tuple(keys))
+    return replace(plan, problem=problem, estimator=estimator, reasons=(reason, *plan.reasons))
+
+
+def perturbed(traits: Traits) -> Plan | None:
+    """Return derivatives of a smoothed loss where path gradients do not serve; else None."""
+    if not traits.unreachable:
+        return None
+    reason = f"derivatives of a smoothed loss (method smoothed): {traits.unreachable}"
+    return Plan(traits.problem, *method("smoothed").start({"sigma": traits.options.sigma}), reasons=(reason,))
+
+
+def paths(traits: Traits) -> Plan:
+    """Return path gradients with the parts of each kind of unknown."""
+    problem, options = traits.problem, traits.options
+    parts = [kind(traits) for kind in KINDS]
+    settings = _merged(traits, [part.settings for part in parts])
+    configured = problem.configured(settings)
+    rates = {**first_rates(configured, options.learning_rate, traits.constants), **traits.rates}
+    sampler, drawn = sampling.sampler(traits)
+    image, image_reason = sampling.image(traits, sampler)
+    spp = sampling.samples_per_pixel(traits, sampler)
+    smoothed = tuple(key for part in parts if part.smoothed for key in part.keys)
+    own = [part for part in parts if part.optimizer]
+    apart = {key for part in own for key in part.keys}
+    optimizer: Optimizer = ScheduleFree(
+        {"*": options.learning_rate, **{key: rate for key, rate in rates.items() if key not in apart}},
+        preconditioner=Sobolev(correlation=options.correlation) if smoothed else None,
+        preconditioned=smoothed,
+        wiener=not isinstance(sampler, pixels.Uniform),
+        reparameterised=tuple(key for key in configured.parameterisations if key in configured.coordinates.transforms),
+    )
+    for part in own:
+        if part.optimizer is not None:
+            optimizer = Partitioned(part.keys, part.optimizer(min(rates[key] for key in part.keys)), optimizer)
+    plain, whole = isinstance(image, Plain), isinstance(sampler, pixels.All)
+    biased = problem.loss.pixelwise and not problem.loss.linear
+    tolerance = options.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
+    first = grouped({key: f"{rate:.3g}" for key, rate in (rates | problem.learning_rates).items()})
+    reasons = (
+        f"{'a fresh rendering each step' if plain else 'recursive control variates'}, {spp} samples per pixel: {image_reason}",
+        drawn,
+        f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
+        *(part.reason for part in parts),
+        f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",
+    )
+    fresh_from = traits.constants.fresh_from if smoothed and whole and not plain else 0
+    estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
+    return Plan(problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
+
+
+def _merged(traits: Traits, settings: list[Mapping[str, ParameterSettings]]) -> dict[str, ParameterSettings]:
+    """Return the settings of all parts by unknown."""
+    merged: dict[str, ParameterSettings] = {}
+    for key in traits.infos:
+        chosen = [vars(part[key]) for part in settings if key in part]
+        if values := {name: value for own in chosen for name, value in own.items() if value is not None}:
+            merged[key] = ParameterSettings(**values)
+    return merged

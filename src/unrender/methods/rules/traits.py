@@ -1,0 +1,85 @@
+"""The traits of a problem that the rules of `auto` look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from unrender.core.errors import InputError
+from unrender.methods.rules.constants import Constants
+from unrender.rendering.renderer import ParameterInfo
+from unrender.scene.problem import Problem
+
+if TYPE_CHECKING:
+    from unrender.methods.auto import AutoMethod
+
+__all__ = ["Traits", "refusal"]
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What the rules of `auto` look at.
+
+    Attributes:
+        problem: What to recover.
+        options: What was asked for.
+        constants: Numbers of the rules.
+        rates: First rates that are decided already, in units of the unknowns.
+    """
+
+    problem: Problem
+    options: AutoMethod
+    constants: Constants
+    rates: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def infos(self) -> dict[str, ParameterInfo]:
+        """The renderer's facts about each unknown."""
+        known = self.problem.renderer.parameters()
+        return {key: known[key] for key in self.problem.shapes()}
+
+    @cached_property
+    def elements(self) -> int:
+        """Number of elements of all unknowns."""
+        return sum(math.prod(shape) for shape in self.problem.shapes().values())
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Keys of vertex positions."""
+        return tuple(self.problem.faces)
+
+    @property
+    def poses(self) -> list[str]:
+        """Keys of rigid motions, of shapes or sensors."""
+        return [key for key, info in self.infos.items() if info.rigid]
+
+    @property
+    def only_cameras(self) -> bool:
+        """Whether all unknowns are poses of sensors. Lenses have other units."""
+        return all(info.viewpoint and info.rigid for info in self.infos.values())
+
+    @property
+    def newton_suits(self) -> bool:
+        """Whether nothing rules out Gauss-Newton steps: no image or pixels asked for, a loss of pixels, no preconditioners."""
+        asked = self.options.image is not None or self.options.pixels is not None
+        return not asked and self.problem.loss.pixelwise and not self.problem.preconditioners
+
+    @cached_property
+    def unreachable(self) -> str:
+        """Why path gradients of the unknowns do not serve; "" where they do."""
+        if rigid := next(iter(self.poses), ""):
+            other = "; --method plain has path gradients" if self.infos[rigid].differentiable else ""
+            return f"parameter {rigid} moves a shape or sensor as a whole, with plateaus of the loss{other}"
+        return refusal(self.problem)
+
+
+def refusal(problem: Problem) -> str:
+    """Return why the renderer has no path gradients of the unknowns; "" where it has."""
+    try:
+        problem.renderer.prepare(list(problem.shapes()), None)
+    except InputError as error:
+        return str(error)
+    return ""
