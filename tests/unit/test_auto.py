@@ -273,7 +273,7 @@ def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss(monkeypatch:
     def image(loss: Any, sampler: Any) -> str:
         made = problem(loss)
         monkeypatch.setattr(made, "faces", {"map": None})
-        return type(sampling.image(Traits(made, module.AutoMethod(), CONSTANTS), sampler)[0]).__name__
+        return type(sampling.image(Traits(made, module.AutoMethod.model_validate({}), CONSTANTS), sampler)[0]).__name__
 
     for loss, name in (
         (losses.L1(), "RecursiveControlVariate"),
