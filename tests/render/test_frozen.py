@@ -37,13 +37,30 @@ def test_what_cannot_be_recorded_is_traced_at_every_call(warned: list[str]) -> N
 
     once = FrozenFunction(function)
     prepared: list[int] = []
-    for n in (1, 2, 3):
+    for n in (1, 2, 3, 4):
         x = mi.Float([1.0, 2.0, float(n)])
         dr.eval(x)
         assert dr.allclose(once(lambda: prepared.append(1), x), x * float(3 + n))
     assert len(warned) == 1
-    assert len(calls) == 4  # the attempt, and three calls
-    assert len(prepared) == 4
+    assert len(calls) == 7  # three attempts, and four calls
+    assert len(prepared) == 7
+
+
+def test_what_its_first_use_makes_recordable_is_recorded_at_the_next_call(warned: list[str]) -> None:
+    """As lights of other scenes that make tables when they are first sampled."""
+    calls: list[int] = []
+
+    def function(x: Any) -> Any:
+        calls.append(1)
+        return x * float(dr.sum(x)[0]) if len(calls) < 3 else x + 1
+
+    once = FrozenFunction(function)
+    x = mi.Float([1.0, 2.0, 3.0])
+    dr.eval(x)
+    for _ in range(4):
+        once(nothing, x)
+    assert len(calls) == 3  # an attempt that failed, its call, and one that was recorded
+    assert not warned
 
 
 def test_the_error_of_a_replay_is_raised_and_the_recording_stays(
@@ -84,7 +101,9 @@ def test_another_layout_of_the_arguments_is_recorded_anew_or_traced(warned: list
     dr.eval(integers, numbers)
     assert dr.all(once(nothing, integers) == [2, 3, 4])
     assert not warned
-    assert dr.allclose(once(nothing, numbers), numbers * 6)
+    for _ in range(3):
+        assert not warned
+        assert dr.allclose(once(nothing, numbers), numbers * 6)
     assert len(warned) == 1
     assert dr.all(once(nothing, integers) == [2, 3, 4])
 

@@ -16,12 +16,18 @@ from unrender.core.errors import InputError
 __all__ = ["FrozenFunction", "naming"]
 
 _log = logging.getLogger("unrender")
+_ATTEMPTS = 3
+"""Failures in a row after which a function is traced at every call."""
 _INDEPENDENT = "the argument does not depend on the input variable"
 """From Dr.Jit's error where a derivative was asked for and there is none."""
 
 
 class FrozenFunction:
     """A function that Dr.Jit records at its first call and replays at later ones. Where it cannot be recorded, it is traced each time.
+
+    A call through a pointer sees the objects of every scene in the process, those of the caller's own scenes too. Some of these, such as
+    lights with textures, make tables at their first use, which no recording can hold. The traced call that follows a failure makes them, so
+    the next call tries again, up to three times in a row.
 
     A replay that fails raises its error: out of memory, say, is no reason to trace at every call from then on.
 
@@ -36,7 +42,7 @@ class FrozenFunction:
         self._function = function
         self._tracing = _Tracing()
         self._frozen: Callable[..., Any] | None = _recorder(function, self._tracing) if recordable else None
-        self._recorded = False
+        self._recorded, self._failures = False, 0
         self._threads = dr.thread_count()
 
     def __call__(self, prepare: Callable[[], None], *arguments: Any) -> Any:
@@ -56,8 +62,12 @@ class FrozenFunction:
                 raise
             prepare()
             result = self._function(*arguments)  # its own error is the one that counts
-            self._frozen = None
-            _warn(str(_first_cause(error)).partition("\n")[0])
+            self._failures += 1
+            self._frozen = _recorder(self._function, self._tracing) if self._failures < _ATTEMPTS else None
+            if self._frozen is None:
+                _warn(str(_first_cause(error)).partition("\n")[0])
+        else:
+            self._failures = 0
         self._recorded = True
         return result
 
