@@ -1,4 +1,4 @@
-"""The files that CONTRIBUTING.md shows: written into a package outside the tree, announced by entry points, and run."""
+"""The files that docs/extending shows: written into a package outside the tree, announced by entry points, and run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 import unrender
 
 ROOT = Path(__file__).resolve().parents[2]
-TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+TEXT = "\n".join(page.read_text() for page in sorted((ROOT / "docs" / "extending").glob("*.md")))
 FILES = {
     name: text for text, name in re.findall(r"^```python\n(# (\w+)\.py\n.*?)^```$", TEXT, re.DOTALL | re.MULTILINE)
 }
