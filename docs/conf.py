@@ -12,7 +12,11 @@ from benchmarks.runner.results_page import write_pages  # noqa: E402
 from unrender.backend import variant  # noqa: E402
 
 variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))  # some public classes are Mitsuba's own subclasses
+
+import site_pages  # noqa: E402
+
 write_pages(HERE / "benchmarks")
+site_pages.write_pages(HERE)
 
 project = "unrender"
 author = "the unrender contributors"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from benchmarks import markdown
@@ -12,6 +13,7 @@ from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
 __all__ = ["on_a_gpu", "section", "split_notes", "write_pages"]
 
+_BASELINES = Path(__file__).with_name("baselines.md")
 _FOLDER = ROOT / "docs" / "benchmarks"
 _INDEX = """# Benchmarks
 
@@ -46,6 +48,8 @@ def write_pages(folder: Path = _FOLDER, figures: bool = True) -> Path:
         if figures:
             text += _figure(benchmark, folder)
         (folder / f"{name}.md").write_text(f"{text[1:]}\n")
+    names.append(_BASELINES.stem)
+    shutil.copyfile(_BASELINES, folder / _BASELINES.name)
     index = folder / "index.md"
     index.write_text(_INDEX.format(names="\n".join(names)))
     return index

@@ -6,7 +6,7 @@ A page's blocks run in order, in an empty folder. A comment before a block says 
     <!-- test: edit room.toml OLD NEW --> before it, OLD becomes NEW in that file
     <!-- test: skip, REASON -->         it is not executed
 
-and one comment anywhere, `<!-- test: after guide/example.md -->`, runs the blocks of another page first; with `files of` in place of
+and one comment anywhere, `<!-- test: after guide/texture.md -->`, runs the blocks of another page first; with `files of` in place of
 `after`, the run folders of that page are removed.
 """
 

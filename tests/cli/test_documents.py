@@ -27,25 +27,16 @@ PAGES = [
     *sorted(
         page
         for page in DOCS.rglob("*.md")
-        if page.name not in ("results.md", "contributing.md") and not {"benchmarks", "extending"} & set(page.parts)
+        if page.name not in ("results.md", "contributing.md")
+        and not {"benchmarks", "extending", "gallery"} & set(page.relative_to(DOCS).parts)
     ),
 ]
 SLOW = {
     "README.md",
     "quickstart.md",
-    "photographs.md",
-    "stages.md",
-    "sweeps.md",
-    "shapes.md",
-    "pixels.md",
-    "own-loop.md",
-    "own-estimator.md",
-    "poses.md",
-    "runs.md",
-    "watching.md",
-    "exporting.md",
-    "surfaces.md",
-    "volumes.md",
+    *("material.md", "light.md", "medium.md", "pose.md", "mesh.md", "camera.md", "any-function.md", "photographs.md"),
+    *("own-loop.md", "own-estimator.md", "losses.md", "speed.md", "stages.md", "sweeps.md", "runs.md", "watching.md"),
+    *("exporting.md", "surfaces.md", "volumes.md", "poses.md"),
 }
 
 # What the example of a docstring takes as given.

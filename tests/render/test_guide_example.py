@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "guide" / "example.md"
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "guide" / "texture.md"
 
 
 def test_the_photograph_hangs_upright(tmp_path: Path) -> None:

@@ -18,6 +18,9 @@ from benchmarks.runner.results_page import section as section_of
 
 KNOWN = benchmarks()
 PAGE = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
+BASELINES = (ROOT / "benchmarks" / "runner" / "baselines.md").read_text(encoding="utf-8")
+LONGEST_CELL = 120
+"""Characters of a cell of a figure or a goal."""
 TABLE_2 = ("QUAD", "BOX2", "BOX10", "MUG", "SHADOW", "BUNNY", "TEXTURE", "CNN", "CNN5")
 PAPERS: dict[str, tuple[int, list[str]]] = {
     "Recursive control variates": (
@@ -116,6 +119,11 @@ def wrong_names(page: str) -> Iterator[str]:
                 yield f"{title}, equation {row[0]}: neither a file and a name nor a reason"
 
 
+def links(cell: str) -> list[str]:
+    """The benchmarks that a cell links to."""
+    return re.findall(r"\[([\w.]+)\]", cell)
+
+
 def commands(text: str) -> list[tuple[str, list[str]]]:
     """Each benchmark that a command runs, with the options it gives."""
     found = re.findall(r"`python -m benchmarks ([\w.]+)([^`]*)`", text)
@@ -131,8 +139,13 @@ def options_of(name: str) -> set[str]:
 
 
 def wrong_commands(page: str) -> Iterator[str]:
-    """Benchmarks that the catalogue does not have, and options that their `run` does not have."""
-    for name, options in commands(page):
+    """Benchmarks that the catalogue does not have, options that their `run` does not have, and commands of no figure's benchmark."""
+    linked = {(title, row[0]): links(row[3]) for title, row in figures_of(page)}
+    for title in PAPERS:
+        for figure, name in re.findall(r"^- (.*?): `python -m benchmarks ([\w.]+)", section(page, title), re.MULTILINE):
+            if name not in linked.get((title, figure), []):
+                yield f"{title}, {figure}: a command of {name}, which its row does not name"
+    for name, options in [*commands(page), *((each, []) for names in linked.values() for each in names)]:
         if name not in KNOWN:
             yield f"no benchmark {name}"
             continue
@@ -149,7 +162,7 @@ def wrong_verdicts(page: str) -> Iterator[str]:
         if (
             verdict is None
             or (verdict[0] == "not run because") != (row[3] == "—")
-            or bool(commands(row[3])) == (row[3] == "—")
+            or bool(links(row[3])) == (row[3] == "—")
         ):
             yield f"{title}, {row[0]}: {row[3]}: {row[4]}"
 
@@ -176,7 +189,7 @@ def results() -> dict[str, str]:
 def wrong_numbers(page: str) -> Iterator[str]:
     """Numbers given as ours that the results of the row's benchmark do not have; a verdict may repeat the paper's."""
     for title, row in figures_of(page):
-        known = frozenset[str]().union(*(numbers(results()[name]) for name, _ in commands(row[3])))
+        known = frozenset[str]().union(*(numbers(results()[name]) for name in links(row[3]) if name in results()))
         given = (numbers(row[2]) - known) | (numbers(row[4]) - known - numbers(row[1]) - numbers(row[0]))
         if given and row[3] != "—":
             yield f"{title}, {row[0]}: not in the results: {sorted(given)}"
@@ -184,13 +197,25 @@ def wrong_numbers(page: str) -> Iterator[str]:
 
 def wrong_goals(page: str) -> Iterator[str]:
     """Goals not reached of which fewer than three things were tried, or whose numbers the results of the benchmarks named do not have."""
-    for goal, here, tried, record in rows(section(page, "Goals that were not reached"), 4):
-        ways, _, reason = tried.rpartition(": ")
-        if len(re.split("[;,] ", ways)) < 3 or not reason:
-            yield f"{goal}: three ways and why they fail"
+    for goal, here, tried, reason, record in rows(section(page, "Goals that were not reached"), 5):
+        if len(re.split("[;,] ", tried)) < 3 or not reason:
+            yield f"{goal}: three attempts and why they fail"
         known = frozenset[str]().union(*(numbers(results()[name]) for name in re.findall(r"`([\w.]+)`", record)))
         if given := numbers(here) - known:
             yield f"{goal}: not in the results: {sorted(given)}"
+
+
+def long_cells(page: str) -> Iterator[str]:
+    """Cells of figures and goals that are too long to read in a table."""
+    for row in [row for _, row in figures_of(page)] + [*rows(section(page, "Goals that were not reached"), 5)]:
+        yield from (f"{row[0]}: {len(cell)} characters" for cell in row if len(cell) > LONGEST_CELL)
+
+
+def wrong_links(page: str) -> Iterator[str]:
+    """Benchmarks that a row names and that have no link, and links to a page of another name."""
+    targets = dict(re.findall(r"^\[([\w.]+)\]: benchmarks/(.*)\.md$", page, re.MULTILINE))
+    for title, row in figures_of(page):
+        yield from (f"{title}, {row[0]}: no link to {name}" for name in links(row[3]) if targets.get(name) != name)
 
 
 def configurations(entrant: dict[str, Any]) -> int:
@@ -203,7 +228,7 @@ def configurations(entrant: dict[str, Any]) -> int:
 def baselines() -> list[str]:
     """The rows of the table of baselines that the records ask for, as regular expressions."""
     found = []
-    for name in sorted(set(re.findall(r"^\| `([\w.]+)` \|", section(PAGE, "Baselines"), re.MULTILINE))):
+    for name in sorted(set(re.findall(r"^\| `([\w.]+)` \|", BASELINES, re.MULTILINE))):
         record = json.loads((KNOWN[name].folder / "results.json").read_text())
         tasks = next(
             (record[key] for key in ("entries", "tasks", "budgets", "schedules") if key in record), {None: record}
@@ -226,20 +251,23 @@ def seeds(name: str, task: str | None) -> int:
     return exceptions.get((name, task or ""), TUNING_SEEDS.get(name, 1))
 
 
-def wrong_baselines(page: str) -> Iterator[str]:
+def wrong_baselines(table: str) -> Iterator[str]:
     """Rows that differ from the records, or are too few or too many."""
-    table = section(page, "Baselines")
     yield from (f"baselines: no row {row}" for row in baselines() if not re.search(row, table, re.MULTILINE))
     if table.count("\n| `") != len(baselines()):
         yield f"baselines: {len(baselines())} rows expected"
 
 
-CHECKS = (left_out, wrong_names, wrong_commands, wrong_verdicts, wrong_numbers, wrong_goals, wrong_baselines)
+CHECKS = (left_out, wrong_names, wrong_commands, wrong_verdicts, wrong_numbers, wrong_goals, long_cells, wrong_links)
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_the_page_is_true(check: Any) -> None:
     assert not list(check(PAGE))
+
+
+def test_the_baselines_are_those_of_the_records() -> None:
+    assert not list(wrong_baselines(BASELINES))
 
 
 @pytest.mark.parametrize(
@@ -254,9 +282,12 @@ def test_the_page_is_true(check: Any) -> None:
         (wrong_names, "`RenderSession.tangent_moment`", "`RenderSession.moment`", "no RenderSession.moment"),
         (wrong_names, "`update`, `covariance`", "`update`, `variance`", "no variance"),
         (wrong_names, "none: the paper sets it aside", "the paper sets it aside", "equation 9"),
-        (wrong_commands, "benchmarks rcv.fig4_order", "benchmarks rcv.fig4", "no benchmark rcv.fig4"),
+        (wrong_commands, "| [rcv.fig4_order] |", "| [rcv.fig4] |", "no benchmark rcv.fig4"),
         (wrong_commands, "--steps 400 --seeds 3", "--step 400", "no option step"),
-        (wrong_commands, "`adaptive.over_uniform`", "`adaptive.over`", "no benchmark adaptive.over"),
+        (wrong_commands, "- Fig. 5: `python -m benchmarks volumes", "- Fig. 6: `python -m benchmarks volumes", "does not name"),
+        (wrong_commands, "`higher_order.networks`", "`higher_order.nets`", "no benchmark higher_order.nets"),
+        (wrong_links, "[rcv.fig4_order]: benchmarks/rcv.fig4_order.md", "", "no link to rcv.fig4_order"),
+        (long_cells, "| beyond |", f"| beyond {'.' * 120} |", "Fig. 8: 127 characters"),
         (wrong_verdicts, "| beyond |", "| fine |", "Fig. 8"),
         (wrong_verdicts, "not run because they are not in the paper", "met, not in the paper", "Suppl., animations"),
         (wrong_verdicts, "| met, on another scene |", "| not run because of time |", "Fig. 7"),
@@ -264,15 +295,16 @@ def test_the_page_is_true(check: Any) -> None:
         (wrong_numbers, "L1's derivative -47.1%", "L1's derivative +47.1%", "['+47.1']"),
         (wrong_numbers, "with L1 stock ends at 1.93", "with L1 stock ends at 1.98", "['1.98']"),
         (wrong_goals, "with 5.0 and 3.6 times fewer", "with 5.7 and 3.6 times fewer", "['5.7']"),
-        (wrong_goals, "more paths behind the maps, a smaller share of uniform draws, smoother maps, ", "", "Adaptive Fig. 3"),
+        (wrong_goals, "more paths behind the maps; a smaller uniform share; ", "", "Adaptive Fig. 3"),
         (wrong_baselines, "OurHVPA: 8; OurJoint: 8 | 3 | 10 to 20 |", "OurHVPA: 2; OurJoint: 8 | 3 | 10 to 20 |", "BOX2"),
         (wrong_baselines, "uniform: 4; loss: 4; adaptive: 4 | 1 |", "uniform: 4; loss: 4; adaptive: 4 | 2 |", "adaptive_smoke"),
         (wrong_baselines, "| `meta.equal_time` | chalice |", "| meta | chalice |", "chalice"),
     ],
 )  # fmt: skip
 def test_a_fault_is_seen(check: Any, old: str, new: str, message: str) -> None:
-    assert old in PAGE
-    assert message in "\n".join(check(PAGE.replace(old, new)))
+    page = BASELINES if check is wrong_baselines else PAGE
+    assert old in page
+    assert message in "\n".join(check(page.replace(old, new)))
 
 
 def test_there_is_something_to_check() -> None:

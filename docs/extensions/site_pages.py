@@ -1,0 +1,140 @@
+"""Pages that the site builds from the code and the records, and that are not committed: gallery, arguments, ranges, coverage."""
+
+import dataclasses
+import inspect
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.coverage import coverage_page, ranges_page
+from benchmarks.coverage.cli import RECORD
+from benchmarks.runner import records
+from benchmarks.runner.catalogue import benchmarks
+from unrender import gallery
+from unrender.core import registry
+from unrender.display.pictures import png, shown_image
+from unrender.methods import method
+
+PIXELS, SAMPLES = 96, 32
+"""Side and samples per pixel of the gallery's pictures."""
+SECTION = re.compile(r"^(Args|Attributes):\n((?:    .*\n|\n)*)", re.MULTILINE)
+ENTRY = re.compile(r"^    (\w[\w, ]*): ((?:.*\n)(?:^     .*\n)*)", re.MULTILINE)
+CODE_COLUMNS = 60
+
+
+def write_pages(docs: Path) -> None:
+    """Write all pages below the folder of the site's sources."""
+    coverage_page.PAGE.write_text(coverage_page.page(json.loads(RECORD.read_text())))
+    ranges_page.PAGE.write_text(ranges_page.page())
+    (docs / "reference" / "arguments.md").write_text(arguments_page())
+    folder = docs / "gallery"
+    folder.mkdir(exist_ok=True)
+    (folder / "index.md").write_text(gallery_page(folder))
+
+
+def gallery_page(folder: Path) -> str:
+    """Return a page with a picture of every problem, and what comes out. The pictures go to `folder`."""
+    record = records.read(benchmarks()["suite"].folder) or {"problems": {}}
+    parts = [
+        "# Gallery",
+        "Problems made by code, whose truth is known. The picture is the first reference. The errors are relative to the "
+        "start, after 4 s on two CPU cores: of the tutorial loop with the best of eight settings, and of `auto` "
+        "(`python -m benchmarks suite`).",
+    ]
+    for name in gallery.names():
+        parts += [f"## {name}", gallery.summary(name)]
+        if picture := _reference(name, folder):
+            parts.append(f"![First reference of {name}]({picture})")
+        entry = record["problems"].get(name)
+        if entry:
+            parts.append(f"Error of the loop {entry['loop'][-1]:.3g}, of `auto` {entry['auto'][-1]:.3g}.")
+        parts.append(f"```sh\nunrender run {name} --seconds 20\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def _reference(name: str, folder: Path) -> str:
+    """Render a problem's first reference to a file. Return its name, "" for a problem without pictures."""
+    known = {option.name for option in gallery.options(name)}
+    if "resolution" not in known:
+        return ""
+    small = {"resolution": PIXELS} | ({"reference_spp": SAMPLES} if "reference_spp" in known else {})
+    file = folder / f"{name}.png"
+    if not file.is_file():
+        file.write_bytes(png(shown_image(gallery.problem(name, **small).views[0].reference)))
+    return file.name
+
+
+def arguments_page() -> str:
+    """Return a page with a table of arguments for each component and method."""
+    parts = [
+        "# Arguments",
+        "The arguments of all components and methods, with their defaults. `unrender methods NAME` prints the options "
+        "of a method on the terminal.",
+    ]
+    for kind in registry.KINDS:
+        if kind in ("method", "gallery problem"):
+            continue
+        parts.append(f"## {kind[0].upper()}{kind[1:]}{'es' if kind.endswith('s') else 's'}")
+        for name, component in registry.components(kind).items():
+            rows = list(_rows(component))
+            parts.append(f"**`{name}`**: {_cell(_summary(component))}")
+            if rows:
+                parts.append("| argument | default | meaning |\n|---|---|---|\n" + "\n".join(rows))
+    parts.append("## Methods")
+    for name in registry.components("method"):
+        made = method(name)
+        parts.append(f"**`{name}`**: {_cell(made.summary)}")
+        rows = []
+        for key, field in made.options.model_fields.items():
+            default = _code(field.get_default(call_default_factory=True))
+            rows.append(f"| `{key}` | {default} | {_cell(field.description or '')} ({_cell(made.expected(key))}) |")
+        if rows:
+            parts.append("| option | default | meaning |\n|---|---|---|\n" + "\n".join(rows))
+    return "\n\n".join(parts) + "\n"
+
+
+def _rows(component: Any) -> Iterator[str]:
+    """A row for each field that may be set."""
+    if not dataclasses.is_dataclass(component):
+        return
+    meanings = _meanings(component)
+    for field in dataclasses.fields(component):
+        if not field.init or field.name.startswith("_"):
+            continue
+        default = "required"
+        if field.default is not dataclasses.MISSING:
+            default = _code(field.default)
+        elif field.default_factory is not dataclasses.MISSING:
+            default = _code(field.default_factory())
+        yield f"| `{field.name}` | {default} | {_cell(meanings.get(field.name, ''))} |"
+
+
+def _meanings(component: Any) -> dict[str, str]:
+    """{argument: its description} of a class's docstring, and of those it inherits from."""
+    found: dict[str, str] = {}
+    for base in reversed(inspect.getmro(component)):
+        text = inspect.cleandoc(base.__doc__ or "") + "\n"
+        for section in SECTION.finditer(text):
+            for names, meaning in ENTRY.findall(section[2]):
+                found |= {name.strip(): " ".join(meaning.split()) for name in names.split(",")}
+    return found
+
+
+def _summary(component: Any) -> str:
+    return " ".join(inspect.cleandoc(component.__doc__ or "").partition("\n\n")[0].split())
+
+
+def _code(value: Any) -> str:
+    text = repr(value)
+    return f"`{_cell(text)}`" if len(text) <= CODE_COLUMNS else f"a {type(value).__name__}"
+
+
+def _cell(text: str) -> str:
+    """Text that neither ends a cell nor begins markup."""
+    return (
+        re.sub(r"([|<*\[\]]|(?<!\w)_)", r"\\\1", " ".join(text.split()))
+        if "`" not in text
+        else text.replace("|", r"\|")
+    )
