@@ -101,11 +101,10 @@ def test_outlines_of_shapes_that_are_no_meshes_are_refused(name: str, key: str) 
 @pytest.mark.parametrize(
     ("key", "words"),
     [
-        ("sun.to_world", "it places an emitter (DirectionalEmitter), which has no pose"),
-        ("sun.rotation", "sun.to_world: it places an emitter (DirectionalEmitter), which has no pose"),
-        ("beamer.rotation", "it places an emitter (Projector), which has no pose"),
-        ("lamp.to_world", "it places a shape that emits light, which has no pose"),
-        ("lamp.translation", "it places a shape that emits light, which has no pose"),
+        ("sun.to_world", "its pose can be: sun.rotation (--method smoothed)"),
+        ("sun.translation", "a pose is sun.rotation (--method smoothed)"),
+        ("beamer.to_world", "its pose can be: beamer.translation, beamer.rotation (--method smoothed)"),
+        ("lamp.to_world", "its pose can be: lamp.translation, lamp.rotation, lamp.scale (--method smoothed)"),
         ("ball.center", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
         ("ball.radius", "a pose is ball.translation, ball.rotation, ball.scale (--method smoothed)"),
         ("ball.to_world", "its pose can be: ball.translation, ball.rotation, ball.scale (--method smoothed)"),

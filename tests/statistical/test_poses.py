@@ -151,7 +151,8 @@ def test_all_states_of_a_batch_share_their_random_numbers() -> None:
 def test_what_poses_refuse() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
     known = renderer.parameters()
-    assert "light.translation" not in known  # an emitter
+    assert "light.translation" in known
+    assert "sky.rotation" not in known  # it looks the same from everywhere
     assert known["block.translation"].shape == (3,)
     assert known["block.scale"].shape == ()
     with pytest.raises(ur.InputError, match=r"block\.rotation stands for the same coordinate"):

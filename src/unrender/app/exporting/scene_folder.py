@@ -206,11 +206,17 @@ def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
 
 
 def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
-    """Put a pose before the `to_world` of a shape or sensor, and tell which node that is."""
-    index = next(
-        i for kind in (mi.ObjectType.Shape, mi.ObjectType.Sensor) for i in graph.of(kind) if graph.names[i] == target
-    )
+    """Put a pose before the `to_world` of a shape, emitter or sensor, and return which node that is."""
+    kinds = mi.ObjectType.Shape, mi.ObjectType.Emitter, mi.ObjectType.Sensor
+    index = next(i for kind in kinds for i in graph.of(kind) if graph.names[i] == target)
     props = graph.nodes[index].props
+    # An emitter may be placed by a point or a direction of the world instead; a sky's sun is given beside its `to_world`.
+    placed = [name for name in ("position", "direction", "sun_direction") if name in props]
+    for name in placed:
+        vector = [*np.array(props[name], float).reshape(3), 1.0 if name == "position" else 0.0]
+        props[name] = type(props[name])((matrix @ vector)[:3].tolist())
+    if placed in (["position"], ["direction"]):
+        return index
     before = props["to_world"] if "to_world" in props else mi.ScalarTransform4d()
     before = np.array(before.matrix, float).reshape(4, 4)
     props["to_world"] = mi.ScalarTransform4d((matrix @ before).tolist())

@@ -16,6 +16,7 @@ from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.pixel_filter import is_box
+from unrender.rendering.mitsuba.poses import is_bare
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
@@ -30,7 +31,8 @@ _STREAM = 3
 def moved_shape(scene: LoadedScene, key: str) -> str:
     """The id of the shape whose points a parameter moves, "" where it moves none."""
     if key in scene.poses:
-        return scene.poses.key(key).target
+        target = scene.poses.key(key).target
+        return "" if is_bare(scene.scene, target) else target
     owner, _, name = key.rpartition(".")
     return owner if name == "vertex_positions" else ""
 

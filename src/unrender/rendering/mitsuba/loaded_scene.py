@@ -206,7 +206,8 @@ class LoadedScene:
             values: {key: `mi.TensorXf`}.
             attached: those that are leaves of the derivative graph.
         """
-        self._restore([key for key in self._settings if key not in values])
+        unset = [key for key in self._settings if key not in values]
+        self._restore(unset)
         changed = [key for key, value in values.items() if not self._is_set(key, value, key in attached)]
         # Where others change the scene between two passes, leaves are made anew within the backward pass of an operation of theirs:
         # then all of them, since Dr.Jit (1.5) loses the gradients of leaves of which some were made within it and some before.
@@ -223,14 +224,16 @@ class LoadedScene:
                 self._posed[key] = leaf
             else:
                 self.parameters[key] = leaf
-        if any(key in self.poses for key in changed):
+        plain = [key for key in changed if key not in self.poses]
+        if plain:
+            self._update(plain)
+            self._hold({key: self.leaves.get(key, self._settings[key].value) for key in plain})
+        # Where one pose of a target is unset, the target was put back, and its other poses are written again.
+        if self._posed and any(key in self.poses for key in (*changed, *unset)):
             self.poses.write(self.parameters, self._posed)
-        elif changed:
-            self._update(changed)
-            self._hold({key: self.leaves.get(key, self._settings[key].value) for key in changed})
         if changed and self._shared:
-            plain = [key for key in self._settings if key not in self.poses]
-            self._held = {key: _reference(dr.detach(self.parameters[key])) for key in plain}
+            held = [key for key in self._settings if key not in self.poses]
+            self._held = {key: _reference(dr.detach(self.parameters[key])) for key in held}
 
     def _update(self, changed: Sequence[str]) -> None:
         """Have the scene take what was written. Raises `InputError` where a plugin of Mitsuba's refuses it."""

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import mitsuba as mi
 
+from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.parameter_errors import Role
@@ -63,6 +64,7 @@ class ParameterTraits:
         delta_lobes: the BSDFs of shapes whose perfectly specular lobes follow it, each with one of the `DELTA_...` constants.
         medium: whether extinction or scattering of a participating medium depends on it.
         phase: whether it belongs to a phase function.
+        light: whether it moves an emitter that has no shape, so that no acceleration structure follows it.
     """
 
     geometric: bool
@@ -71,6 +73,7 @@ class ParameterTraits:
     delta_lobes: tuple[tuple[Any, int], ...] = ()
     medium: bool = False
     phase: bool = False
+    light: bool = False
 
     @property
     def shares_paths(self) -> bool:
@@ -117,6 +120,7 @@ def _joined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:
         tuple((lobes | dict(other.delta_lobes)).items()),
         one.medium or other.medium,
         one.phase or other.phase,
+        one.light and other.light,
     )
 
 
@@ -134,7 +138,7 @@ def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
         return _bsdf_traits(bsdfs, chain)
     if any(isinstance(n, mi.Emitter) for n in chain):
         if leaf in ("to_world", "position", "direction", "cutoff_angle", "beam_width"):
-            return ParameterTraits(True, "it moves an emitter")
+            return ParameterTraits(True, "it moves an emitter", light=True)
         if leaf == "sun_direction":
             why = "it moves the sun's disk, whose border path gradients do not follow"
             return ParameterTraits(False, why, replayable=False)
@@ -190,12 +194,10 @@ def _masks_delta(bsdf: Any) -> bool:
 def transform_obstacle(scene: mi.Scene, parameters: mi.SceneParameters, key: str) -> str:
     """Return why the object whose transformation is `key` has no pose, "" where it has one."""
     node: Any = parameters.properties[key][2]
-    if isinstance(node, mi.Emitter):
+    if isinstance(node, mi.Emitter) and not (poses.is_posable(node) and node in scene.emitters()):
         return f"it places an emitter ({node.class_name()}), which has no pose"
     if isinstance(node, mi.Sensor) and not any(node.id() == sensor.id() for sensor in scene.sensors()):
         return "it places a sensor of a batch, which has no pose of its own; give the sensors to the scene one by one"
-    if isinstance(node, mi.Shape) and node.is_emitter():
-        return "it places a shape that emits light, which has no pose"
     if isinstance(node, mi.Shape) and node.is_sensor():
         return "it places a shape that carries a sensor, which has no pose"
     return ""

@@ -1,17 +1,18 @@
-"""Rigid poses of shapes and sensors as parameters, a pose per lane.
+"""Rigid poses of shapes, lights and sensors as parameters, a pose per lane.
 
-For every shape that is no emitter and carries no sensor, and for every sensor that no shape carries, the renderer offers parameters
-that Mitsuba does not have:
+For every shape that carries no sensor, every sensor that no shape carries, and the emitters without a shape that `_LIGHTS` lists, the
+renderer offers parameters that Mitsuba does not have:
 
     <id>.translation    (3,)  in units of the world; 0 as loaded
     <id>.rotation       (3,)  rotation vector, axis times angle in radians; 0 as loaded
     <id>.scale          ()    factor, shapes only; 1 as loaded
 
 and each coordinate of the first two alone, `<id>.translation.x` and so on, (). A point x of the shape goes to
-c + translation + scale R (x - c), where c is the centre of the shape's bounding box, or where the sensor stands.
+c + translation + scale R (x - c), where c is the centre of the shape's bounding box, or where the sensor or light stands.
 
-Geometry is never moved, and no acceleration structure rebuilt: a posed shape lives in a scene of its own, and rays are transformed into it.
-Since each ray may have its own transform, one launch renders any number of poses.
+The geometry of shapes that emit nothing is never moved, and no acceleration structure rebuilt: a posed shape lives in a scene of its own,
+and rays are transformed into it. Since each ray may have its own transform, one launch renders any number of poses. Poses of lights are
+written into the scene instead (`rigid_motions.py`), where emitters are sampled.
 """
 
 from __future__ import annotations
@@ -29,9 +30,31 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["Assembly", "Pose", "PoseKey", "PosedScene", "centres", "info", "keys", "matrices", "slots"]
+__all__ = [
+    "Assembly",
+    "Pose",
+    "PoseKey",
+    "PosedScene",
+    "centres",
+    "info",
+    "is_bare",
+    "is_posable",
+    "keys",
+    "matrices",
+    "slots",
+]
 
 _AXES = ("x", "y", "z")
+_MOTIONS = ("translation", "rotation")
+_LIGHTS = {
+    "PointLight": ("translation",),
+    "SpotLight": ("translation", "rotation"),
+    "Projector": ("translation", "rotation"),
+    "DirectionalEmitter": ("rotation",),
+    "EnvironmentMapEmitter": ("rotation",),
+    "SunskyEmitter": ("rotation",),
+}
+"""{class of an emitter without a shape: what its pose consists of}."""
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+")
 
 
@@ -40,14 +63,16 @@ class PoseKey:
     """What a key of this module stands for.
 
     Attributes:
-        target: id of the shape or sensor.
+        target: id of the shape, emitter or sensor.
         part: "translation", "rotation" or "scale".
         axis: 0 to 2, or None for all.
+        light: whether the target emits light.
     """
 
     target: str
     part: str
     axis: int | None
+    light: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -60,30 +85,44 @@ class PoseKey:
 
 
 def keys(scene: Any) -> dict[str, PoseKey]:
-    """The pose parameters that a scene has, by key."""
-    shapes = [shape.id() for shape in scene.shapes() if not (shape.is_emitter() or shape.is_sensor())]
-    sensors = [sensor.id() for sensor in scene.sensors() if sensor.get_shape() is None]
+    """Return the pose parameters that a scene has, by key."""
+    targets = [
+        (shape.id(), (*_MOTIONS, "scale"), shape.is_emitter()) for shape in scene.shapes() if not shape.is_sensor()
+    ]
+    lamps = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    targets += [(lamp.id(), _LIGHTS.get(lamp.class_name(), ()), True) for lamp in lamps]
+    targets += [(sensor.id(), _MOTIONS, False) for sensor in scene.sensors() if sensor.get_shape() is None]
+    counts = Counter(target for target, _, _ in targets)
     found: dict[str, PoseKey] = {}
-    counts, moved = Counter(shapes + sensors), frozenset(shapes)
-    for target, count in counts.items():
-        if _NAMELESS.fullmatch(target) or count > 1:
+    for target, parts, light in targets:
+        if _NAMELESS.fullmatch(target) or counts[target] > 1:
             continue
-        for part in ("translation", "rotation"):
-            for axis in (None, 0, 1, 2):
-                key = f"{target}.{part}" + ("" if axis is None else f".{_AXES[axis]}")
-                found[key] = PoseKey(target, part, axis)
-        if target in moved:
-            found[f"{target}.scale"] = PoseKey(target, "scale", None)
+        for part in parts:
+            key = f"{target}.{part}"
+            found[key] = PoseKey(target, part, None, light)
+            if part != "scale":
+                found |= {f"{key}.{name}": PoseKey(target, part, axis, light) for axis, name in enumerate(_AXES)}
     return found
+
+
+def is_posable(emitter: Any) -> bool:
+    """Return whether an emitter without a shape has a pose."""
+    return emitter.class_name() in _LIGHTS
+
+
+def is_bare(scene: Any, target: str) -> bool:
+    """Return whether a target is an emitter without a shape."""
+    return any(emitter.id() == target and emitter.get_shape() is None for emitter in scene.emitters())
 
 
 def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
     """What the renderer says of a pose parameter; `obstacle`: why path gradients do not serve, "" where they do;
     `sensor`: index of the sensor that it moves, None where it moves a shape."""
     viewpoint = sensor is not None
-    why = f"it moves a {'sensor' if viewpoint else 'shape'} as a whole"
+    what = "light" if key.light else "sensor" if viewpoint else "shape"
+    why = f"it moves a {what} as a whole"
     if obstacle:
-        why = f"it moves a shape or sensor as a whole, and {obstacle}; SmoothedDerivatives has its derivative"
+        why += f", and {obstacle}; SmoothedDerivatives has its derivative"
     low = 1e-3 if key.part == "scale" else None
     return ParameterInfo(
         key.shape,
@@ -272,13 +311,25 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
 
 
 def centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
-    """What each of the targets turns about, shapes before sensors."""
+    """Return what each of the targets turns about: shapes first, then emitters, then sensors."""
     found = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
+    lamps = [emitter for emitter in scene.emitters() if emitter.get_shape() is None and emitter.id() in targets]
+    found |= {lamp.id(): _place(lamp) for lamp in lamps}
     for sensor in scene.sensors():
         if sensor.id() in targets:
             matrix = np.array(sensor.world_transform().matrix.numpy(), float).reshape(4, 4)
             found[sensor.id()] = matrix[:3, 3].tolist()
     return found
+
+
+def _place(emitter: Any) -> list[float]:
+    """Return where an emitter without a shape stands; the origin for light from afar."""
+    parameters: Any = mi.traverse(emitter)
+    if "position" in parameters:
+        return np.array(parameters["position"], float).reshape(3).tolist()
+    if "translation" not in _LIGHTS[emitter.class_name()]:
+        return [0.0, 0.0, 0.0]
+    return np.array(parameters["to_world"].matrix, float).reshape(4, 4)[:3, 3].tolist()
 
 
 def slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:

@@ -71,8 +71,7 @@ class MitsubaRenderer:
             *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         self._formats = formats(self.pair.current.sensors())
-        # Posed shapes live in scenes of their own, which media do not reach.
-        self._poses = {} if self.pair.volumetric else poses.keys(self.pair.current)
+        self._poses = self._pose_keys()
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
         sensors = {sensor.id(): index for index, sensor in enumerate(self.pair.current.sensors())}
         found = self._obstacles({pose.target for pose in self._poses.values()})
@@ -130,12 +129,13 @@ class MitsubaRenderer:
         if (names, wanted, space) not in self._checked:
             for key in keys:
                 self._check(key, space, key in wanted)
+            self._check_targets(keys)
             if space is not None:
                 self.pair.check_separate([key for key in keys if key not in self._poses])
             self._checked.add((names, wanted, space))
         if (names, wanted) not in self._sessions:
-            chosen = {key: self._poses[key] for key in keys if key in self._poses}
-            rest = [key for key in keys if key not in self._poses]
+            chosen = {key: self._poses[key] for key in keys if key in self._poses and not self._is_written(key, keys)}
+            rest = [key for key in keys if key not in chosen]
             session = MitsubaSession(
                 self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
@@ -168,6 +168,32 @@ class MitsubaRenderer:
             self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.light_paths)
         return self._stock
 
+    def _pose_keys(self) -> dict[str, poses.PoseKey]:
+        """Return the poses that the scene has: of lights alone beside media, which posed shapes in scenes of their own do not meet."""
+        written = self.pair.loaded().poses
+        return {
+            key: pose
+            for key, pose in poses.keys(self.pair.current).items()
+            if (key in written if pose.light else not self.pair.volumetric)
+        }
+
+    def _is_written(self, key: str, keys: Iterable[str]) -> bool:
+        """Return whether a pose is written into the scene: a light's always, and others beside a shape that emits light, with which the
+        scene's acceleration structure changes."""
+        if self._poses[key].light:
+            return True
+        scene = self.pair.loaded()
+        lit = any(other in self._poses and self._poses[other].light and moved_shape(scene, other) for other in keys)
+        return lit and key in scene.poses
+
+    def _check_targets(self, keys: list[str]) -> None:
+        """Raise `InputError` where two parameters place the same object."""
+        poses.slots({key: self._poses[key] for key in keys if key in self._poses})
+        written = self.pair.loaded().poses
+        for key in keys:
+            if key in written and (other := next((name for name in written.written(key) if name in keys), "")):
+                raise InputError(f"parameter {key}: {other} places the same object; keep one of them")
+
     def _translates(self, pose: poses.PoseKey) -> str:
         """Why a pose has no derivative because it moves a sensor to another place, "" where that is not so."""
         moves = pose.part == "translation" and any(sensor.id() == pose.target for sensor in self.pair.current.sensors())
@@ -176,14 +202,17 @@ class MitsubaRenderer:
     def _obstacles(self, targets: set[str]) -> dict[str, str]:
         """{shape or sensor that moves: why it has no path gradient, "" where it has}."""
         sensors = {sensor.id() for sensor in self.pair.current.sensors() if sensor.get_shape() is None}
-        return obstacles(self.pair, targets - sensors) | {
-            target: sensor_obstacle(self.pair, target) for target in targets & sensors
-        }
+        lamps = {emitter.id() for emitter in self.pair.current.emitters() if emitter.get_shape() is None}
+        found = obstacles(self.pair, targets - sensors - lamps)
+        found |= {target: sensor_obstacle(self.pair, target) for target in targets & sensors}
+        return found | dict.fromkeys(targets & lamps, "path gradients do not follow it")
 
     def _carries(self, key: str) -> bool:
         """Whether paths of two values of a parameter, which moves a mesh, can be related: see `MovedPair`."""
         scene = self.pair.loaded()
         kinds = {shape.class_name() for shape in scene.scene.shapes()}
+        if key in self._poses and self._poses[key].light:
+            return False
         return bool(moved_shape(scene, key)) and not moved_sensor(scene, key) and not kinds & {"Instance", "ShapeGroup"}
 
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:

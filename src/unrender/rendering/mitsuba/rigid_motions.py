@@ -1,4 +1,4 @@
-"""Rigid poses of meshes and sensors, written into the scene: what path gradients of the keys of `poses.py` are taken through."""
+"""Rigid poses written into the scene: those of lights, and of all else where path gradients are taken through the keys of `poses.py`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["RigidMotions"]
 
 
 class RigidMotions:
-    """The pose parameters of a loaded scene's meshes and sensors.
+    """The pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write.
 
     Args:
         scene: as loaded.
@@ -23,17 +23,24 @@ class RigidMotions:
     """
 
     def __init__(self, scene: Any, own: Mapping[str, Any]):
-        movable = [shape for shape in scene.shapes() if shape.is_mesh()]
-        movable += [sensor for sensor in scene.sensors() if sensor.get_shape() is None]
+        known = poses.keys(scene)
+        targets = {pose.target for pose in known.values()}
         self._own = own
         self._worlds = {
             item.id(): _copy(parameters["to_world"])
-            for item in movable
-            if "to_world" in (parameters := mi.traverse(item))
+            for item in (*scene.shapes(), *scene.emitters(), *scene.sensors())
+            if item.id() in targets and "to_world" in (parameters := mi.traverse(item))
         }
-        able = {item.id() for item in movable if item.id() in self._worlds or f"{item.id()}.vertex_positions" in own}
-        self._keys = {key: pose for key, pose in poses.keys(scene).items() if pose.target in able}
+        written = {target: self._written(target) for target in targets}
+        self._keys = {key: pose for key, pose in known.items() if written[pose.target]}
         self._centres = poses.centres(scene, {pose.target for pose in self._keys.values()})
+
+    def _written(self, target: str) -> str:
+        """Return the parameter of Mitsuba that places a target, "" where there is none."""
+        for name in ("vertex_positions", "position"):
+            if f"{target}.{name}" in self._own:
+                return f"{target}.{name}"
+        return f"{target}.to_world" if target in self._worlds else ""
 
     def __contains__(self, key: str) -> bool:
         return key in self._keys
@@ -50,9 +57,7 @@ class RigidMotions:
         """The parameters of Mitsuba that a parameter is written to: itself, where it is one of them."""
         if key not in self._keys:
             return [key]
-        target = self._keys[key].target
-        positions = f"{target}.vertex_positions"
-        return [positions if positions in self._own else f"{target}.to_world"]
+        return [self._written(self._keys[key].target)]
 
     def restore(self, parameters: mi.SceneParameters, key: str) -> None:
         """Put what a pose has moved back to where it was loaded, without derivatives; the caller updates the scene."""
@@ -64,7 +69,7 @@ class RigidMotions:
             self._set_world(parameters, name, _copy(self._worlds[target]))
 
     def write(self, parameters: mi.SceneParameters, values: Mapping[str, Any]) -> None:
-        """Move the meshes, as derivatives of the poses or not, and update the scene.
+        """Move the targets, with the derivatives of the poses if these are attached, and update the scene.
 
         Args:
             parameters: of the scene.
@@ -72,14 +77,16 @@ class RigidMotions:
         """
         turned: dict[str, Any] = {}
         for target, pose in self._poses(values).items():
-            positions = f"{target}.vertex_positions"
-            if positions not in self._own:
-                self._set_world(parameters, f"{target}.to_world", pose.transform() @ self._worlds[target])
+            name = self._written(target)
+            if name not in self._own:
+                self._set_world(parameters, name, pose.transform() @ self._worlds[target])
                 continue
-            points = dr.unravel(mi.Point3f, self._own[positions])
-            parameters[positions] = dr.ravel(pose.point(points))
+            if name.endswith(".position"):
+                parameters[name] = pose.point(self._own[name])
+                continue
+            parameters[name] = dr.ravel(pose.point(dr.unravel(mi.Point3f, self._own[name])))
             normals = f"{target}.vertex_normals"
-            if dr.width(self._own.get(normals, 0)) == dr.width(self._own[positions]):
+            if dr.width(self._own.get(normals, 0)) == dr.width(self._own[name]):
                 turned[normals] = dr.ravel(pose.matrix @ dr.unravel(mi.Vector3f, self._own[normals]))
         parameters.update()
         # In a second update: Mitsuba computes normals anew whenever positions change.

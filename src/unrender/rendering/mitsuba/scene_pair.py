@@ -24,6 +24,7 @@ from unrender.rendering.mitsuba.emitter_tables import emitter_tables
 from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
+from unrender.rendering.mitsuba.integrators.pointer_tables import pointer_table
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import (
@@ -37,6 +38,7 @@ from unrender.rendering.mitsuba.parameters import (
     update_obstacle,
 )
 from unrender.rendering.mitsuba.pixel_filter import is_box
+from unrender.rendering.mitsuba.poses import is_bare
 from unrender.rendering.mitsuba.range_table import Range
 from unrender.rendering.mitsuba.scene_graph import object_ids
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
@@ -187,8 +189,8 @@ class ScenePair:
                     triangles[number] = first
                     first += shape.face_count()
             self._moved[frozenset(moving)] = {
-                "shape": _table(current, previous),
-                "shape_back": _table(previous, current),
+                "shape": pointer_table(current, previous),
+                "shape_back": pointer_table(previous, current),
                 "triangles": mi.UInt32(triangles),
                 "emitters": self._emitter_bounds(moving),
             }
@@ -306,6 +308,9 @@ class ScenePair:
         return traits
 
     def _traits(self, key: str) -> ParameterTraits:
+        if key in self._current.poses:
+            bare = is_bare(self.current, self._current.poses.key(key).target)
+            return ParameterTraits(True, "it moves an object as a whole", light=bare)
         return parameter_traits(self.current_parameters, key, self.loaded().graph)
 
     def physical_range(self, key: str) -> Range:
@@ -388,13 +393,3 @@ def _areas(mesh: Any) -> Any:
     corners = dr.unravel(mi.Point3u, mesh.faces_buffer())
     a, b, c = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), corner) for corner in corners)
     return dr.norm(dr.cross(b - a, c - a))
-
-
-def _table(current: Any, previous: Any) -> mi.UInt32:
-    source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
-    target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]
-    if source.shape != target.shape:
-        raise InputError("scene: two loads of the description differ in their shapes or emitters")
-    table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
-    table[source] = target
-    return mi.UInt32(table)

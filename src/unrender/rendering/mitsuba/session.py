@@ -38,7 +38,7 @@ from unrender.rendering.mitsuba.passes import (
     TangentPass,
     VerticesPass,
 )
-from unrender.rendering.mitsuba.poses import PosedScene, PoseKey, slots
+from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
 from unrender.rendering.mitsuba.recordable import are_recordable
 from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
@@ -60,8 +60,8 @@ class MitsubaSession:
 
     Args:
         pair: both loads of the scene, which sessions share.
-        keys: the parameters, poses left out.
-        poses: {key: what it stands for} of those that are poses.
+        keys: the parameters, among them poses that are written into the scene.
+        poses: {key: what it stands for} of the poses by which rays are transformed.
         derivatives: the parameters that are leaves of the derivative graph: for all of a session or never, since recorded kernels
             would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
         paths: settings of the light paths.
@@ -86,14 +86,16 @@ class MitsubaSession:
         differential_bsdf: bool = False,
     ):
         traits = {key: pair.parameter_traits(key) for key in keys}
-        cameras = [key for key in (*keys, *poses) if moved_sensor(pair.loaded(), key)]
-        moving = next((key for key in keys if traits[key].geometric and key not in cameras), None)
+        scene = pair.loaded()
+        cameras = [key for key in (*keys, *poses) if moved_sensor(scene, key)]
+        moving = next((key for key, of in traits.items() if of.geometric and not of.light and key not in cameras), None)
         if poses and moving is not None:
             raise InputError(
                 f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
             )
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
-        moved = {key: moved_shape(pair.loaded(), key) for key in (*keys, *poses) if key not in cameras}
+        moved = {key: moved_shape(scene, key) for key in (*keys, *poses) if key not in cameras}
+        moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         # Of pairs: what moves, and what stands still.
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
         self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
@@ -101,7 +103,6 @@ class MitsubaSession:
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
             # Path gradients move the shapes and sensors of the scene itself.
-            slots(poses)
             everything = [key for key in (*keys, *poses) if key in derivatives]
             cameras = [key for key in cameras if key in derivatives]
             if fixed and (other := next((key for key in everything if key in poses or key in cameras), None)):
@@ -116,9 +117,8 @@ class MitsubaSession:
             self._replays = len(cameras) < len(everything)
             keys = [*keys, *(key for key in poses if key in derivatives)]
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
-        if fixed:
-            # Path gradients of an earlier session may have left shapes where it moved them.
-            pair.loaded().set_parameters({})
+        if fixed:  # path gradients of an earlier session may have left shapes where it moved them
+            scene.set_parameters({})
         self._posed = PosedScene(pair.current, fixed) if fixed else None
         if self._posed is not None:
             share_addresses(self._posed.scenes())

@@ -7,10 +7,12 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.integrators.array_types import UInt32
 
-__all__ = ["Pointer", "StatePointers", "registry_id", "remap"]
+__all__ = ["Pointer", "StatePointers", "pointer_table", "registry_id", "remap"]
 
 Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
 
@@ -59,3 +61,17 @@ class StatePointers:
         siₚ = mi.SurfaceInteraction3f(si)
         siₚ.shape = remap(self._tables["shape"], si.shape)
         return [si, siₚ]
+
+
+def pointer_table(current: Any, previous: Any) -> mi.UInt32:
+    """Return the table from the registry ids of one load's pointers to those of another load.
+
+    Raises `InputError` where the two loads differ in their number.
+    """
+    source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    if source.shape != target.shape:
+        raise InputError("scene: two loads of the description differ in their shapes or emitters")
+    table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
+    table[source] = target
+    return mi.UInt32(table)
