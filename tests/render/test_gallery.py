@@ -261,9 +261,7 @@ def test_every_parameter_follows_a_path_of_another_state_and_is_seen(small):
     estimator = ur.PathGradient(image=ur.images.RecursiveControlVariate(space="path"), spp=8)
     result = ur.optimize(small, estimator, ur.optimizers.Adam(learning_rate=0.02), steps=12, seed=1)
     assert result.skipped == 0
-    assert [
-        line for line in result.warnings if "further from the truth" not in line
-    ] == []  # twelve steps promise nothing
+    assert result.warnings == []
     for key, value in result.parameters.items():
         moved = np.abs(value - result.initial[key]) > 1e-4
         assert moved.mean() > 0.75, key  # texels that some camera sees

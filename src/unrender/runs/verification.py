@@ -141,6 +141,13 @@ class FreshPictures:
             found.append(images.reshape(_GROUPS, -1, 3))
         return found
 
+    def residual(self, images: Sequence[np.ndarray]) -> float:
+        """Return the mean square over pixels and channels by which images (K, N, 3) of each frame differ from the references."""
+        means = np.concatenate([one.mean(axis=0) for one in images])
+        weights = self.weights[:, None] * np.isfinite(means)
+        squares = np.where(np.isfinite(means), means - self.references, 0.0) ** 2
+        return float((weights * squares).sum() / max(float(weights.sum()), 1e-300))
+
     @property
     def weights(self) -> np.ndarray:
         """How much each pixel counts, (N,), of all frames one after the other; at most 1."""

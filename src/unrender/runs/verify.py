@@ -17,6 +17,7 @@ from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.hooks import Hook
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
+from unrender.runs.truth_check import FEW_STEPS, further_from_truth
 from unrender.runs.verification import (
     FreshPictures,
     Picture,
@@ -41,8 +42,6 @@ _SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
 """Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
-_FURTHER = 1.1
-"""Ratio of a parameter's last error to its first, where the truth is known, from which on a warning says so."""
 _FIRST_CANDIDATE = 64
 """The step after which the first candidate is taken; the next ones after twice as many steps each."""
 _EARLIER, _STILL = 0.75, 0.85
@@ -131,9 +130,11 @@ class Verify(Hook):
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
         kept = places[best][0] if places else last
-        lines = self._residual(result) + _further(
-            problem, result.initial, places[best][1] if places else result.parameters
-        )
+        lines = self._residual(result)
+        few = result.steps < FEW_STEPS
+        if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
+            ends = places[best][1] if places else result.parameters
+            lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
         lines += _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
         told: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
@@ -285,19 +286,6 @@ def _lines(first: Picture, last: Picture, best: str, kept_loss: float, memory: M
             "is wrong; try --method plain, or the control variate's space = primary"
         )
     return found
-
-
-def _further(problem: Problem, first: Mapping[str, np.ndarray], last: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a warning for each parameter that ends further from its known truth than it began."""
-    if not problem.has_truth or _other_meshes(problem):
-        return []
-    before, after = problem.parameter_error(first), problem.parameter_error(last)
-    return [
-        f"{key} ends further from the truth than it began: error {text(error)}, {text(before[key])} at the start; the images may allow "
-        "several solutions: try another start, bounds, or more views"
-        for key, error in after.items()
-        if 0.0 < _FURTHER * before[key] < error and (text := problem.measures[key].text)
-    ]
 
 
 def _loss(picture: Picture) -> str:

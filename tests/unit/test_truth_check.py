@@ -1,0 +1,79 @@
+"""Warnings about parameters that end further from their truth: only where the pictures show it, and beyond noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.truth_check import further_from_truth
+from unrender.runs.verification import FreshPictures
+
+SIDE, CELLS = 12, 8
+START = 0.2
+
+
+def made(noise_of_references: float = 0.0) -> ur.Problem:
+    """A texture of 8 x 8 cells, of which the pixels show the upper half; each pixel shows a cell, three channels alike."""
+    generator = np.random.default_rng(0)
+    cell = generator.integers(0, CELLS * CELLS // 2, SIDE * SIDE)
+    matrix = np.repeat(np.eye(CELLS * CELLS)[cell], 3, axis=0)
+    truth = generator.uniform(0.3, 0.7, (CELLS, CELLS, 1))
+    renderer = AnalyticRenderer({"x": np.full((CELLS, CELLS, 1), 0.5)}, matrix, noise=0.02, shape=(SIDE, SIDE))
+    reference = (matrix @ truth.ravel()).reshape(SIDE, SIDE, 3)
+    reference = reference + noise_of_references * generator.normal(size=reference.shape)
+    return ur.Problem(renderer, [ur.Parameter("x", initial=truth + START)], [ur.View(reference)], truth={"x": truth})
+
+
+def lines(problem: ur.Problem, last: np.ndarray, first: np.ndarray | None = None, few: bool = False) -> list[str]:
+    begin = problem.initial_values()["x"] if first is None else first
+    pictures = FreshPictures(problem, 0, 0)
+    return further_from_truth(problem, pictures, {"x": begin}, {"x": last.astype(np.float32)}, few, 1.0)
+
+
+def changed(problem: ur.Problem, upper: float, lower: float) -> np.ndarray:
+    values = np.array(problem.truth["x"], float)
+    values[: CELLS // 2] += upper
+    values[CELLS // 2 :] += lower
+    return values
+
+
+def test_cells_that_no_picture_shows_may_drift() -> None:
+    problem = made()
+    assert lines(problem, changed(problem, 0.1, 2.0)) == []
+
+
+@pytest.mark.parametrize("lower", [0.0, 2.0])
+def test_cells_that_walk_away_are_told(lower: float) -> None:
+    problem = made()
+    (line,) = lines(problem, changed(problem, 0.3, lower))
+    assert line.startswith("x ends further from the truth than it began where the pictures show it: error 0.3, 0.2 at")
+
+
+def test_the_noise_of_the_references_is_no_walk() -> None:
+    """A descent from beside the truth ends at what the noisy references say."""
+    problem, noise = made(0.3), np.random.default_rng(1).normal(0, 0.1, (CELLS, CELLS, 1))
+    near = changed(problem, 0.01, 0.01)
+    assert lines(problem, problem.truth["x"] + noise, near) == []
+    assert len(lines(made(), problem.truth["x"] + noise, near)) == 1
+    assert len(lines(problem, changed(problem, 0.6, 0.0), near)) == 1
+
+
+def test_few_steps_must_lead_further() -> None:
+    problem = made()
+    assert lines(problem, changed(problem, 0.25, 0.0), few=True) == []
+    assert len(lines(problem, changed(problem, 0.4, 0.0), few=True)) == 1
+
+
+@pytest.mark.parametrize(("steps", "told"), [(8, False), (64, True)])
+def test_a_run_of_few_steps_with_a_better_picture_is_unfinished(steps: int, told: bool) -> None:
+    """The picture shows x + y / 10 alone, so that y walks away while the picture gets better."""
+    matrix = np.tile([[1.0, 0.1]], (SIDE * SIDE * 3, 1))
+    renderer = AnalyticRenderer({"x": np.zeros(()), "y": np.zeros(())}, matrix, noise=0.1, shape=(SIDE, SIDE))
+    truth = {"x": np.array(3.0), "y": np.array(-0.2)}
+    reference = (matrix @ [3.0, -0.2]).reshape(SIDE, SIDE, 3)
+    problem = ur.Problem(renderer, [ur.Parameter("x"), ur.Parameter("y")], [ur.View(reference)], truth=truth)
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.03), steps=steps)
+    assert result.status == "finished"
+    assert [line.split()[0] for line in result.warnings if "further" in line] == (["y"] if told else [])
