@@ -29,6 +29,7 @@ from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
 from unrender.methods import method
+from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 from unrender.rendering.mitsuba.range_table import Range
@@ -38,6 +39,9 @@ from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.exponential import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.runs import loop
+from unrender.runs.budget import Budget
+from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, first_values
 from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
 from unrender.scene.batches import WholeView
@@ -74,6 +78,7 @@ __all__ = [
     "black_box",
     "build_problem",
     "coupled_gradients",
+    "descend",
     "dr",
     "element_scales",
     "from_tensor",
@@ -274,3 +279,10 @@ def gradient_of(
 def with_preconditioner(problem: ur.Problem, preconditioner: Any, *keys: str) -> ur.Problem:
     """Return the problem with a preconditioner for parameters that have none."""
     return problem.configured(dict.fromkeys(keys, ParameterSettings(preconditioner=preconditioner)))
+
+
+def descend(problem: ur.Problem, estimator: Estimator, optimizer: Optimizer, steps: int) -> dict[str, np.ndarray]:
+    """Return the parameters after some steps; without the pictures that verify a run, which cost more than a short one."""
+    run, state = loop.prepare(Plan(problem, estimator, optimizer), steps, None, 1)
+    log = RunMetadata(describe_run(run, RunAnnotations()), first_values(run))
+    return loop.descend(loop.Descent(run, state, log, [Budget()])).parameters

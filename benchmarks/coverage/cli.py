@@ -23,19 +23,23 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("plugins", nargs="*", help="measure these alone; the record keeps the others")
     parser.add_argument("--ranges", action="store_true", help="write docs/reference/ranges.md alone")
     parser.add_argument("--page", action="store_true", help="write the pages from the record, measure nothing")
-    parser.add_argument("--no-descent", action="store_true", help="leave out the descents")
+    parser.add_argument("--descents", action="store_true", help="measure the descents alone; the record keeps the rest")
     parser.add_argument("--record", type=Path, default=RECORD, help="the record's file")
     given = parser.parse_args(arguments)
     ur.use()
     from benchmarks.coverage import coverage_page, ranges_page
-    from benchmarks.coverage.plugins import PLUGINS
+    from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
 
     if not (given.ranges or given.page):
+        scenes = {**PLUGINS, **IN_INSTANCES}
         record = json.loads(given.record.read_text()) if given.record.is_file() else {}
-        for name in given.plugins or PLUGINS:
-            record[name] = _measure_apart(name, not given.no_descent)
+        for name in given.plugins or scenes:
+            known = record.get(name) if given.descents else None
+            if known is not None and "parameters" not in known:
+                continue  # refused as a whole
+            record[name] = _measure_apart(name, known)
             print(name, json.dumps(record[name]), flush=True)
-            given.record.write_text(json.dumps({key: record[key] for key in PLUGINS if key in record}, indent=1) + "\n")
+            given.record.write_text(json.dumps({key: record[key] for key in scenes if key in record}, indent=1) + "\n")
     if given.record != RECORD:
         return 0
     if not given.ranges:
@@ -46,11 +50,11 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _measure_apart(name: str, descend: bool) -> dict[str, Any]:
+def _measure_apart(name: str, known: dict[str, Any] | None) -> dict[str, Any]:
     """Measure a plugin in a process of its own, which Mitsuba may end."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(theirs, name, descend))
+    process = context.Process(target=_send, args=(theirs, name, known))
     process.start()
     theirs.close()
     try:
@@ -62,10 +66,10 @@ def _measure_apart(name: str, descend: bool) -> dict[str, Any]:
     return found
 
 
-def _send(connection: Any, name: str, descend: bool) -> None:
+def _send(connection: Any, name: str, known: dict[str, Any] | None) -> None:
     from benchmarks.coverage.measure import measure
 
     try:
-        connection.send(measure(name, descend))
+        connection.send(measure(name, known))
     except BaseException as error:  # any traceback is a finding
         connection.send({"failed": f"{type(error).__name__}: {error}"[:400]})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks import markdown
-from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
 from benchmarks.runner.catalogue import ROOT
 
 __all__ = ["PAGE", "page"]
@@ -13,35 +13,29 @@ __all__ = ["PAGE", "page"]
 PAGE = ROOT / "docs" / "reference" / "coverage.md"
 _HEAD = """# Coverage of Mitsuba's plugins
 
-Written by `python -m benchmarks coverage` from a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1.
+Written by `python -m benchmarks coverage` from a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1. The rows *in instances* have
+the plugin's shape in a `shapegroup` with two instances; one parameter of each is measured, with a quarter of the samples.
 
 | column | contents |
 |---|---|
 | image | mean of our picture over Mitsuba's, and the largest difference of 2 x 2 pixels in standard errors |
 | gradient | path gradient over finite difference along a random direction, with its standard error |
-{descent}
+| descends | squared error of the picture, and error of the parameter, after 40 steps of Adam over before |
+
 *refused* is followed by the line that a user reads. *perturbed* means that there is no path gradient, so `--method smoothed` recovers the
-parameter from perturbed renders. *weak* means that noise would hide a difference of 3 % of a picture, or of the whole gradient."""
-_DESCENT = (
-    "| descent | image error (L2, less its noise) after 30 steps over before, from a start two twentieths of the range away; "
-    "*unseen* where the pictures hardly differ |\n"
-)
+parameter from perturbed renders. *weak* means that noise would hide a difference of 3 % of a picture, or of the whole gradient. *unseen*
+means that a start far away in the parameter's range leaves the picture as it is, within noise. A descent begins a tenth of the range
+away, or further where the pictures would hardly differ. It follows path gradients, or perturbed renders where there are none. The squared
+error of its picture must halve, and its parameter must come closer to the truth."""
 
 
 def page(record: dict[str, Any]) -> str:
-    """Return the text of the page. The last column is left out where no descent was measured."""
-    entries = [entry for found in record.values() for entry in found.get("parameters", {}).values()]
-    columns = 5 if any("descent" in entry for entry in entries) else 4
-    parts = [_HEAD.format(descent=_DESCENT if columns == 5 else "")]
-    kinds = sorted({plugin.kind for plugin in PLUGINS.values()}, key=str.lower)
-    for kind in kinds:
-        rows = [
-            row[:columns]
-            for name, plugin in PLUGINS.items()
-            if plugin.kind == kind
-            for row in _rows(name, record.get(name))
-        ]
-        table = markdown.table(" | ".join(["plugin", "parameter", "image", "gradient", "descent"][:columns]), rows)
+    """Return the text of the page."""
+    parts = [_HEAD]
+    scenes = {**PLUGINS, **IN_INSTANCES}
+    for kind in sorted({plugin.kind for plugin in scenes.values()}, key=str.lower):
+        rows = [row for name, plugin in scenes.items() if plugin.kind == kind for row in _rows(name, record.get(name))]
+        table = markdown.table("plugin | parameter | image | gradient | descends", rows)
         parts.append(f"## {kind[0].upper()}{kind[1:]}\n\n{table}")
     return "\n\n".join(parts) + "\n"
 
@@ -83,7 +77,8 @@ def _descent(found: dict[str, Any] | None) -> str:
         return _cell(f"refused: {found['refused']}")
     if found["ok"] is None:
         return "unseen"
-    return f"{'' if found['ok'] else '**no**, '}{found['after'] / found['before']:.2g}"
+    verdict = "" if found["ok"] else "**no**, "
+    return f"{verdict}{found['after'] / found['before']:.2g}, {found['error']:.2g}"
 
 
 def _verdict(found: dict[str, Any]) -> str:

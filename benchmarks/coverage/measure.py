@@ -10,9 +10,9 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.coverage.checks import descended, gradients_agree, images_agree
-from benchmarks.coverage.plugins import PLUGINS
+from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
 from benchmarks.coverage.scenes import Plugin
-from benchmarks.internals import SampleRequest, load_scene, media, mi, mitsuba_renderer
+from benchmarks.internals import SampleRequest, descend, load_scene, media, mi, mitsuba_renderer
 
 __all__ = ["measure"]
 
@@ -21,43 +21,54 @@ RUNS, SPP = 16, 64
 _MOST_RUNS = 4 * RUNS
 """Runs of a comparison of gradients that is weak, or differs by `_DOUBTFUL` standard errors, after `RUNS`."""
 _DOUBTFUL = 2.5
-STEPS = 30
+_SEEN = 5.0
+STEPS, DESCENT_SPP, PICTURES = 40, 16, 32
+"""Steps of a descent, samples per pixel of each; how many pictures of as many samples make one whose error counts."""
+_INSTANCED = 1
+"""Parameters of a plugin in instances that are measured."""
 _UNROULETTED = 1000
 _AXES = (".x", ".y", ".z")
 
 
-def measure(name: str, descend: bool = True) -> dict[str, Any]:
-    """Return {"refused": reason}, or {"image": ..., "notices": ..., "parameters": {key: ...}}."""
-    plugin = PLUGINS[name]
+def measure(name: str, known: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return {"refused": reason}, or {"image": ..., "notices": ..., "parameters": {key: ...}}.
+
+    Args:
+        name: of the plugin.
+        known: what was measured before: descents alone are added. None measures all.
+    """
+    plugin = (PLUGINS | IN_INSTANCES)[name]
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return _measure(plugin, Path(folder), descend)
+            return _measure(plugin, Path(folder), known)
         except ur.InputError as error:
             return {"refused": str(error)}
 
 
-def _measure(plugin: Plugin, folder: Path, descend: bool) -> dict[str, Any]:
+def _measure(plugin: Plugin, folder: Path, known: dict[str, Any] | None) -> dict[str, Any]:
     def description() -> Any:
         return plugin.build(folder)
 
     renderer = mitsuba_renderer(description, DEPTH)
-    found: dict[str, Any] = {"notices": list(getattr(renderer, "notices", ())), "parameters": {}}
-    session = renderer.prepare([], None, False)
-    ours = [np.array(session.image({}, SampleRequest(0, SPP, 100 + n)).images[0]) for n in range(RUNS)]
-    found["image"] = images_agree(np.stack(ours), _stock(description())).record()
+    found = known or {"notices": list(getattr(renderer, "notices", ())), "parameters": {}}
+    if known is None:
+        session = renderer.prepare([], None, False)
+        ours = [np.array(session.image({}, SampleRequest(0, SPP, 100 + n)).images[0]) for n in range(RUNS)]
+        found["image"] = images_agree(np.stack(ours), _stock(description())).record()
     for key, info in renderer.parameters().items():
         prefix = next((p for p in plugin.prefixes if key.startswith(f"{p}.")), None)
         if prefix is None or key.endswith(_AXES) or not (info.perturbable or info.differentiable):
             continue
-        entry = found["parameters"][key.removeprefix(f"{prefix}.")] = {}
+        if plugin.instanced and len(found["parameters"]) == _INSTANCED and known is None:
+            break
+        entry = found["parameters"].setdefault(key.removeprefix(f"{prefix}."), {})
+        if known is None:
+            try:
+                entry["gradient"] = _gradient(renderer, key, info, SPP // 4 if plugin.instanced else SPP)
+            except ur.InputError as error:
+                entry["gradient"] = {"refused": str(error)}
         try:
-            entry["gradient"] = _gradient(renderer, key, info)
-        except ur.InputError as error:
-            entry["gradient"] = {"refused": str(error)}
-        if not descend:
-            continue
-        try:
-            entry["descent"] = _descent(description, renderer, key, info)
+            entry["descent"] = _descent(renderer, key, info)
         except ur.InputError as error:
             entry["descent"] = {"refused": str(error)}
     return found
@@ -96,7 +107,7 @@ def _scale(value: np.ndarray, info: Any) -> float:
     return 0.05 * (float(np.abs(value).max(initial=0)) or 1.0)
 
 
-def _gradient(renderer: Any, key: str, info: Any) -> dict[str, Any]:
+def _gradient(renderer: Any, key: str, info: Any, spp: int) -> dict[str, Any]:
     if not info.differentiable:
         return {"perturbed": info.reason}
     session = renderer.prepare([key], None)
@@ -114,12 +125,12 @@ def _gradient(renderer: Any, key: str, info: Any) -> dict[str, Any]:
     adjoints, differences = [], []
     found = None
     for number in range(_MOST_RUNS):
-        paths = session.image({key: value}, SampleRequest(0, SPP, 200 + number)).paths
+        paths = session.image({key: value}, SampleRequest(0, spp, 200 + number)).paths
         gradient = np.array(session.adjoint({key: value}, paths, given)[key]).astype(np.float64)
         adjoints.append(float(np.sum(gradient * along)))
         steps = np.array([0.5, -0.5, 0.25, -0.25]) * width
         states = {key: np.stack([at + step * along for step in steps]).astype(np.float32)}
-        images = np.array(session.image_batch(states, SampleRequest(0, 4 * SPP, 500 + number))).astype(np.float64)
+        images = np.array(session.image_batch(states, SampleRequest(0, 4 * spp, 500 + number))).astype(np.float64)
         values = (images * weights).sum((1, 2, 3))
         wide, narrow = (values[0] - values[1]) / width, (values[2] - values[3]) / (width / 2)
         differences.append((4 * narrow - wide) / 3)
@@ -131,30 +142,53 @@ def _gradient(renderer: Any, key: str, info: Any) -> dict[str, Any]:
     return found.record()
 
 
-def _descent(description: Any, renderer: Any, key: str, info: Any) -> dict[str, Any]:
+def _descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
+    """Descend from a perturbed start by Adam: on path gradients, or on perturbed renders where there are none.
+
+    Returns:
+        Mean squares of the pictures' differences "before" and "after", without the noise of their rendering, and the standard
+        "deviation" of the first; the parameter's error after over before as "error"; "ok", or None where the pictures hardly differ.
+    """
     truth = np.array(renderer.values([key])[key]).astype(np.float64)
-    offset = 2 * _direction(key, truth, _scale(truth, info), info.welded)
+    session, groups = renderer.prepare([key], None, info.differentiable), 2 if info.differentiable else 1
+
+    def picture(value: Any, half: int) -> np.ndarray:
+        tree = {key: renderer.array(np.asarray(value, np.float32))}
+        requests = [SampleRequest(0, DESCENT_SPP, 5000 + 1000 * half + n, groups=groups) for n in range(PICTURES)]
+        return np.mean([np.array(session.image(tree, request).images).mean(0) for request in requests], axis=0)
+
+    references = [picture(truth, half) for half in (0, 1)]
+
+    def error(value: Any) -> tuple[float, float]:
+        """The product of two independent differences, each of equal random numbers, has no noise on average."""
+        one, other = (picture(value, half) - references[half] for half in (0, 1))
+        square, noise = float(np.mean(one * other)), float(np.mean((one - other) ** 2)) / 2
+        return square, float(np.sqrt(noise * (noise + 2 * max(square, 0.0)) / one.size))
+
+    for width in (2, 4, 8):
+        start, offset = _start(key, truth, info, width)
+        before, deviation = error(start)
+        if seen := before > _SEEN * deviation:
+            break
+    if not seen:
+        return {"before": before, "deviation": deviation, "ok": None}
+    reference = np.mean(references, axis=0)
+    problem = ur.Problem(renderer, [ur.Parameter(key, start)], [ur.View(reference)], truth={key: truth})
+    size = float(np.abs(offset).mean())
+    smoothed = ur.SmoothedDerivatives(size / 2, samples=8, spp=DESCENT_SPP)
+    estimator = ur.PathGradient(spp=DESCENT_SPP) if info.differentiable else smoothed
+    end = descend(problem, estimator, ur.optimizers.Adam(0.15 * size, schedule=ur.schedules.Cosine(STEPS)), STEPS)
+    after, _ = error(end[key])
+    first, last = (problem.parameter_error({key: value})[key] for value in (start.astype(np.float32), end[key]))
+    closer = last / first if first else 0.0
+    found = {"before": before, "deviation": deviation, "after": max(after, 0.0), "error": closer}
+    return {**found, "ok": descended(before, after) and closer < 1}
+
+
+def _start(key: str, truth: np.ndarray, info: Any, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a perturbed start within the range, and how far it is away."""
+    offset = width * _direction(key, truth, _scale(truth, info), info.welded)
     start = truth - offset if info.highest is not None and (truth + offset > info.highest).any() else truth + offset
-    session = renderer.prepare([key], None, False)
-    reference = np.array(
-        session.image({key: renderer.array(truth.astype(np.float32))}, SampleRequest(0, 1024, 7)).images[0]
-    )
-    problem = ur.Problem(description, [ur.Parameter(key, start)], [ur.View(reference)], max_depth=DEPTH)
-    estimator = (
-        ur.PathGradient(spp=8)
-        if info.differentiable
-        else ur.SmoothedDerivatives(float(np.abs(offset).mean()) / 2, samples=8)
-    )
-    rate = 0.1 * float(np.abs(offset).mean())
-    result = ur.optimize(problem, estimator, ur.optimizers.Adam(rate), steps=STEPS, seed=1)
-
-    def error(value: Any) -> float:
-        image = np.array(
-            session.image({key: renderer.array(np.asarray(value, np.float32))}, SampleRequest(0, 1024, 8)).images[0]
-        )
-        return float(np.mean((image - reference) ** 2))
-
-    noise = error(truth)
-    before, after = max(error(start) - noise, 0.0), max(error(result.parameters[key]) - noise, 0.0)
-    seen = before > 3 * noise
-    return {"before": before, "after": after, "noise": noise, "ok": descended(before, after) if seen else None}
+    start = start if info.lowest is None else np.maximum(start, info.lowest)
+    start = start if info.highest is None else np.minimum(start, info.highest)
+    return start, start - truth

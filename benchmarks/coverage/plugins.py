@@ -24,6 +24,7 @@ from benchmarks.coverage.scenes import (
     grid,
     group,
     halved,
+    in_instances,
     integrated,
     irradiance,
     measured,
@@ -45,7 +46,7 @@ from benchmarks.coverage.scenes import (
 )
 from benchmarks.internals import mi
 
-__all__ = ["PLUGINS"]
+__all__ = ["IN_INSTANCES", "PLUGINS"]
 
 _GOLD = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
 _PATH = {"type": "path", "max_depth": 6}
@@ -164,3 +165,12 @@ PLUGINS: dict[str, Plugin] = {
     "volume": textured("volume", lambda: {"type": "volume", "volume": grid()}),
 }  # fmt: skip
 """{name: its scene}, all plugins of the wheel of Mitsuba 3.9.1. After a comma, a name says how the plugin differs from its first scene."""
+
+_INSIDE = ("BSDF", "medium", "phase function", "shape", "texture", "volume")
+_OUTSIDE = ("instance", "shapegroup")
+IN_INSTANCES = {
+    f"{name}, in instances": in_instances(plugin)
+    for name, plugin in PLUGINS.items()
+    if name not in _OUTSIDE and (plugin.kind in _INSIDE or plugin.prefixes == ("lamp.emitter",))
+}
+"""{name: its scene}, the plugins that belong to a shape, in a shapegroup with two instances."""

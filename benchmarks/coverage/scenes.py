@@ -26,12 +26,14 @@ class Plugin:
         build: makes the scene.
         prefixes: of the keys that belong to the plugin, in the scene.
         aborts: whether Mitsuba itself may end the process, so that a process of its own is needed.
+        instanced: whether the plugin is in a shapegroup with two instances. Its first parameters are measured, with fewer samples.
     """
 
     kind: str
     build: Build
     prefixes: tuple[str, ...] = ()
     aborts: bool = False
+    instanced: bool = False
 
 
 def wheel() -> list[str]:
@@ -240,6 +242,28 @@ def group(folder: Path) -> Description:
         for n, x in enumerate((-0.5, 0.6))
     }
     return scene(ball=None, group=group, **places)
+
+
+def in_instances(plugin: Plugin) -> Plugin:
+    """Return the plugin with its shape in a shapegroup that two instances show."""
+    name = plugin.prefixes[0].partition(".")[0]
+
+    def build(folder: Path) -> Description:
+        found = plugin.build(folder)
+        place = mi.ScalarTransform4f
+        copies = {
+            f"copy_{n}": {
+                "type": "instance",
+                "to_world": place().translate([x, 0, 0]).scale(size),
+                "g": {"type": "ref", "id": "group"},
+            }
+            for n, (x, size) in enumerate(((-0.6, 0.8), (0.7, 0.6)))
+        }
+        part = found.pop(name)
+        return {**found, "group": {"type": "shapegroup", "part": part}, **copies}
+
+    inside = tuple(prefix.replace(name, "group.part", 1) for prefix in plugin.prefixes)
+    return Plugin(plugin.kind, build, inside, plugin.aborts, instanced=True)
 
 
 def merge(folder: Path) -> Description:
