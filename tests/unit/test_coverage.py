@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.coverage.checks import descended, gradients_agree, images_agree
 from benchmarks.coverage.cli import RECORD
+from unrender.rendering.numpy.linear import AnalyticRenderer
 
 RUNS, SIZE = 16, 16
 PICTURE = np.kron(np.random.default_rng(0).uniform(0.2, 0.8, (4, 4, 3)), np.ones((4, 4, 1)))
@@ -72,3 +74,22 @@ def test_the_page_is_what_the_record_says_and_has_no_empty_cell() -> None:
     assert [name for name in record if f"| {name} |" not in written] == []
     cells = [cell for line in written.splitlines() if line.startswith("|") for cell in line.strip("|").split("|")]
     assert all(cell.strip() for cell in cells)
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(("factor", "shift", "ok"), [(1.0, 0.0, True), (-1.0, 0.0, False), (1.0, 0.2, False)])
+def test_a_descent_of_a_wrong_gradient_is_seen(
+    monkeypatch: pytest.MonkeyPatch, factor: float, shift: float, ok: bool
+) -> None:
+    """A gradient of the wrong sign, and one that leads to another value than the truth."""
+    from benchmarks.coverage.measure import descent
+
+    matrix = np.random.default_rng(0).uniform(0, 1, (SIZE * SIZE * 3, 3))
+    renderer = AnalyticRenderer({"x": np.full(3, 0.5)}, matrix, noise=0.05, shape=(SIZE, SIZE))
+    adjoint = AnalyticRenderer.adjoint
+
+    def wrong(self: Any, parameters: Any, paths: Any, weights: Any) -> Any:
+        return {key: factor * value + shift * SIZE for key, value in adjoint(self, parameters, paths, weights).items()}
+
+    monkeypatch.setattr(AnalyticRenderer, "adjoint", wrong)
+    assert descent(renderer, "x", renderer.parameters()["x"])["ok"] is ok
