@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,9 @@ __all__ = ["INPUTS", "TARGETS", "faults", "names", "warm_up"]
 LARGEST = 1 << 30
 """Bytes that no input may take."""
 LONGEST = 120.0
-"""Seconds of the clock after which an input counts as hung, on a machine that others use, too."""
+"""Seconds of the clock after which a process is ended, on a machine that others use, too."""
+SLOWEST = 10.0
+"""Processor seconds from which on an input counts as hung."""
 
 Files = dict[str, bytes]
 Use = Callable[[Path, str], Any]
@@ -206,20 +208,27 @@ def _capture_files() -> Files:
     frames = [{"file_path": f"images/{name}.png", "transform_matrix": pose} for name in "ab"]
     head = {"fl_x": 10.0, "fl_y": 10.0, "cx": 5.0, "cy": 6.0, "w": 10, "h": 12, "k1": 0.01, "frames": frames}
     row = np.r_[np.column_stack([np.eye(3), np.zeros(3), [12, 10, 10]]).ravel(), 1, 9]
-    images_bin = struct.pack("<Q", 2) + b"".join(
-        struct.pack("<i7di", index, 1, 0, 0, 0, 0, 0, 0, 1) + f"{name}.png".encode() + b"\0" + struct.pack("<Q2dq", 1, 1, 1, 0)
-        for index, name in enumerate("ab")
-    )  # fmt: skip
-    cameras_bin = struct.pack("<QiiQQ4d", 1, 1, 1, 10, 12, 10, 10, 5, 6)
     return {
         "transforms/transforms.json": json.dumps(head).encode(),
-        "binary/sparse/0/cameras.bin": cameras_bin,
-        "binary/sparse/0/images.bin": images_bin,
         "text/cameras.txt": b"# a comment\n1 OPENCV 10 12 10 10 5 6 0.01 0 0 0\n",
         "text/images.txt": b"1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n1 2 -1\n",
         "llff/poses_bounds.npy": _npy(np.array([row, row])),
         "lights/lights.txt": b"4\n0.3 0 1\n-0.3 0 1\n0 0.3 1\n0 -0.3 1\n",
     }
+
+
+@functools.cache
+def _colmap_files() -> Files:
+    images = struct.pack("<Q", 2) + b"".join(
+        struct.pack("<i7di", index, 1, 0, 0, 0, 0, 0, 0, 1) + f"{name}.png".encode() + b"\0" + struct.pack("<Q2dq", 1, 1, 1, 0)
+        for index, name in enumerate("ab")
+    )  # fmt: skip
+    pinhole = struct.pack("<QiiQQ4d", 1, 1, 1, 10, 12, 10, 10, 5, 6)
+    opencv = struct.pack("<QiiQQ8d", 1, 1, 4, 10, 12, 10, 10, 5, 6, 0.01, 0, 0, 0)
+    found: Files = {}
+    for place, cameras in (("binary/sparse/0", pinhole), ("distorted", opencv)):
+        found |= {f"{place}/cameras.bin": cameras, f"{place}/images.bin": images}
+    return found
 
 
 @functools.cache
@@ -317,6 +326,7 @@ TARGETS: dict[str, tuple[Callable[[], Files], Use]] = {
     "picture": (_picture_files, _use_picture),
     "volume": (_volume_files, _use_volume),
     "capture": (_capture_files, _use_capture),
+    "colmap": (_colmap_files, _use_capture),
     "run": (_run_files, _use_run),
 }
 
@@ -335,7 +345,7 @@ class _Inputs(Mapping[str, Hostile]):
             for file, data in given.items():
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (folder / file).write_bytes(damaged(data, draw) if file == which else data)
-            if target == "capture":
+            if use is _use_capture:
                 (folder / "photo.png").write_bytes(_picture_files()["a.png"])
             return lambda: use(folder, which)
 
@@ -351,9 +361,9 @@ class _Inputs(Mapping[str, Hostile]):
 INPUTS = _Inputs()
 
 
-def names(first: int, count: int) -> list[str]:
-    """The names of so many inputs of each target."""
-    return [f"{target} {seed}" for seed in range(first, first + count) for target in TARGETS]
+def names(first: int, count: int, targets: Sequence[str] = ()) -> list[str]:
+    """Return the names of `count` inputs of each target; of all targets where none is named."""
+    return [f"{target} {seed}" for seed in range(first, first + count) for target in targets or TARGETS]
 
 
 def warm_up(place: Path) -> None:
@@ -364,7 +374,7 @@ def warm_up(place: Path) -> None:
             for file, data in files().items():
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (folder / file).write_bytes(data)
-            if target == "capture":
+            if use is _use_capture:
                 (folder / "photo.png").write_bytes(_picture_files()["a.png"])
             use(folder, name)
 
@@ -372,9 +382,13 @@ def warm_up(place: Path) -> None:
 def faults(outcomes: list[Outcome]) -> list[str]:
     """A line for each outcome that is none of a sound reader."""
     return [
-        f"{o.name}: {o.kind}, {o.bytes >> 20} MB, {o.wall:.1f} s: {o.said[:300]}"
+        f"{o.name}: {o.kind}, {o.bytes >> 20} MB, {o.wall:.1f} s ({o.seconds:.1f} s of the processor): {o.said[:300]}"
         for o in outcomes
-        if o.kind not in ("refused", "taken") or o.bytes > LARGEST or not o.said.isprintable() or "\n" in o.said
+        if o.kind not in ("refused", "taken")
+        or o.bytes > LARGEST
+        or o.seconds > SLOWEST
+        or not o.said.isprintable()
+        or "\n" in o.said
     ]
 
 
@@ -383,12 +397,15 @@ def _main() -> int:
     options.add_argument("--seconds", type=float, default=60.0)
     options.add_argument("--first", type=int, default=0, help="seed of the first input")
     options.add_argument("--batch", type=int, default=100, help="inputs of each target between two reports")
+    options.add_argument("--targets", nargs="+", default=list(TARGETS), choices=TARGETS, help="kinds of inputs")
     given = options.parse_args()
     end, first, counts = time.monotonic() + given.seconds, given.first, Counter[str]()
     found: list[str] = []
     while time.monotonic() < end:
         with tempfile.TemporaryDirectory(prefix="fuzz") as place:
-            outcomes = take_in(Path(__file__).stem, "INPUTS", names(first, given.batch), Path(place), LONGEST)
+            outcomes = take_in(
+                Path(__file__).stem, "INPUTS", names(first, given.batch, given.targets), Path(place), LONGEST
+            )
         first += given.batch
         counts.update(f"{o.name.partition(' ')[0]} {o.kind}" for o in outcomes)
         counts["inputs"] += len(outcomes)

@@ -7,9 +7,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["cores", "free_memory"]
+__all__ = ["address_space", "cores", "free_memory", "group_memory", "most_address_space"]
 
 _GROUPS, _MOUNT, _MEMORY = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"), Path("/proc/meminfo")
+_STATUS = Path("/proc/self/status")
 _UNLIMITED = 1 << 60
 """Bytes from which on version 1 of control groups means no limit."""
 
@@ -32,6 +33,30 @@ def free_memory() -> int:
     return min(found, default=0)
 
 
+def group_memory() -> int:
+    """Return the bytes that this process's control groups may use; 0 where none has a limit."""
+    return min((limit for limit, _ in _group_memory()), default=0)
+
+
+def address_space() -> int:
+    """Return the bytes of addresses that this process may use (`ulimit -v`); 0 where that is not limited."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return 0 if limit == resource.RLIM_INFINITY else max(limit, 1)
+
+
+def most_address_space() -> int:
+    """Return the most bytes of addresses that this process has used so far; 0 where that is unknown."""
+    try:
+        lines = _STATUS.read_text().splitlines()
+        return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmPeak:")), 0)
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
 def _processor_shares() -> Iterator[float]:
     """Processor seconds per second, of each group that has a limit."""
     for folder in _groups("cpu"):
@@ -45,11 +70,16 @@ def _processor_shares() -> Iterator[float]:
 
 def _memory_left() -> Iterator[int]:
     """Bytes, of each group that has a limit."""
+    return (max(limit - used, 1) for limit, used in _group_memory())
+
+
+def _group_memory() -> Iterator[tuple[int, int]]:
+    """The limit and the bytes in use, of each group that has a limit."""
     for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
         for folder in _groups("memory"):
             words = [*_words(folder / limit), *_words(folder / used)]
             if len(words) == 2 and all(word.isdigit() for word in words) and int(words[0]) < _UNLIMITED:
-                yield max(int(words[0]) - int(words[1]), 1)
+                yield int(words[0]), int(words[1])
 
 
 def _groups(controller: str) -> Iterator[Path]:

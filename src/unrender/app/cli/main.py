@@ -7,14 +7,16 @@ Whatever is wrong is one line on standard error.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
 from importlib import metadata
 
+from unrender.app.cli import memory
 from unrender.app.cli.exit_status import ENVIRONMENT, INPUT, INTERRUPTED, WORDS
 from unrender.app.cli.signals import Signals
-from unrender.backend import variant
+from unrender.backend import limits, variant
 from unrender.core.checks import encode_text
 from unrender.core.errors import UnrenderError, VariantError
 from unrender.core.text import one_line
@@ -28,9 +30,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given == ["--version"]:  # at once: nothing else is imported
         print(metadata.version("unrender"))
         return 0
+    try:
+        memory.check()
+    except VariantError as error:
+        return _complain(str(error), ENVIRONMENT)
+    is_process = arguments is None
+    if is_process and memory.is_limited() and (ended := memory.supervised()) is not None:
+        return ended
+    signals = Signals(process=is_process)
+    try:
+        return _run(given, signals)
+    except Exception as error:
+        if not memory.exhausted(error):
+            raise
+        status = _out_of_memory()
+        if is_process:
+            os._exit(status)  # what ends an interpreter needs memory, too
+        return status
+
+
+def _run(given: list[str], signals: Signals) -> int:
     import typer
 
-    signals = Signals(process=arguments is None)
     try:
         with signals:
             status = _execute(given)
@@ -65,6 +86,8 @@ def _execute(given: list[str]) -> int:
     except VariantError as error:
         return _complain(str(error), ENVIRONMENT)
     except UnrenderError as error:
+        if limits.address_space() and memory.says_so(error):
+            return _out_of_memory(f"{error}: ")
         return _complain(str(error), INPUT)
     except usage_error as error:
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
@@ -75,8 +98,15 @@ def _execute(given: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:  # a name that is too long, a folder that may not be entered, a full disk
+        if error.errno in (errno.ENOMEM, errno.EAGAIN):
+            return _out_of_memory()
         where = f"{error.filename}: " if error.filename else ""
         return _complain(f"{where}{error.strerror or error}", INPUT)
+
+
+def _out_of_memory(what: str = "") -> int:
+    memory.drop_errors()
+    return _complain(what + memory.exhaustion(), ENVIRONMENT)
 
 
 def _complain(message: str, status: int) -> int:

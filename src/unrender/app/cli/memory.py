@@ -1,0 +1,164 @@
+"""The command where memory is limited, by `ulimit -v` or by a container: one line, whatever native code makes of it.
+
+A library that gets no memory may raise anything, abort, or wait for ever. So a command that has too few addresses does not begin. Where a
+limit is set, the command runs in a process of its own. Its parent reports an end by a signal as one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import sys
+from collections.abc import Iterator
+from types import FrameType
+
+from unrender.app.cli.exit_status import ENVIRONMENT
+from unrender.backend import limits
+from unrender.core.errors import VariantError
+from unrender.core.text import one_line
+
+__all__ = ["check", "drop_errors", "exhausted", "exhaustion", "is_limited", "says_so", "supervised"]
+
+_BASE, _PER_CORE = 800 << 20, 64 << 20
+"""Bytes of addresses that the smallest problem with a renderer takes: libraries, then a thread's stack and heap for each core."""
+_MARGIN = 64 << 20
+_SIGNS = re.compile(
+    r"bad_alloc|out of memory|cannot allocate memory|unable to allocate|failed to map segment|resource temporarily unavailable"
+    r"|can't start new thread",
+    re.IGNORECASE,
+)
+_PASSED_ON = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2")
+_OF_MEMORY = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGKILL", "SIGILL", "SIGTRAP")
+_DEATH_OF_PARENT = 1  # PR_SET_PDEATHSIG
+
+_is_child = False
+
+
+def check() -> None:
+    """Raise `VariantError` where `ulimit -v` leaves too few addresses for the libraries to be loaded."""
+    given, needed = limits.address_space(), _BASE + _PER_CORE * limits.cores()
+    if 0 < given < needed:
+        raise VariantError(
+            f"memory: {_described()}, expected at least {needed >> 10} kB on {limits.cores()} cores; raise it: ulimit -v unlimited"
+        )
+
+
+def is_limited() -> bool:
+    """Return whether the command needs a parent: memory is limited, and this system can end a child with its parent."""
+    return sys.platform == "linux" and bool(limits.address_space() or limits.group_memory())
+
+
+def exhausted(error: BaseException) -> bool:
+    """Return whether an error of an unknown reason came from a lack of memory: it says so, or nearly all allowed addresses were in use."""
+    given = limits.address_space()
+    return says_so(error) or 0 < given < limits.most_address_space() + _MARGIN
+
+
+def says_so(error: BaseException) -> bool:
+    """Return whether an error, or one that it arose from, says that there was no memory."""
+    return any(isinstance(each, MemoryError) or _SIGNS.search(str(each)) for each in _chain(error))
+
+
+def exhaustion(how: str = "") -> str:
+    """Return the line for a command that ran out of memory."""
+    limit = f" ({_described()})" if limits.address_space() or limits.group_memory() else ""
+    return (
+        f"out of memory{limit}{how}; what a run had written remains. Allow more memory, or use fewer samples (--set spp=N), "
+        "smaller pictures or fewer --threads"
+    )
+
+
+def supervised() -> int | None:
+    """Run the rest of the command in a child. Returns None there, and the exit status in the parent once the child has ended.
+
+    What the child writes on standard error is shown when it ends, and is dropped where native code ended it. The child has a process
+    group of its own, so that a signal reaches it once: by its parent.
+    """
+    global _is_child
+    errors = os.memfd_create("unrender-errors")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    parent, child = os.getpid(), os.fork()
+    if child == 0:
+        _is_child = True
+        os.setpgid(0, 0)
+        os.dup2(errors, 2)
+        os.close(errors)
+        import ctypes  # takes time, which commands without a limit need not spend
+
+        ctypes.CDLL(None).prctl(_DEATH_OF_PARENT, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(ENVIRONMENT)
+        return None
+    with contextlib.suppress(OSError):
+        os.setpgid(child, child)
+    with _passing_on(child):
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    name = "" if status >= 0 else signal.Signals(-status).name
+    if name in _OF_MEMORY:
+        print(f"unrender: {one_line(exhaustion(f', it seems: {name} ended the process'))}", file=sys.stderr)
+        return ENVIRONMENT
+    with os.fdopen(errors, "rb") as file:
+        file.seek(0)
+        shutil.copyfileobj(file, sys.stderr.buffer)
+        sys.stderr.flush()
+    if name:
+        signal.signal(-status, signal.SIG_DFL)
+        os.kill(parent, -status)
+    return status
+
+
+def drop_errors() -> None:
+    """Forget what libraries wrote on standard error before the line that tells the reason, in a supervised child."""
+    if _is_child:
+        sys.stderr.flush()
+        os.ftruncate(2, 0)
+        os.lseek(2, 0, os.SEEK_SET)
+
+
+@contextlib.contextmanager
+def _passing_on(child: int) -> Iterator[None]:
+    """Let signals to this process reach the child, and stop and go on with it."""
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        del frame
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, number)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number
+        pass_on(signal.SIGSTOP, frame)
+        os.kill(os.getpid(), signal.SIGSTOP)
+        pass_on(signal.SIGCONT, frame)
+
+    handlers = dict.fromkeys((getattr(signal, name) for name in _PASSED_ON), pass_on) | {signal.SIGTSTP: stop}
+    for number, handler in handlers.items():
+        if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number in handlers:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def _described() -> str:
+    parts = []
+    if given := limits.address_space():
+        parts.append(f"ulimit -v allows {given >> 10} kB of addresses")
+    if given := limits.group_memory():
+        parts.append(f"the container allows {given >> 20} MB")
+    return ", ".join(parts)
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """The error and those that it arose from."""
+    seen: set[int] = set()
+    following: BaseException | None = error
+    while following is not None and id(following) not in seen:
+        seen.add(id(following))
+        yield following
+        following = following.__cause__ or following.__context__
