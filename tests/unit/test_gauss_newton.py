@@ -27,9 +27,11 @@ def problem(loss: Any = None, noise: float = 0.6) -> ur.Problem:
     return ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], loss or ur.losses.L2(), truth=TRUTH)
 
 
-def estimates(made: ur.Problem, count: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def estimates(
+    made: ur.Problem, count: int = 150, coarse: float | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gradients (count, n), Hessians (count, n, n) and their noise at the start."""
-    estimator = ur.GaussNewton(spp=2, derivative_spp=2)
+    estimator = ur.GaussNewton(spp=2, derivative_spp=2, coarse=coarse)
     state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
     found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(count)]
     gradients = [np.concatenate([one.gradient[key] for key in START]) for one in found]
@@ -59,6 +61,33 @@ def test_gradient_and_matrix_are_unbiased_and_one_half_alone_is_not(monkeypatch:
     monkeypatch.setattr(module, "_products", lambda halves, *rest: products([halves[0], halves[0]], *rest))
     _, hessians, _ = estimates(made)
     assert off(hessians, hessian) > 4.5
+
+
+def test_wide_differences_compare_sums_over_blocks_of_pixels() -> None:
+    """With S the sums over blocks, over the root of their size: g = 2 (S A)ᵀ S A (θ - θ*) / N. At the border of 4 × 5 pixels, blocks of
+    3 × 3 are 1 × 3, 3 × 2 and 1 × 2 pixels."""
+    image = MATRIX.reshape(4, 5, 3, 3)
+    parts = [block for rows in (image[:3], image[3:]) for block in (rows[:, :3], rows[:, 3:])]
+    summed = np.concatenate([part.sum(axis=(0, 1)) / np.sqrt(part.shape[0] * part.shape[1]) for part in parts])
+    hessian = 2.0 * summed.T @ summed / len(MATRIX)
+    away = np.concatenate([START[key] - TRUTH[key] for key in START])
+    gradients, hessians, _ = estimates(problem(), coarse=3.5)
+    assert off(gradients, hessian @ away) < 4.5
+    assert off(hessians, hessian) < 4.5
+    assert off(hessians, 2.0 * MATRIX.T @ MATRIX / len(MATRIX)) > 4.5
+
+
+def test_differences_become_sharper_once_steps_are_short() -> None:
+    made, estimator = problem(), ur.GaussNewton(2, 2, shift=0.5, coarse=4.0)
+    state = estimator.init(made, START)
+    shifts = []
+    for distance in (0.0, 100.0, 0.1, 0.1, 0.1, 0.1):
+        point = dict(START)
+        if state.point is not None:
+            point["b"] = np.array([state.point[2] + distance * state.widths["b"]])
+        _, state = estimator.estimate(made, point, state, Key(0))
+        shifts.append(state.shift)
+    assert shifts == [4.0, 4.0, 2.0, 1.0, 0.5, 0.5]
 
 
 def test_losses_that_are_not_linear_have_a_secant_that_is_damped_by_noise() -> None:
@@ -99,6 +128,8 @@ def test_views_that_a_parameter_does_not_change_are_not_rendered() -> None:
 
 
 def test_what_it_refuses() -> None:
+    with pytest.raises(ur.InputError, match=r"coarse must be at least shift, 0\.3, got 0\.1"):
+        ur.GaussNewton(coarse=0.1)
     with pytest.raises(ur.InputError, match="spp must be a whole number of at least 2, got 1"):
         ur.GaussNewton(spp=1)
     with pytest.raises(ur.InputError, match="shift must be a finite number > 0, got 0"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
 __all__ = [
+    "BlockEstimate",
     "Capabilities",
     "Capability",
     "FreshGradient",
@@ -141,6 +142,20 @@ class Smoothing(Capability):
 
     name: ClassVar[str] = "sigma"
     sigma: Mapping[str, float | np.ndarray]
+
+
+@dataclass(frozen=True)
+class BlockEstimate(Capability):
+    """The estimate of some of the parameters alone, with their own curvature, the others held at their present values.
+
+    Attributes:
+        keys: of these parameters, in key order.
+        estimate: an `Estimate` whose gradient has these keys; None in a step in which they stay where they are.
+    """
+
+    name: ClassVar[str] = "block"
+    keys: tuple[str, ...]
+    estimate: Any
 
 
 class Capabilities(frozenset[str]):

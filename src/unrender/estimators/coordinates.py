@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from unrender.core import arrays, vectors
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
+    BlockEstimate,
     Capability,
     FreshGradient,
     Hessian,
@@ -22,7 +24,7 @@ from unrender.estimators.capabilities import (
 from unrender.parameterisations.base import Transform
 from unrender.scene.problem import Problem
 
-__all__ = ["by_coordinates", "regularized"]
+__all__ = ["by_coordinates", "regularized", "restricted"]
 
 
 def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
@@ -38,6 +40,8 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     slopes = coordinates.slopes(parameters)
 
     def converted(capability: Capability) -> Capability:
+        if isinstance(capability, BlockEstimate):
+            return _block(capability, problem, parameters)
         if isinstance(capability, FreshGradient):
             return FreshGradient(coordinates.pull_back(capability.values, slopes))
         return _second_order(capability, estimate.gradient, problem, parameters, slopes) if slopes else capability
@@ -45,6 +49,26 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     gradient = coordinates.pull_back(estimate.gradient, slopes)
     capabilities = tuple(converted(capability) for capability in estimate.capabilities)
     return replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
+
+
+def restricted(problem: Problem, keys: Sequence[str]) -> Problem:
+    """Return the problem with the coordinates of these parameters alone."""
+    coordinates = problem.coordinates
+    found = problem.rendered_by(problem.renderer)
+    found.coordinates = replace(
+        coordinates,
+        transforms={k: φ for k, φ in coordinates.transforms.items() if k in keys},
+        preconditioners={k: S for k, S in coordinates.preconditioners.items() if k in keys},
+        repeated={k: n for k, n in coordinates.repeated.items() if k in keys},
+    )
+    return found
+
+
+def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEstimate:
+    if block.estimate is None:
+        return block
+    own = {key: parameters[key] for key in block.keys}
+    return BlockEstimate(block.keys, by_coordinates(block.estimate, restricted(problem, block.keys), own))
 
 
 def regularized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:

@@ -26,8 +26,10 @@ __all__ = ["GaussNewton", "GaussNewtonState", "explained"]
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Of the widths: passes of their own before the first estimate, and factors by which a width changes at most, there and later."""
-_VALUES = 1 << 20
-"""Of an image, that are turned into double precision at once."""
+_VALUES = 1 << 22
+"""Of images, that are turned into double precision at once."""
+_SETTLED = 0.5
+"""Longest step, in units of the widths, after which differences become sharper."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of the trial of a start; eigenvalues of its matrix, relative to the largest, that count as 0."""
 _IMAGE = 2
@@ -40,9 +42,13 @@ class GaussNewtonState:
 
     Attributes:
         widths: of the differences, {key: in units of the parameter}; {} before the first estimate.
+        shift: in pixels, of the differences.
+        point: the parameters of the last estimate, (n,); None before the first.
     """
 
     widths: dict[str, float]
+    shift: float = 0.0
+    point: np.ndarray | None = None
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """See `Upsamplable`: widths are measured anew."""
@@ -74,6 +80,9 @@ class GaussNewton:
         shift: in pixels, > 0. Smaller ones are sharper, with more noise at edges.
         width: of the differences before the first estimate finds better ones, in units of the parameter, > 0.
         tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
+        coarse: `shift` at the start, in pixels, >= `shift`; None for `shift` itself. It halves after each step that is short beside the
+            widths. Images and derivative images are summed over blocks as wide as the shift, so a wide difference has little noise, and
+            a start that is several pixels away takes few steps.
         largest: {key: largest width, > 0}; no limit for the others. A pose of one shape needs it: the shape covers a part of the picture,
             so no shift of it differs from the picture by as much as a shift of the whole.
     """
@@ -83,6 +92,7 @@ class GaussNewton:
     shift: float = 0.3
     width: float = 0.01
     tolerance: float = 2.0
+    coarse: float | None = None
     largest: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -92,6 +102,8 @@ class GaussNewton:
             checks.integer("GaussNewton", name, getattr(self, name), at_least=2)
         for name in ("shift", "width", "tolerance"):
             checks.number("GaussNewton", name, getattr(self, name), above=0.0)
+        if self.coarse is not None and checks.number("GaussNewton", "coarse", self.coarse, above=0.0) < self.shift:
+            raise InputError(f"GaussNewton: coarse must be at least shift, {self.shift:g}, got {self.coarse:g}")
 
     @property
     def provides(self) -> Capabilities:
@@ -116,11 +128,13 @@ class GaussNewton:
         """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view."""
         point = _Point(self, problem, parameters)
         if not state.widths:
-            state = GaussNewtonState({key: min(self.width, self.largest.get(key, math.inf)) for key in parameters})
+            widths = {key: min(self.width, self.largest.get(key, math.inf)) for key in parameters}
+            state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
-                found = point.system(state.widths, key.fold(1 + index), derivatives=False)
+                found = point.system(state, key.fold(1 + index), derivatives=False)
                 state = self._next(state, found, parameters, _FIRST_CHANGE)
-        found = point.system(state.widths, key.fold(0))
+        state = self._sharpened(state, parameters)
+        found = point.system(state, key.fold(0))
         estimate = Estimate(
             found.loss,
             vectors.unravel(found.gradient, parameters),
@@ -129,16 +143,26 @@ class GaussNewton:
         )
         return estimate, self._next(state, found, parameters, _CHANGE)
 
+    def _sharpened(self, state: GaussNewtonState, parameters: Tree) -> GaussNewtonState:
+        """Return the state with half the shift, where the last step was short beside the widths."""
+        point = vectors.ravel(parameters)
+        if state.point is None:
+            return GaussNewtonState(state.widths, state.shift or self.coarse or self.shift, point)
+        moved = np.abs(point - state.point) / vectors.repeat_per_element(state.widths, parameters)
+        settled = 0.0 < moved.max(initial=0.0) < _SETTLED
+        shift = max(0.5 * state.shift, self.shift) if settled else state.shift
+        return GaussNewtonState(state.widths, shift, point)
+
     def _next(self, state: GaussNewtonState, found: _System, parameters: Tree, change: float) -> GaussNewtonState:
-        """With the widths at which renders differ from the picture as a shift by `shift` pixels does, root mean square over the elements of
+        """With the widths at which renders differ from the picture as a shift by so many pixels does, root mean square over the elements of
         a parameter; no more than `change` times what they were, or less by it."""
         squares, slopes = vectors.parts(found.squares, parameters), vectors.parts(found.slopes, parameters)
         widths = {}
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
-            wanted = self.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
+            wanted = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
             widths[key] = float(np.clip(wanted, width / change, min(width * change, self.largest.get(key, math.inf))))
-        return GaussNewtonState(widths)
+        return GaussNewtonState(widths, state.shift, state.point)
 
 
 def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
@@ -208,10 +232,10 @@ class _Point:
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
         self._sensors = vectors.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
-    def system(self, widths: Mapping[str, float], key: Key, derivatives: bool = True) -> _System:
-        """Gradient and Hessian at differences of these widths; without `derivatives`, what the next widths are found by alone."""
+    def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True) -> _System:
+        """Gradient and Hessian at differences of the state's widths; without `derivatives`, what the next widths are found by alone."""
         found = _System.zero(self.theta.size)
-        steps = vectors.repeat_per_element(widths, self.parameters)
+        steps = vectors.repeat_per_element(state.widths, self.parameters)
         for view, of in enumerate(self.problem.views):
             elements = np.flatnonzero((self._sensors == -1) | (self._sensors == of.sensor))
             own = key.fold(view)
@@ -225,7 +249,7 @@ class _Point:
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             slope = _slope(halves)
             weights = None if image is None else self._weights(view, image, variance)
-            gradient, hessian, noise, squares = _products(halves, distances, weights)
+            gradient, hessian, noise, squares = _products(halves, distances, weights, int(state.shift))
             found.gradient[elements] += gradient
             found.hessian[np.ix_(elements, elements)] += hessian
             found.noise[np.ix_(elements, elements)] += noise
@@ -283,7 +307,7 @@ def _slope(halves: list[np.ndarray]) -> float:
 
 
 def _products(
-    halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None
+    halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None, block: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from two
     independent halves of J.
@@ -292,28 +316,49 @@ def _products(
         halves: images (2 m, H, W, 3), those at more and those at less.
         distances: of the two parameters of each difference, (m,); an element with 0 has no derivative.
         weights: ℓ' and ℓ''; None where only the last is wanted.
+        block: side of the blocks of pixels over which all but the last are summed.
     """
     m = distances.size
     gradient, hessian, noise, squares = np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
     over = np.divide(1.0, distances, out=np.zeros(m), where=distances != 0.0)[:, None]
-    for part in _parts(halves[0][0].size):
-        one, other = (_difference(half, part) * over for half in halves)
+    for rows in _rows(halves[0], max(block, 1)):
+        parts = [_difference(half[:, rows]) for half in halves]
+        one, other = (part.reshape(m, -1) * over for part in parts)
         squares += (one * other).sum(axis=1)
-        if weights is not None:
-            first, second = (x.reshape(-1)[part].astype(np.float64) for x in weights)
-            gradient += 0.5 * ((one + other) @ first)
-            hessian += (one * second) @ other.T
-            apart = 0.5 * (one - other)
-            noise += (apart * second) @ apart.T
+        if weights is None:
+            continue
+        first, second = (x[rows].astype(np.float64) for x in weights)
+        if block > 1:
+            one, other = (_pooled(part, block).reshape(m, -1) * over for part in parts)
+            first, second = _pooled(first, block), _pooled(second, block) / _pooled(np.ones_like(second), block)
+        first, second = first.reshape(-1), second.reshape(-1)
+        gradient += 0.5 * ((one + other) @ first)
+        hessian += (one * second) @ other.T
+        apart = 0.5 * (one - other)
+        noise += (apart * second) @ apart.T
     return gradient, 0.5 * (hessian + hessian.T), noise, squares
 
 
-def _difference(images: np.ndarray, part: slice) -> np.ndarray:
-    """Of the first half of the images and the second, (m, values of the part)."""
-    flat = images.reshape(len(images), -1)[:, part].astype(np.float64)
-    return flat[: len(flat) // 2] - flat[len(flat) // 2 :]
+def _pooled(images: np.ndarray, block: int) -> np.ndarray:
+    """Sums over blocks of pixels, over the square root of their number, of images (..., H, W, 3)."""
+    for axis in (-3, -2):
+        starts = np.arange(0, images.shape[axis], block)
+        sizes = np.diff(np.append(starts, images.shape[axis]))
+        shape = [1] * images.ndim
+        shape[axis] = -1
+        images = np.add.reduceat(images, starts, axis=axis) / np.sqrt(sizes).reshape(shape)
+    return images
 
 
-def _parts(size: int) -> Iterator[slice]:
-    for start in range(0, size, _VALUES):
-        yield slice(start, start + _VALUES)
+def _difference(images: np.ndarray) -> np.ndarray:
+    """Of the first half of the images and the second, (m, H, W, 3), in double precision."""
+    count = len(images) // 2
+    return images[:count].astype(np.float64) - images[count:]
+
+
+def _rows(images: np.ndarray, block: int) -> Iterator[slice]:
+    """Return whole blocks of rows, of some million values of all images or fewer."""
+    height = images.shape[1]
+    step = max(_VALUES // max(images[:, :1].size * block, 1), 1) * block
+    for start in range(0, height, step):
+        yield slice(start, start + step)

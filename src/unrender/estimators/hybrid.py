@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.capabilities import Capabilities, Capability, FreshGradient, Gradient, Variance
-from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.capabilities import BlockEstimate, Capabilities, Capability, FreshGradient, Gradient, Variance
+from unrender.estimators.coordinates import by_coordinates, restricted
+from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
@@ -47,14 +48,14 @@ class HybridState:
 
     Attributes:
         path: of the path gradients.
-        perturbed: of the smoothed derivatives.
+        perturbed: of the second estimator.
         mean, square: running means of the gradient by the second parameters, and of its square, not debiased; {} where it is not
             `averaged`.
         step: estimates made so far, since these began.
     """
 
     path: Any
-    perturbed: SmoothedState
+    perturbed: SmoothedState | GaussNewtonState
     mean: Tree = field(default_factory=dict)
     square: Tree = field(default_factory=dict)
     step: int = 0
@@ -64,7 +65,7 @@ class HybridState:
         return replace(
             self,
             path=upsampled(self.path, upsampler),
-            perturbed=self.perturbed.upsampled(upsampler),
+            perturbed=upsampled(self.perturbed, upsampler),
             mean=upsampler.tree(self.mean, 1.0),
             square=upsampler.tree(self.square, SQUARES),
         )
@@ -72,7 +73,7 @@ class HybridState:
     def restarted(self, fresh: HybridState) -> HybridState:
         """See `Restartable`."""
         return replace(
-            fresh, path=restarted(self.path, fresh.path), perturbed=self.perturbed.restarted(fresh.perturbed)
+            fresh, path=restarted(self.path, fresh.path), perturbed=restarted(self.perturbed, fresh.perturbed)
         )
 
 
@@ -95,6 +96,10 @@ class HybridGradient:
     Let `perturbed` be `debiased`: the noise of a few samples a pixel adds to the loss of each perturbed render, and less where the second
     parameters make for darker images; the first, which do not see that, would follow the second away.
 
+    With `GaussNewton` for `perturbed`, the second parameters are a block of their own (`BlockEstimate`): an optimizer such as
+    `Partitioned(keys, AveragedNewton(), others)` solves it, and the gradient by them is 0 in steps in which they stay. Then `wait` and
+    `every` say in which steps they move. While textures are far off, the pictures say little about poses beside them.
+
     The two kinds of steps have no common scale: give the second learning rates of their own.
 
     Provides a gradient, and its variance where `path` does: for the second parameters the mean square, variance plus squared
@@ -103,20 +108,24 @@ class HybridGradient:
 
     Args:
         path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
-        perturbed: of order "gradient"; its `sigma` is for the second parameters alone.
+        perturbed: of order "gradient", its `sigma` for the second parameters alone; or `GaussNewton`.
         keys: the second parameters; None for all poses, and all that have no path gradient.
         averaged: for `MetaAdam`, which has no momentum: the gradient by the second parameters is the running mean of about ten steps, and
             its variance that of the squares, both debiased, so its steps there are Adam's. Differences of the smoothed
             loss between two steps are not rendered, so the mean lags behind. Optimizers that average by themselves, or grow their
             rates while gradients agree, should have it False. Needs a variance of `path`.
+        wait: steps before the first in which a block moves, >= 0. For `GaussNewton` alone.
+        every: the second parameters of a block move in each so many-th step, >= 1. For `GaussNewton` alone.
     """
 
     path: Estimator = field(default_factory=PathGradient)
-    perturbed: SmoothedDerivatives = field(
+    perturbed: SmoothedDerivatives | GaussNewton = field(
         default_factory=lambda: SmoothedDerivatives(0.2, samples=16, spp=2, debiased=True)
     )
     keys: tuple[str, ...] | None = None
     averaged: bool = False
+    wait: int = 0
+    every: int = 1
 
     def __post_init__(self):
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
@@ -128,9 +137,17 @@ class HybridGradient:
                 f"HybridGradient: path must be an estimator of path gradients, such as PathGradient(), got "
                 f"{type(self.path).__name__}"
             )
-        if not isinstance(self.perturbed, SmoothedDerivatives) or self.perturbed.order != "gradient":
+        checks.integer("HybridGradient", "wait", self.wait, at_least=0)
+        checks.integer("HybridGradient", "every", self.every, at_least=1)
+        if self._is_block and self.averaged:
+            raise InputError("HybridGradient: averaged goes with SmoothedDerivatives, not with GaussNewton")
+        if not self._is_block and (self.wait or self.every > 1):
+            raise InputError("HybridGradient: wait and every go with GaussNewton, not with SmoothedDerivatives")
+        if not self._is_block and (
+            not isinstance(self.perturbed, SmoothedDerivatives) or self.perturbed.order != "gradient"
+        ):
             raise InputError(
-                'HybridGradient: perturbed must be SmoothedDerivatives with order="gradient", since path gradients have no '
+                'HybridGradient: perturbed must be GaussNewton, or SmoothedDerivatives with order="gradient", since path gradients have no '
                 f"curvature, got {self.perturbed!r:.80}"
             )
         if self.averaged and Variance.name not in self.path.provides:
@@ -144,7 +161,9 @@ class HybridGradient:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient, and its variance where `path` has one."""
+        """A gradient, and its variance where both have one; with `GaussNewton`, a block."""
+        if self._is_block:
+            return Capabilities(Gradient, BlockEstimate)
         return Capabilities(Gradient, Variance) if Variance.name in self.path.provides else Capabilities(Gradient)
 
     def init(self, problem: Problem, parameters: Tree) -> HybridState:
@@ -164,10 +183,18 @@ class HybridGradient:
         path, perturbed = self._problems(problem, parameters, own)
         found, path_state = self.path.estimate(path, parameters, state.path, key)
         part = {name: parameters[name] for name in own}
-        moved, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, key.fold(_PERTURBED))
+        own_key = key.fold(_PERTURBED)
+        if self._is_block:
+            moved, perturbed_state, samples = self._block(perturbed, part, state, own_key)
+        else:
+            moved, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, own_key)  # pyright: ignore[reportArgumentType]
+            samples = int(moved.info.get("samples", 0))
         if found.preconditioned or moved.preconditioned:
-            found, moved = by_coordinates(found, problem, parameters), by_coordinates(moved, _of(problem, own), part)
-        moments = state
+            found, moved = (
+                by_coordinates(found, problem, parameters),
+                by_coordinates(moved, restricted(problem, own), part),
+            )
+        moments = replace(state, step=state.step + 1) if self._is_block else state
         if self.averaged:
             moved, moments = _averaged(moved, state)
         elif Variance.name in self.provides:
@@ -175,12 +202,30 @@ class HybridGradient:
         gradient = {name: moved.gradient[name] if name in own else g for name, g in found.gradient.items()}
         info = {
             **found.info,
-            "samples": int(found.info.get("samples", 0)) + int(moved.info.get("samples", 0)),
+            "samples": int(found.info.get("samples", 0)) + samples,
             "perturbed_loss": moved.loss,
         }
         whole = replace(found, gradient=gradient, capabilities=_merged(found, moved, own), info=info)
         arrays.evaluate(moments.mean, moments.square)
         return whole, replace(moments, path=path_state, perturbed=perturbed_state)
+
+    @property
+    def _is_block(self) -> bool:
+        return isinstance(self.perturbed, GaussNewton)
+
+    def _block(
+        self, problem: Problem, part: Tree, state: HybridState, key: Key
+    ) -> tuple[Estimate, GaussNewtonState | SmoothedState, int]:
+        """Return the estimate with a block, the state, and the paths traced. The first step is estimated for its kernels, at least."""
+        still = Estimate(0.0, trees.zeros_like(part), (BlockEstimate(tuple(part), None),))
+        moves = state.step >= self.wait and (state.step - self.wait) % self.every == 0
+        if not moves and state.step:
+            return still, state.perturbed, 0
+        found, after = self.perturbed.estimate(problem, part, state.perturbed, key)  # pyright: ignore[reportArgumentType]
+        samples = int(found.info.get("samples", 0))
+        if not moves:
+            return still, state.perturbed, samples
+        return replace(found, capabilities=(BlockEstimate(tuple(part), found),)), after, samples
 
     def _problems(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> tuple[Problem, Problem]:
         """As each of the two estimators sees it."""
@@ -214,19 +259,6 @@ class HybridGradient:
         return own
 
 
-def _of(problem: Problem, keys: Sequence[str]) -> Problem:
-    """The problem with the coordinates of these parameters alone."""
-    coordinates = problem.coordinates
-    found = problem.rendered_by(problem.renderer)
-    found.coordinates = replace(
-        coordinates,
-        transforms={k: φ for k, φ in coordinates.transforms.items() if k in keys},
-        preconditioners={k: S for k, S in coordinates.preconditioners.items() if k in keys},
-        repeated={k: n for k, n in coordinates.repeated.items() if k in keys},
-    )
-    return found
-
-
 def _averaged(perturbed: Estimate, state: HybridState) -> tuple[Estimate, HybridState]:
     """The debiased running mean of the gradient, with its debiased mean square for variance; the state with both."""
     step = state.step + 1
@@ -257,4 +289,4 @@ def _merged(path: Estimate, perturbed: Estimate, own: Sequence[str]) -> tuple[Ca
                 found.append(FreshGradient(fresh))
             case _:
                 pass
-    return tuple(found)
+    return (*found, *(block for block in perturbed.capabilities if isinstance(block, BlockEstimate)))

@@ -32,9 +32,9 @@ class AutoMethod(Options):
     other than L2. Its errors are forgotten after some 20 steps, of L1 and such 33, lest steps follow them. Where the scene cannot be
     loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
     the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
-    steps in proportion to their range. Where path gradients do not reach a parameter, as of a pose, it moves by perturbed renders, beside
-    path gradients of the others (`hybrid`), or `smoothed` where there are no others; cameras alone take Gauss-Newton steps, and so do poses
-    of shapes from a start that overlaps enough. Grids of
+    steps in proportion to their range. A parameter that path gradients do not reach, such as a pose, takes Gauss-Newton steps by perturbed
+    renders beside path gradients of the others, or steps by a smoothed loss where these do not suit (`hybrid`, `smoothed`). Cameras alone
+    take Gauss-Newton steps, and so do poses of shapes alone from a start that overlaps enough. Grids of
     volumes are coarse in the first steps. Every choice can be set.
     """
 

@@ -6,11 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
+from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
 from unrender.preconditioners.mesh import MeshTopology
@@ -42,10 +44,13 @@ class Partitioned:
 
         Partitioned(("vase.vertex_positions",), Adam(0.01, uniform=True), ScheduleFree(0.1))
 
+    Or a few numbers by `AveragedNewton` beside textures, from an estimator that gives the numbers a block of their own
+    (`HybridGradient` with `GaussNewton`); in steps without a block they stay where they are.
+
     Args:
         keys: of parameters.
-        optimizer: for those; it requires the gradient alone.
-        others: for all others, likewise.
+        optimizer: for those. One that requires more than the gradient takes it from the block of these keys (`BlockEstimate`).
+        others: for all others; it requires the gradient alone.
     """
 
     keys: tuple[str, ...] = ()
@@ -56,17 +61,20 @@ class Partitioned:
         if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
             raise InputError(f"Partitioned: keys must be keys of parameters, got {self.keys!r}")
         object.__setattr__(self, "keys", tuple(self.keys))
-        for name in ("optimizer", "others"):
-            if getattr(self, name).requires != Capabilities(Gradient):
-                kind = type(getattr(self, name)).__name__
-                raise InputError(
-                    f"Partitioned: {name}: expected one that requires the gradient alone, such as Adam, got {kind}"
-                )
+        if self.others.requires != Capabilities(Gradient):
+            kind = type(self.others).__name__
+            raise InputError(
+                f"Partitioned: others: expected one that requires the gradient alone, such as Adam, got {kind}"
+            )
 
     @property
     def requires(self) -> Capabilities:
-        """A gradient."""
-        return Capabilities(Gradient)
+        """A gradient, and a block for an optimizer that requires more."""
+        return Capabilities(Gradient, BlockEstimate) if self._solves_block else Capabilities(Gradient)
+
+    @property
+    def _solves_block(self) -> bool:
+        return self.optimizer.requires != Capabilities(Gradient)
 
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
@@ -97,7 +105,15 @@ class Partitioned:
             (self.optimizer, self.others), (state.own, state.others), points, gradients, told, strict=True
         ):
             capabilities = () if fresh is None else (FreshGradient(values),)
-            found, after = part.update(replace(estimate, gradient=gradient, capabilities=capabilities), before, point)
+            own = replace(estimate, gradient=gradient, capabilities=capabilities)
+            if self._solves_block and part is self.optimizer:
+                block = estimate.require("Partitioned", BlockEstimate)
+                if set(block.keys) != set(self.keys):
+                    raise InputError(
+                        f"Partitioned: the estimate's block is of {listed(block.keys)}, not of {listed(self.keys)}"
+                    )
+                own = block.estimate
+            found, after = (trees.zeros_like(point), before) if own is None else part.update(own, before, point)
             steps |= found
             states.append(after)
         return {key: steps[key] for key in parameters}, PartitionedState(*states)

@@ -104,8 +104,8 @@ class Constants:
     """Path budget of the images of such a step. Source: lamps, lens and frosted glass in 12 s (7adae11)."""
     number_spp: tuple[int, int] = (4, 256)
     """Limits of its samples per pixel. Source: as for `number_paths`."""
-    difference_paths: int = 1 << 20
-    """Path budget of all its derivative images; 16 times as many are too expensive. Source: as for `number_paths`."""
+    difference_paths: int = 1 << 19
+    """Path budget of all its derivative images; 32 times as many are too expensive. Source: as for `number_paths`."""
     difference_spp: tuple[int, int] = (2, 8)
     """Limits of their samples per pixel. Source: as for `number_paths`."""
     trial_spp: int = 4
@@ -113,6 +113,23 @@ class Constants:
     explained: float = 0.1
     """Share of the loss that derivative images at the start must explain. Source: 0.22 to 0.34 for a block that overlaps, at most 0.003
     on the plateaus of `box2`, `mug` and `shadow` (7c39b33)."""
+
+    pose_shift: float = 1.0 / 12.0
+    """First shift of the differences of poses, as a share of the smallest picture's side. Source: a block in a room .25 away."""
+    pose_reach: float = 2.0
+    """Largest width of the differences of poses over `sigma`. Source: as for `pose_shift`."""
+    pose_averaging: float = 3.0
+    """`averaging` of poses, whose first models are of far away. Source: as for `pose_shift`."""
+    pose_images: float = 2.0
+    """Paths of the images of poses over those of their derivative images. Source: as for `pose_shift`."""
+    block_images: float = 0.5
+    """Likewise in a block, while textures change the images. Source: the block with all else in the room unknown."""
+    block_every: int = 2
+    """Steps of textures for one of a block, at most. Source: as for `block_images`."""
+    block_wait: int = 8
+    """Steps of textures before the first of a block. Source: as for `block_images`."""
+    path_cost: float = 4.0
+    """Cost of a path with its gradient over that of a path alone. Source: by hand."""
 
 
 CONSTANTS = Constants()

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from unrender.core.text import listed
 from unrender.estimators.gauss_newton import GaussNewton, explained
+from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
@@ -16,9 +17,10 @@ from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.averaged_newton import AveragedNewton
+from unrender.optimizers.partitioned import Partitioned
 from unrender.schedules import Exponential
 
-__all__ = ["cameras", "cameras_by_paths", "few_numbers"]
+__all__ = ["beside", "cameras", "cameras_by_paths", "few_numbers"]
 
 
 def cameras(traits: Traits) -> Plan | None:
@@ -56,29 +58,95 @@ def few_numbers(traits: Traits) -> Plan | None:
 
     Poses of shapes take them where derivative images at the start explain the residual: on a plateau a smoothed loss is needed.
     """
-    constants, problem, infos, elements = traits.constants, traits.problem, traits.infos, traits.elements
-    shapes = problem.shapes().values()
-    small = all(len(shape) <= 1 and math.prod(shape) <= constants.number_size for shape in shapes)
-    reached = all(info.perturbable and not (info.rigid and info.viewpoint) for info in infos.values())
-    nonlinear = traits.poses or [key for key, info in infos.items() if info.nonlinear]
-    mixed = 0 < len(traits.poses) < len(infos)
-    costly = elements > constants.few_numbers or elements * problem.pixels > 4 * constants.difference_paths
-    if not small or not reached or not nonlinear or mixed or costly or not traits.newton_suits:
+    constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
+    nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear]
+    mixed = 0 < len(traits.poses) < len(keys)
+    if not nonlinear or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
-    spp = traits.options.spp or sampling.within(constants.number_spp, constants.number_paths // problem.pixels)
+    estimator = _estimator(traits, keys, constants.pose_images)
+    if traits.poses:
+        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None)
+        trial = replace(trial, largest=widths_of(traits.options.sigma, traits.poses))
+        if not problem.loss.linear or not explained(problem, trial) > constants.explained:
+            return None
+    reason = f"{_reason(traits, keys, estimator)}: pictures change their form with {listed(nonlinear)}"
+    return Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
+
+
+def beside(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
+    """Return a plan by path gradients with these unknowns as a block beside it; None where Gauss-Newton steps do not suit them.
+
+    Args:
+        traits: Of the problem.
+        keys: Of the unknowns that become the block.
+        plan: Of the others.
+    """
+    constants, problem = traits.constants, traits.problem
+    own = any(key in problem.preconditioners for key in keys)
+    if not _few(traits, keys) or own or not problem.loss.linear or not isinstance(plan.estimator, PathGradient):
+        return None
+    estimator = _estimator(traits, keys, constants.block_images)
+    traced = 2 * _elements(traits, keys) * estimator.derivative_spp + estimator.spp
+    every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
+    times = "" if every == 1 else f", every {every} steps"
+    reason = (
+        f"{_reason(traits, keys, estimator)}{times}, after {constants.block_wait} steps of the others: {listed(keys)}"
+    )
+    return replace(
+        plan,
+        problem=problem,
+        estimator=HybridGradient(plan.estimator, estimator, keys, wait=constants.block_wait, every=every),
+        optimizer=Partitioned(keys, _optimizer(traits, keys), plan.optimizer),
+        reasons=(reason, *plan.reasons),
+    )
+
+
+def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
+    """Return whether these unknowns are few numbers that can be perturbed at little cost."""
+    constants, shapes, elements = traits.constants, traits.problem.shapes(), _elements(traits, keys)
+    small = all(len(shapes[key]) <= 1 and math.prod(shapes[key]) <= constants.number_size for key in keys)
+    infos = [traits.infos[key] for key in keys]
+    reached = all(info.perturbable and not (info.rigid and info.viewpoint) for info in infos)
+    costly = elements > constants.few_numbers or elements * traits.problem.pixels > 8 * constants.difference_paths
+    return small and reached and not costly
+
+
+def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNewton:
+    """Return the estimator of these unknowns; `images`: paths of the images of poses over those of the derivative images."""
+    constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
+    poses = [key for key in keys if key in traits.poses]
     differences = sampling.within(
         constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels)
     )
-    largest = widths_of(traits.options.sigma, traits.poses)
-    trial = GaussNewton(max(spp, 2), constants.trial_spp, largest=largest)
-    if traits.poses and (not problem.loss.linear or not explained(problem, trial) > constants.explained):
-        return None
-    reason = (
-        f"Gauss-Newton steps of {elements} number{'s' * (elements > 1)} by perturbed renders, {trial.spp} samples per pixel of the image, "
-        f"{differences} of those: pictures change their form with {listed(nonlinear)}"
+    paths = constants.number_paths // problem.pixels
+    paths = max(paths, round(2 * elements * differences * images)) if poses else paths
+    spp = traits.options.spp or sampling.within(constants.number_spp, paths)
+    side = min(min(size) for size in problem.sizes)
+    return GaussNewton(
+        max(spp, 2),
+        differences,
+        tolerance=_damping(traits),
+        coarse=max(constants.pose_shift * side, 1.0) if poses else None,
+        largest={key: constants.pose_reach * width for key, width in widths_of(traits.options.sigma, poses).items()},
     )
-    estimator = replace(trial, derivative_spp=differences, tolerance=_damping(traits))
-    return Plan(problem, estimator, AveragedNewton(), reasons=(reason,))
+
+
+def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
+    poses = any(key in traits.poses for key in keys)
+    return AveragedNewton(averaging=traits.constants.pose_averaging) if poses else AveragedNewton()
+
+
+def _elements(traits: Traits, keys: tuple[str, ...]) -> int:
+    shapes = traits.problem.shapes()
+    return sum(math.prod(shapes[key]) for key in keys)
+
+
+def _reason(traits: Traits, keys: tuple[str, ...], estimator: GaussNewton) -> str:
+    elements = _elements(traits, keys)
+    return (
+        f"Gauss-Newton steps of {elements} number{'s' * (elements > 1)} by perturbed renders, {estimator.spp} samples per pixel of the "
+        f"image, {estimator.derivative_spp} of those"
+    )
 
 
 def _damping(traits: Traits) -> float:

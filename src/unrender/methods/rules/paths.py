@@ -16,6 +16,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
 from unrender.methods.rules.first_rates import first_rates
 from unrender.methods.rules.kinds import KINDS
+from unrender.methods.rules.newton import beside
 from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.base import Optimizer
@@ -36,6 +37,8 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
     others = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(keys)))
     if not 0 < len(keys) < len(traits.infos) or refusal(others):
         return None
+    if plan := beside(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
+        return plan
     rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, keys).items()}
     plan = paths(replace(traits, problem=others, rates=rates))
     smoothing = SmoothedDerivatives(
@@ -65,6 +68,7 @@ def paths(traits: Traits) -> Plan:
     settings = _merged(traits, [part.settings for part in parts])
     configured = problem.configured(settings)
     rates = {**first_rates(configured, options.learning_rate, traits.constants), **traits.rates}
+    rates = {key: rate for key, rate in rates.items() if key not in traits.block}
     sampler, drawn = sampling.sampler(traits)
     image, image_reason = sampling.image(traits, sampler)
     spp = sampling.samples_per_pixel(traits, sampler)
@@ -84,7 +88,8 @@ def paths(traits: Traits) -> Plan:
     plain, whole = isinstance(image, Plain), isinstance(sampler, pixels.All)
     biased = problem.loss.pixelwise and not problem.loss.linear
     tolerance = options.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
-    first = grouped({key: f"{rate:.3g}" for key, rate in (rates | problem.learning_rates).items()})
+    own_rates = {key: rate for key, rate in problem.learning_rates.items() if key not in traits.block}
+    first = grouped({key: f"{rate:.3g}" for key, rate in (rates | own_rates).items()})
     reasons = (
         f"{'a fresh rendering each step' if plain else 'recursive control variates'}, {spp} samples per pixel: {image_reason}",
         drawn,
@@ -101,7 +106,7 @@ def _merged(traits: Traits, settings: list[Mapping[str, ParameterSettings]]) -> 
     """Return the settings of all parts by unknown."""
     merged: dict[str, ParameterSettings] = {}
     for key in traits.infos:
-        chosen = [vars(part[key]) for part in settings if key in part]
+        chosen = [vars(part[key]) for part in settings if key in part and key not in traits.block]
         if values := {name: value for own in chosen for name, value in own.items() if value is not None}:
             merged[key] = ParameterSettings(**values)
     return merged

@@ -28,12 +28,14 @@ class Traits:
         options: What was asked for.
         constants: Numbers of the rules.
         rates: First rates that are decided already, in units of the unknowns.
+        block: Keys of unknowns that have an optimizer of their own beside path gradients.
     """
 
     problem: Problem
     options: AutoMethod
     constants: Constants
     rates: Mapping[str, float] = field(default_factory=dict)
+    block: tuple[str, ...] = ()
 
     @cached_property
     def infos(self) -> dict[str, ParameterInfo]:
