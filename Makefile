@@ -6,7 +6,7 @@
 # make test-unit   the tests that need no Mitsuba alone, in about a minute
 # make lint        lint and types alone
 # make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
-# make package     wheel and source archive, in dist; the wheel is installed into an empty folder and started from there
+# make package     wheel and source archive, in dist; the wheel is installed into an empty environment and started there
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:

@@ -1,7 +1,7 @@
-"""Build the wheel and the source archive into `dist`, and start the wheel from an empty folder.
+"""Build the wheel and the source archive into `dist`, and start the wheel in an empty environment.
 
-The wheel is installed without its dependencies, so nothing large is downloaded: modules are found in the folder first and packages of
-others in the environment that runs this. `python -I scripts/package.py` from the root of the repository.
+The wheel is installed without its dependencies, so nothing large is downloaded: the environment finds packages of others in the one that
+runs this. `python -I scripts/package.py` from the root of the repository.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ ROOT = Path(__file__).resolve().parents[1]
 RECORDS = (".json", ".npz", ".png")
 
 
-def _run(*command: str, cwd: Path | None = None) -> str:
-    found = subprocess.run([sys.executable, *command], cwd=cwd, capture_output=True, text=True, check=False)
+def _run(*command: str, cwd: Path | None = None, python: Path | None = None) -> str:
+    found = subprocess.run(
+        [str(python or sys.executable), *command], cwd=cwd, capture_output=True, text=True, check=False
+    )
     if found.returncode:
         sys.exit(f"package: {' '.join(command)[:200]} failed:\n{found.stdout}{found.stderr}")
     return found.stdout
@@ -50,29 +52,51 @@ def _check_sdist(sdist: Path) -> None:
             sys.exit(f"package: the source archive lacks {name}")
 
 
+def _check_start(wheel: Path, place: Path) -> str:
+    """Install the wheel into an empty environment and start its command there. Returns the version that it prints."""
+    scripts, purelib = ("Scripts", "Lib/site-packages") if sys.platform == "win32" else ("bin", "")
+    _run("-m", "venv", "--without-pip", str(place))
+    python = place / scripts / "python"
+    options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--no-index")
+    _run("-m", "pip", "--python", str(python), "install", *options, str(wheel))
+    inside = place / (purelib or f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages")
+    others = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
+    (inside / "others.pth").write_text("".join(f"{path}\n" for path in others))
+    file = _run("-I", "-c", "import unrender; print(unrender.__file__)", cwd=place, python=python).strip()
+    if not file.startswith(str(inside)):
+        sys.exit(f"package: {file} was imported, expected the wheel's")
+    command = str(place / scripts / "unrender")
+    _run("-I", command, "methods", cwd=place, python=python)
+    return _run("-I", command, "--version", cwd=place, python=python).strip()
+
+
 def main() -> None:
-    """Build, install into an empty folder, start."""
+    """Build, check, install into an empty environment, start."""
     shutil.rmtree(ROOT / "dist", ignore_errors=True)
-    with tempfile.TemporaryDirectory() as place:
-        tools, empty = Path(place, "tools"), Path(place, "empty")
-        _run("-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--target", str(tools), "hatchling")
-        build = (
-            f"import os, sys; sys.path.insert(0, {str(tools)!r}); os.chdir({str(ROOT)!r}); from hatchling import build;"
-            "print(build.build_sdist('dist')); print(build.build_wheel('dist'))"
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name).resolve()
+        tools = place / "tools"
+        _run(
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--disable-pip-version-check",
+            "--target",
+            str(tools),
+            "hatchling",
+            "twine",
         )
-        sdist, wheel = (ROOT / "dist" / name for name in _run("-c", build).split()[-2:])
+        found = f"import os, sys; sys.path.insert(0, {str(tools)!r}); os.chdir({str(ROOT)!r});"
+        build = (
+            f"{found} from hatchling import build; print(build.build_sdist('dist')); print(build.build_wheel('dist'))"
+        )
+        sdist, wheel = (ROOT / "dist" / each for each in _run("-c", build).split()[-2:])
         _check_sdist(sdist)
         _check_wheel(wheel)
-        options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--no-index", "--target", str(empty))
-        _run("-m", "pip", "install", *options, str(wheel))
-        start = (
-            f"import sys; sys.path.insert(0, {str(empty)!r}); import unrender; print(unrender.__file__);"
-            "from unrender.app.cli.main import main; sys.exit(main(['--version']))"
-        )
-        file, version = _run("-I", "-c", start, cwd=Path(place)).split()
-        if not file.startswith(str(empty)):
-            sys.exit(f"package: {file} was imported, expected the wheel's")
-        _run("-I", "-c", start.replace("'--version'", "'methods'"), cwd=Path(place))
+        check = f"{found} from twine.commands.check import check; sys.exit(check({[str(sdist), str(wheel)]!r}))"
+        _run("-c", check)
+        version = _check_start(wheel, place / "empty")
     print(
         f"unrender {version}: {wheel.name} {wheel.stat().st_size >> 10} KiB, {sdist.name} {sdist.stat().st_size >> 10} KiB"
     )

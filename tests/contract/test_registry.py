@@ -255,18 +255,25 @@ def test_entry_points_are_loaded_once_and_a_broken_one_is_one_line(
     def leaves() -> None:
         sys.exit(3)
 
+    class Own(BaseException):
+        pass
+
+    def raises_its_own() -> None:
+        raise Own("of a kind that nobody catches")
+
     def takes_a_name() -> None:
         ur.register(name="L2", kind="loss")(Cubic)
 
-    announce(monkeypatch, point("bad", bad), point("good", good), point("leaves", leaves), point("taken", takes_a_name))
+    points = {"bad": bad, "good": good, "leaves": leaves, "own": raises_its_own, "taken": takes_a_name}
+    announce(monkeypatch, *(point(name, load) for name, load in points.items()))
     with caplog.at_level(logging.WARNING, "unrender"):
         assert "Cubic" in registry.components("loss")
         assert "Cubic" in registry.table_components()
     assert loads == [1]
     lines = [record.getMessage() for record in caplog.records]
-    assert [line.split()[2] for line in lines] == ["bad", "leaves", "taken"]
+    assert [line.split()[2] for line in lines] == ["bad", "leaves", "own", "taken"]
     assert "RuntimeError: no such library" in lines[0]
-    assert "two components are called L2" in lines[2]
+    assert "two components are called L2" in lines[3]
     assert not any("\n" in line for line in lines)
     assert "Half" not in registry.components("loss")
     assert registry.components("loss")["L2"] is losses.L2

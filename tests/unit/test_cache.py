@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -103,3 +107,49 @@ def test_a_folder_that_others_may_write_keeps_nothing(
     assert "DRJIT_CACHE_DIR" not in os.environ
     place.chmod(0o700)
     assert cache.folder(cache.KERNELS) == top / cache.KERNELS
+
+
+def test_a_folder_that_another_user_could_replace_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may write to the folder above it can put another in its place."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as above:
+        os.chmod(above, 0o755)
+        monkeypatch.setenv(cache.ENVIRONMENT_VARIABLE, os.path.join(above, "cache"))
+        assert cache.folder(cache.KERNELS) is not None
+        os.chmod(above, 0o777)
+        assert cache.folder(cache.KERNELS) is None
+        os.chmod(above, 0o1777)
+        assert cache.folder(cache.KERNELS) is not None
+        os.chmod(above, 0o755)
+        os.chmod(os.path.join(above, "cache"), 0o775)
+        assert cache.folder(cache.KERNELS) is None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to make a folder of another user")
+def test_two_users_share_no_cache(tmp_path: Path) -> None:
+    """Each keeps nothing in the other's folder, whatever its mode, and all works as before."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as above:
+        os.chmod(above, 0o1777)
+        place = os.path.join(above, "cache")
+        os.mkdir(place)
+        os.chmod(place, 0o777)
+        code = (
+            "from unrender.backend import cache; print(cache.folder(cache.KERNELS)); print(cache.size(cache.KERNELS))"
+        )
+        for owner in (0, 65534):
+            os.chown(place, owner, owner)
+            environment = os.environ | {cache.ENVIRONMENT_VARIABLE: place, "PYTHONPATH": os.pathsep.join(sys.path)}
+            done = subprocess.run(
+                [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+            )
+            assert done.stdout == "None\n0\n"
+
+
+def test_a_moved_clock_does_no_harm(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of the system may jump by years in either direction; then files seem to come from the future."""
+    folder = cache.folder(cache.KERNELS)
+    assert folder is not None
+    fill(folder, 10, 20, 30)
+    for now in (0.0, 4e9, 1e9):
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        cache.tidy(folder, 200)
+        assert sorted(path.name for path in folder.glob("*.bin")) == ["0.bin", "1.bin"]

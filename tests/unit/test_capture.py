@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import struct
 import sys
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from unrender.app.capture.cameras import Lens, project, rigid
 from unrender.app.capture.capture import Capture, Photograph
 from unrender.app.capture.captured_view import CapturedView
 from unrender.app.capture.conventions import AXES, pose, reinterpreted
-from unrender.app.capture.formats import colmap
+from unrender.app.capture.formats import colmap, files, lights
 from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
 from unrender.app.capture.undistortion import Resampling, pinhole
 from unrender.core.errors import InputError
@@ -338,3 +339,24 @@ def test_a_missing_package_is_told_before_photographs_are_read(
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match=r"pip install 'unrender\[capture\]'"):
         importing.import_capture(tmp_path, tmp_path / "out", importing.ImportOptions())
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms", "llff", "lights"])
+def test_a_hundred_thousand_photographs_are_one_line(kind: str, tmp_path: Path) -> None:
+    """Before a file of them is looked for, which would take hours."""
+    count = files.MOST + 1
+    if kind == "colmap":
+        (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, 1, 10, 12, 10, 10, 5, 6))
+        image = struct.pack("<i7di", 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0" + struct.pack("<Q", 0)
+        (tmp_path / "images.bin").write_bytes(struct.pack("<Q", count) + count * image)
+    elif kind == "transforms":
+        (tmp_path / "transforms.json").write_text(json.dumps({"frames": count * [{"file_path": "a.png"}]}))
+    elif kind == "llff":
+        np.save(tmp_path / "poses_bounds.npy", np.ones((count, 17)))
+    else:
+        (tmp_path / "lights.txt").write_text(
+            f"{count}\n" + "1 0 1\n0 1 1\n-1 0 1\n" * (count // 3) + "0 0 1\n" * (count % 3)
+        )
+    read = lights.read if kind == "lights" else formats.FORMATS[kind].read
+    with pytest.raises(InputError, match=f": {count} photographs, expected at most {files.MOST}; take a part of them"):
+        read(tmp_path, None)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from unrender.app.distributed.cluster.access import can_change, can_read
 from unrender.app.distributed.cluster.trust import check_cluster, check_token
+from unrender.backend.access import can_change, can_read
 from unrender.core.errors import InputError
 
 

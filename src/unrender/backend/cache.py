@@ -18,6 +18,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from unrender.backend import access
+
 __all__ = [
     "ENVIRONMENT_VARIABLE",
     "KERNELS",
@@ -61,27 +63,21 @@ def folder(part: str) -> Path | None:
     """A part of the cache, `REFERENCES` or `KERNELS`, made where it is missing.
 
     Returns:
-        None where the cache is switched off or bypassed, or the folder cannot be made or written, is another user's, or may be written by
-        everybody.
+        None where the cache is switched off or bypassed, or the folder cannot be made or written, or where another user could put files
+        there or replace it: a compiled kernel is code that runs as whoever loads it.
     """
     top = None if _bypassed else root()
     if top is None:
         return None
     place = top / part
     try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        top.mkdir(mode=0o700, parents=True, exist_ok=True)
+        place.mkdir(mode=0o700, exist_ok=True)
+        if any(each.stat().st_mode & stat.S_IWOTH for each in (top, place)) or access.can_change(place):
+            return None
     except OSError:
         return None
-    if not all(_is_private(each) for each in (top, place)):
-        return None
     return place if os.access(place, os.R_OK | os.W_OK | os.X_OK) else None
-
-
-def _is_private(place: Path) -> bool:
-    """Whether nobody else can put files there: a compiled kernel is code that runs as whoever loads it."""
-    found = place.stat()
-    others_may_write = bool(found.st_mode & stat.S_IWOTH)
-    return found.st_uid in (os.geteuid(), 0) and not others_may_write
 
 
 @contextlib.contextmanager

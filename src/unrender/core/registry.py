@@ -306,7 +306,9 @@ def _load_entry_points() -> None:
         for point in importlib.metadata.entry_points(group=GROUP):
             try:
                 point.load()
-            except (Exception, SystemExit) as error:  # whatever a module of others raises
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # whatever a module of others raises
                 # Those of a module whose import failed; other modules that it imported stay, and so do theirs.
                 for key in [key for key, each in _components.items() if each.made_by.__module__ not in sys.modules]:
                     del _components[key]

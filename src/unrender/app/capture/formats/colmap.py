@@ -81,6 +81,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
     text = ending == ".txt"
     lenses = dict(_text_cameras(cameras_file) if text else _binary_cameras(cameras_file))
     images = sorted(_text_images(images_file) if text else _binary_images(images_file), key=lambda image: image.name)
+    files.check_count(len(images), images_file)
     root = next(
         (folder / name for name in _PHOTOGRAPHS if images and files.is_file(folder / name / images[0].name)), None
     )

@@ -8,13 +8,33 @@ from pathlib import Path
 from unrender.core.errors import InputError
 from unrender.core.text import printable, shorten
 
-__all__ = ["PICTURES", "find_mask", "find_picture", "is_file", "left_out", "pictures", "without_pose"]
+__all__ = [
+    "MOST",
+    "PICTURES",
+    "check_count",
+    "find_mask",
+    "find_picture",
+    "is_file",
+    "left_out",
+    "pictures",
+    "without_pose",
+]
 
 PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".tga", ".bmp", ".hdr", ".ppm", ".pfm")
 """Endings of photographs."""
+MOST = 10_000
+"""Photographs of a capture at most: looking for the files and masks of many more takes hours."""
 _WITHOUT_ENDING = (*PICTURES, ".PNG", ".JPG", ".JPEG", "_rgb.exr", "_rgba.png")
 """Tried in turn where a format names a photograph without its ending."""
 _MASK_FOLDERS = ("masks", "mask")
+
+
+def check_count(count: int, where: Path) -> None:
+    """Raise `InputError` for more than `MOST` photographs."""
+    if count > MOST:
+        raise InputError(
+            f"{where}: {count} photographs, expected at most {MOST}; take a part of them, such as every tenth"
+        )
 
 
 def is_file(path: Path) -> bool:

@@ -51,6 +51,7 @@ def recognise(folder: Path) -> bool:
 def read(folder: Path, mask: Path | None = None) -> LitCapture:
     """The capture of such a folder; `mask`: a folder with one mask, None for the folder itself. Raises `InputError`."""
     directions = _directions(folder / FILE)
+    files.check_count(len(directions), folder / FILE)
     pictures = sorted(files.pictures(folder), key=_by_number)
     if not any("mask" not in path.name.lower() for path in pictures):
         pictures += sorted(files.pictures(folder / "images"), key=_by_number)
@@ -58,7 +59,7 @@ def read(folder: Path, mask: Path | None = None) -> LitCapture:
     if len(photographs) != len(directions):
         many = f"{len(directions)} lights, and {len(photographs)} photographs"
         raise InputError(f"{folder / FILE}: {many}: they belong together in the order of names, so none may be missing")
-    masks = files.pictures(mask) if mask is not None else [path for path in pictures if path not in photographs]
+    masks = files.pictures(mask) if mask is not None else [path for path in pictures if "mask" in path.name.lower()]
     if len(masks) > 1 or (mask is not None and not masks):
         place = folder if mask is None else mask
         raise InputError(f"{place}: expected one mask, got {len(masks)}, the camera stands still")

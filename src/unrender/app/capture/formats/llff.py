@@ -37,6 +37,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
     rows = bounded_files.read_array(path, _LARGEST)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or not np.isfinite(rows).all():
         raise InputError(f"{path}: expected rows of 17 finite numbers, got shape {rows.shape}")
+    files.check_count(len(rows), path)
     place = next((folder / name for name in _FOLDERS if files.pictures(folder / name)), folder)
     pictures = files.pictures(place)
     masks_beside = {f"{path.stem.removesuffix('_rgb').removesuffix('_rgba')}_mask" for path in pictures}

@@ -52,6 +52,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         if not isinstance(frames, list) or not frames:
             raise InputError(f"{path}: frames: expected a list of at least one frame")
         count += len(frames)
+        files.check_count(count, path)
         for index, frame in enumerate(frames):
             where = f"{path}: frames[{index}]"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from unrender.app.distributed.cluster.access import can_change
+from unrender.backend.access import can_change
 from unrender.core.errors import InputError
 
 __all__ = ["check_private", "private_cluster", "private_folder"]

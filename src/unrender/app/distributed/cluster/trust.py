@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from unrender.app.distributed.cluster.access import can_change, can_read
+from unrender.backend.access import can_change, can_read
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, reason_of
 

@@ -21,8 +21,8 @@ def can_change(folder: Path, shared: bool = False) -> str:
     """
     place = Path(os.path.realpath(folder))
     for above in (place, *place.parents):
-        if _shielded(above.parent):
-            return ""
+        if _shielded(above.parent):  # but the folder that shields it may be replaced, too
+            continue
         status = above.stat()
         mode = stat.S_IMODE(status.st_mode)
         if status.st_uid not in _trusted():
