@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,12 @@ RUNS, SPP = 16, 64
 _MOST_RUNS = 4 * RUNS
 """Runs of a comparison of gradients that is weak, or differs by `_DOUBTFUL` standard errors, after `RUNS`."""
 _DOUBTFUL = 2.5
-_SEEN = 5.0
-STEPS, DESCENT_SPP, PICTURES = 40, 16, 32
-"""Steps of a descent, samples per pixel of each; how many pictures of as many samples make one whose error counts."""
+STEPS, DESCENT_SPP = 40, 16
+"""Steps of a descent, and samples per pixel of its pictures."""
+_SEEN, _LEAST = 10.0, 1e-10
+"""Standard errors, and square error of the picture, from which on a start is seen to differ from the truth."""
+_ONE_OF_MANY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "control_points")
+"""Parameters of which many values give nearly the same picture: their descents are judged by the picture alone."""
 _INSTANCED = 1
 """Parameters of a plugin in instances that are measured."""
 _UNROULETTED = 1000
@@ -142,6 +146,30 @@ def _gradient(renderer: Any, key: str, info: Any, spp: int) -> dict[str, Any]:
     return found.record()
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much a descent may take.
+
+    Attributes:
+        spp: samples per pixel of a step.
+        rate: learning rate over the start's distance from the truth.
+        pictures: how many pictures of `DESCENT_SPP` make one half of the reference, and of a picture whose error counts.
+        widths: distances of the start, in `_scale`; the first one that the pictures show is taken.
+    """
+
+    spp: int
+    rate: float
+    pictures: int
+    widths: tuple[float, ...]
+
+
+_EFFORTS = (
+    Effort(DESCENT_SPP, 0.15, 32, (2.0, 4.0, 8.0)),
+    Effort(8 * DESCENT_SPP, 0.08, 256, (8.0,)),
+)
+"""The second one where the first one does not suffice."""
+
+
 def descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
     """Descend from a perturbed start by Adam: on path gradients, or on perturbed renders where there are none.
 
@@ -149,12 +177,22 @@ def descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
         Mean squares of the pictures' differences "before" and "after", without the noise of their rendering, and the standard
         "deviation" of the first; the parameter's error after over before as "error"; "ok", or None where the pictures hardly differ.
     """
+    found = _descend(renderer, key, info, _EFFORTS[0])
+    return (
+        found
+        if found["ok"] or (found["ok"] is None and not info.differentiable)
+        else _descend(renderer, key, info, _EFFORTS[1])
+    )
+
+
+def _descend(renderer: Any, key: str, info: Any, effort: Effort) -> dict[str, Any]:
     truth = np.array(renderer.values([key])[key]).astype(np.float64)
     session, groups = renderer.prepare([key], None, info.differentiable), 2 if info.differentiable else 1
 
     def picture(value: Any, half: int) -> np.ndarray:
         tree = {key: renderer.array(np.asarray(value, np.float32))}
-        requests = [SampleRequest(0, DESCENT_SPP, 5000 + 1000 * half + n, groups=groups) for n in range(PICTURES)]
+        seeds = range(5000 + 1000 * half, 5000 + 1000 * half + effort.pictures)
+        requests = [SampleRequest(0, DESCENT_SPP, seed, groups=groups) for seed in seeds]
         return np.mean([np.array(session.image(tree, request).images).mean(0) for request in requests], axis=0)
 
     references = [picture(truth, half) for half in (0, 1)]
@@ -165,25 +203,29 @@ def descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
         square, noise = float(np.mean(one * other)), float(np.mean((one - other) ** 2)) / 2
         return square, float(np.sqrt(noise * (noise + 2 * max(square, 0.0)) / one.size))
 
-    for width in (2, 4, 8):
+    for width in effort.widths:
         start, offset = _start(key, truth, info, width)
         before, deviation = error(start)
-        if seen := before > _SEEN * deviation:
+        if seen := before > max(_SEEN * deviation, _LEAST):
             break
     if not seen:
         return {"before": before, "deviation": deviation, "ok": None}
-    reference = np.mean(references, axis=0)
-    problem = ur.Problem(renderer, [ur.Parameter(key, start)], [ur.View(reference)], truth={key: truth})
-    size = float(np.abs(offset).mean())
-    smoothed = ur.SmoothedDerivatives(size / 2, samples=8, spp=DESCENT_SPP)
-    estimator = ur.PathGradient(spp=DESCENT_SPP) if info.differentiable else smoothed
-    end = descend(problem, estimator, ur.optimizers.Adam(0.15 * size, schedule=ur.schedules.Cosine(STEPS)), STEPS)
-    after, _ = error(end[key])
-    first, last = (problem.parameter_error({key: value})[key] for value in (start.astype(np.float32), end[key]))
+    size, reference = float(np.abs(offset).mean()), np.mean(references, axis=0)
+    # Vertices at one place must move as one.
+    smooth = ur.preconditioners.LargeSteps(1.0) if info.welded and info.differentiable else None
+    parameter = ur.Parameter(key, start, preconditioner=smooth)
+    problem = ur.Problem(renderer, [parameter], [ur.View(reference)], truth={key: truth})
+    smoothed = ur.SmoothedDerivatives(size / 2, samples=8, spp=effort.spp)
+    estimator = ur.PathGradient(spp=effort.spp) if info.differentiable else smoothed
+    adam = ur.optimizers.Adam(effort.rate * size, schedule=ur.schedules.Cosine(STEPS))
+    end = descend(problem, estimator, adam, STEPS)[key]
+    after, _ = error(end)
+    first, last = (problem.parameter_error({key: value})[key] for value in (start.astype(np.float32), end))
     closer = last / first if first else 0.0
-    found = {"before": before, "deviation": deviation, "after": max(after, 0.0), "error": closer}
     # Perturbed renders move elements that no picture shows, too; path gradients leave these as they are.
-    return {**found, "ok": descended(before, after) and (closer < 1 or not info.differentiable)}
+    alone = key.endswith(_ONE_OF_MANY) or not info.differentiable
+    ok = descended(before, after) and (closer < 1 or alone)
+    return {"before": before, "deviation": deviation, "after": max(after, 0.0), "error": closer, "ok": ok}
 
 
 def _start(key: str, truth: np.ndarray, info: Any, width: float) -> tuple[np.ndarray, np.ndarray]:
