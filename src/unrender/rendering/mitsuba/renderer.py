@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor
 from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
+from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -170,19 +171,19 @@ class MitsubaRenderer:
 
     def _pose_keys(self) -> dict[str, poses.PoseKey]:
         """Return the poses that the scene has: of lights alone beside media, which posed shapes in scenes of their own do not meet."""
-        written = self.pair.loaded().poses
+        written, instances = self.pair.loaded().poses, has_instances(self.pair.current)
         return {
             key: pose
             for key, pose in poses.keys(self.pair.current).items()
-            if (key in written if pose.light else not self.pair.volumetric)
+            if (pose.light or not self.pair.volumetric) and (key in written or not (pose.light or instances))
         }
 
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:
         """Return whether a pose is written into the scene: a light's always, and others beside a shape that emits light, with which the
-        scene's acceleration structure changes."""
-        if self._poses[key].light:
-            return True
+        scene's acceleration structure changes, and beside instances, which Mitsuba does not take into another scene."""
         scene = self.pair.loaded()
+        if self._poses[key].light or has_instances(scene.scene):
+            return True
         lit = any(other in self._poses and self._poses[other].light and moved_shape(scene, other) for other in keys)
         return lit and key in scene.poses
 
