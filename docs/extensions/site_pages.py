@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.coverage import coverage_page, ranges_page
 from benchmarks.coverage.cli import RECORD
 from benchmarks.runner import records
@@ -17,7 +19,7 @@ from unrender.core import registry
 from unrender.display.pictures import png, shown_image
 from unrender.methods import method
 
-PIXELS, SAMPLES = 96, 32
+PIXELS, SAMPLES = 96, 256
 """Side and samples per pixel of the gallery's pictures."""
 SECTION = re.compile(r"^(Args|Attributes):\n((?:    .*\n|\n)*)", re.MULTILINE)
 ENTRY = re.compile(r"^    (\w[\w, ]*): ((?:.*\n)(?:^     .*\n)*)", re.MULTILINE)
@@ -62,7 +64,8 @@ def _reference(name: str, folder: Path) -> str:
     small = {"resolution": PIXELS} | ({"reference_spp": SAMPLES} if "reference_spp" in known else {})
     file = folder / f"{name}.png"
     if not file.is_file():
-        file.write_bytes(png(shown_image(gallery.problem(name, **small).views[0].reference)))
+        reference = gallery.problem(name, **small).views[0].reference
+        file.write_bytes(png(shown_image(np.asarray(reference))))
     return file.name
 
 

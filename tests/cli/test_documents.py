@@ -241,6 +241,26 @@ def test_the_reference_has_every_public_name():
             ), name
 
 
+@pytest.fixture
+def site_pages(mitsuba_variant: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module that builds pages of the site."""
+    monkeypatch.syspath_prepend(str(DOCS / "extensions"))
+    return importlib.import_module("site_pages")
+
+
+def without_a_meaning(page: str) -> list[str]:
+    """The arguments of tables whose last cell is empty."""
+    return re.findall(r"^\| `(\w+)` \| .*?\|\s+\|$", page, re.MULTILINE)
+
+
+def test_every_argument_has_a_default_and_a_meaning(site_pages: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = site_pages.arguments_page()
+    assert len(re.findall(r"^\| `\w+` \|", page, re.MULTILINE)) > 200
+    assert without_a_meaning(page) == []
+    monkeypatch.setattr(ur.losses.Huber, "__doc__", "Without its arguments.")
+    assert without_a_meaning(site_pages.arguments_page()) == ["delta"]
+
+
 def test_names_that_have_moved_warn_and_are_the_same() -> None:
     for name, home in ur._MOVED.items():
         with pytest.warns(DeprecationWarning, match=rf"unrender\.{name} is now unrender\.{home}"):
