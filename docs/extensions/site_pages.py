@@ -21,6 +21,8 @@ from unrender.methods import method
 
 PIXELS, SAMPLES = 96, 256
 """Side and samples per pixel of the gallery's pictures."""
+ENLARGED = 2
+"""Pixels on the page for each pixel of a picture, along each axis."""
 SECTION = re.compile(r"^(Args|Attributes):\n((?:    .*\n|\n)*)", re.MULTILINE)
 ENTRY = re.compile(r"^    (\w[\w, ]*): ((?:.*\n)(?:^     .*\n)*)", re.MULTILINE)
 CODE_COLUMNS = 60
@@ -65,7 +67,7 @@ def _reference(name: str, folder: Path) -> str:
     file = folder / f"{name}.png"
     if not file.is_file():
         reference = gallery.problem(name, **small).views[0].reference
-        file.write_bytes(png(shown_image(np.asarray(reference))))
+        file.write_bytes(png(shown_image(np.asarray(reference)).repeat(ENLARGED, 0).repeat(ENLARGED, 1)))
     return file.name
 
 
