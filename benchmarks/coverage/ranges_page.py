@@ -15,10 +15,10 @@ from benchmarks.coverage.scenes import Plugin
 from benchmarks.internals import ObjectGraph, Range, SlotReaders, dr, load_scene, mi
 from benchmarks.runner.catalogue import ROOT
 
-__all__ = ["PAGE", "Row", "missing", "page", "rows"]
+__all__ = ["NO_VALUES", "PAGE", "Row", "missing", "page", "rows"]
 
 PAGE = ROOT / "docs" / "reference" / "ranges.md"
-_NO_VALUES = ("film", "filter", "integrator", "sampler")
+NO_VALUES = ("film", "filter", "integrator", "sampler")
 """Kinds of plugins that have no parameters of their own."""
 _HEAD = """# Physical ranges
 
@@ -63,7 +63,7 @@ def missing(found: list[Row]) -> list[str]:
 
 def page() -> str:
     """Return the text of the page."""
-    found = [row for name, plugin in PLUGINS.items() if plugin.kind not in _NO_VALUES for row in rows(name, plugin)]
+    found = [row for name, plugin in PLUGINS.items() if plugin.kind not in NO_VALUES for row in rows(name, plugin)]
     parts = [_HEAD.format(version=mi.__version__)]
     for kind in sorted({row.kind for row in found}, key=str.lower):
         lines = {
