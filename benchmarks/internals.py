@@ -32,8 +32,7 @@ from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
-from unrender.rendering.mitsuba.range_table import Range
-from unrender.rendering.mitsuba.ranges import SlotReaders
+from unrender.rendering.mitsuba.ranges import Range, SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media

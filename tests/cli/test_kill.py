@@ -16,7 +16,7 @@ import pytest
 from victim import CASES
 
 import unrender as package
-from unrender.app.cli.exit_status import DOUBTFUL
+from unrender.app.cli.signals import DOUBTFUL
 from unrender.runs.folder import checkpoint
 from unrender.runs.folder import reader as report_folder
 from unrender.runs.folder.checkpoint import STATE

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.app.exporting import blender, gltf, mesh_formats, textures, usd
+from unrender.app.exporting import blender, formats, gltf, textures, usd
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.app.exporting.materials import Material
 
@@ -62,8 +62,8 @@ def test_gltf_as_trimesh_reads_it() -> None:
 def test_obj_and_ply_as_mitsuba_reads_them(tmp_path: Path) -> None:
     """Its OBJ loader takes v upwards; its PLY loader does when it is told to."""
     given = quad()
-    mesh_formats.write_obj(asset(given, replace(given, name="other", normals=None)), tmp_path)
-    mesh_formats.write_ply(asset(given), tmp_path)
+    formats.write_obj(asset(given, replace(given, name="other", normals=None)), tmp_path)
+    formats.write_ply(asset(given), tmp_path)
     for found in (
         mi.load_dict({"type": "obj", "filename": str(tmp_path / "asset.obj")}),
         mi.load_dict({"type": "ply", "filename": str(tmp_path / "quad.ply"), "flip_tex_coords": True}),

@@ -32,7 +32,7 @@ from unrender.io.volumes import write_grid
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.optimizers.chain import ChainState
-from unrender.runs import loop, multiresolution
+from unrender.runs import loop, refinement
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.upsampling import SQUARES
 
@@ -169,9 +169,9 @@ def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any
     for _ in range(steps):
         loop._step(run, memory)
     before = dict(run.parameters), loop.replace(memory)
-    assert multiresolution.is_due(run)
-    multiresolution.refine(run, memory)
-    assert not multiresolution.is_due(run)
+    assert refinement.is_due(run)
+    refinement.refine(run, memory)
+    assert not refinement.is_due(run)
     return *before, run, memory
 
 
@@ -363,7 +363,7 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     run, memory = loop.prepare(plan, 9, None, 0)
     for _ in range(3):
         loop._step(run, memory)
-    multiresolution.refine(run, memory)
+    refinement.refine(run, memory)
     start = run.parameters[KEY]
     loop._step(run, memory)
     moved = run.parameters[KEY] - start

@@ -9,7 +9,7 @@ from scipy import stats
 
 import unrender as ur
 from tiers import quick
-from unrender.gallery import skies, two_planets
+from unrender.gallery import parts, two_planets
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import CountingSession, SampleRequest
 
@@ -344,9 +344,9 @@ def test_the_caustic_lights_the_floor_by_few_bright_samples():
 
 def test_a_sky_has_its_sun_where_it_was_put_and_its_colours_elsewhere():
     towards = np.array([0.6, 0.64, 0.48])
-    picture = skies.picture(towards, 0.2, (9.0, 8.0, 7.0), ((0, 0, 1), (0, 1, 0), (1, 0, 0)), rows=64)
+    picture = parts.picture(towards, 0.2, (9.0, 8.0, 7.0), ((0, 0, 1), (0, 1, 0), (1, 0, 0)), rows=64)
     assert picture.shape == (64, 128, 3)
-    sky = mi.load_dict({"type": "scene", "sky": skies.environment(picture)}).emitters()[0]
+    sky = mi.load_dict({"type": "scene", "sky": parts.environment(picture)}).emitters()[0]
 
     def look(direction) -> np.ndarray:
         si = mi.SurfaceInteraction3f()

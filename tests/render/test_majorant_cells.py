@@ -18,9 +18,9 @@ from kernels import on_device, recorded
 from tiers import quick
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import emissive
-from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators import majorant_supergrid
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids, SupergridTraversal
+from unrender.rendering.mitsuba.scene_loading import attached_media, extinction_transforms
 from unrender.rendering.renderer import SampleRequest
 
 SHAPE = (17, 33, 22)

@@ -13,7 +13,7 @@ import unrender as ur
 from benchmarks.coverage import ranges_page
 from benchmarks.coverage.plugins import PLUGINS
 from benchmarks.coverage.scenes import scene, wheel
-from unrender.rendering.mitsuba.range_table import CLASSES, KINDS
+from unrender.rendering.mitsuba.ranges import CLASSES, KINDS
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 VIEW = ur.View(np.full((16, 16, 3), 0.5, np.float32))

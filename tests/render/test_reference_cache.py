@@ -114,6 +114,6 @@ def test_references_in_a_folder_that_is_full_are_rendered(
     def full(*_: Any) -> None:
         raise ur.InputError("cannot be written: No space left on device")
 
-    monkeypatch.setattr("unrender.gallery.reference_cache.files.write_arrays", full)
+    monkeypatch.setattr("unrender.gallery.specification.files.write_arrays", full)
     reference()
     assert rendered == [0]

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files, files, image_size, mesh_files, spectrum_files, tensor_files, toml_lines, volumes
+from unrender.io import bounded_files, files, image_size, mesh_files, scene_assets, spectrum_files, toml_lines, volumes
 
 # ---------------------------------------------------------------------- pictures
 
@@ -194,7 +194,7 @@ def test_spectra_and_tensors_of_sound_files_pass(tmp_path: Path):
         spectrum_files.check(tmp_path / "a.spd")
     head = b"tensor_file\0\1\0" + struct.pack("<IH", 1, 1) + b"a" + struct.pack("<HBQQ", 1, 10, 46, 2)
     (tmp_path / "a.bsdf").write_bytes(head + bytes(50 - len(head)) + bytes(4))
-    tensor_files.check(tmp_path / "a.bsdf")
+    scene_assets.check_tensors(tmp_path / "a.bsdf")
 
 
 def test_a_sound_grid_is_measured(tmp_path: Path):

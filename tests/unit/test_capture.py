@@ -18,8 +18,7 @@ pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrende
 import unrender
 from unrender.app.capture import atlas, formats, hull, importing, pictures
 from unrender.app.capture.cameras import Lens, project, rigid
-from unrender.app.capture.capture import Capture, Photograph
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import Capture, CapturedView, Photograph
 from unrender.app.capture.conventions import AXES, pose, reinterpreted
 from unrender.app.capture.formats import colmap, files, lights
 from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs

@@ -21,7 +21,7 @@ from unrender.app.distributed.cluster import (
     load_ray,
     share,
 )
-from unrender.app.distributed.cluster.head import HeadNode
+from unrender.app.distributed.cluster.connection import HeadNode
 from unrender.core.errors import InputError
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unrender.estimators.damping import damping, smoothed_variance
+from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.estimators.sample_groups import _derivative
 from unrender.images.base import variance_of_mean
 from unrender.losses import L1

@@ -15,7 +15,7 @@ import pytest
 import unrender as ur
 from tests.contract import analytic
 from unrender.app.cli.dealing import variant_again
-from unrender.app.distributed import capacity
+from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import assign, total
 from unrender.app.distributed.cluster import Workers, share
 from unrender.app.distributed.executor import DistributedExecutor
@@ -336,13 +336,13 @@ def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pyt
 def test_what_does_not_fit_a_worker_is_refused_with_what_would() -> None:
     problem = analytic.problem(views=4)
     shares = ((0, 1), (2, 3))
-    parameters, images = capacity.needed(problem, (0, 1), remembers=True)
+    parameters, images = assignment.needed(problem, (0, 1), remembers=True)
     room = sum(parameters.values()) + images
-    capacity.check(problem, shares, [("a", room), ("b", 0)], remembers=True)
+    assignment.check(problem, shares, [("a", room), ("b", 0)], remembers=True)
     with pytest.raises(ur.InputError, match=r"on b, .* 1 would fit; take 4 workers"):
-        capacity.check(problem, shares, [("a", room), ("b", room - 1)], remembers=True)
+        assignment.check(problem, shares, [("a", room), ("b", room - 1)], remembers=True)
     with pytest.raises(ur.InputError, match=r"parameter map \(2 × 2 × 1\) is .*, but a has .*would fit"):
-        capacity.check(problem, shares, [("a", 100), ("b", 100)], remembers=False)
+        assignment.check(problem, shares, [("a", 100), ("b", 100)], remembers=False)
 
 
 def test_a_grid_that_fits_no_worker_is_refused_with_the_grid_that_would() -> None:
@@ -355,11 +355,11 @@ def test_a_grid_that_fits_no_worker_is_refused_with_the_grid_that_would() -> Non
 
     room = [("a", 10**9), ("b", 10**9)]
     with pytest.raises(ur.InputError) as refused:
-        capacity.check(problem(512, 512, 512, 1), ((0,), (1,)), room, remembers=False)
+        assignment.check(problem(512, 512, 512, 1), ((0,), (1,)), room, remembers=False)
     assert "parameter smoke.sigma_t.data (512 × 512 × 512 × 1) is 4.29 GB in each worker" in str(refused.value)
     told = re.search(r"but a has 1 GB for it: \((\d+) × (\d+) × (\d+) × 1\) would fit$", str(refused.value))
     assert told is not None
     largest = [int(n) for n in told.groups()]
-    capacity.check(problem(*largest, 1), ((0,), (1,)), room, remembers=False)
+    assignment.check(problem(*largest, 1), ((0,), (1,)), room, remembers=False)
     with pytest.raises(ur.InputError, match="would fit"):
-        capacity.check(problem(*(n + 1 for n in largest), 1), ((0,), (1,)), room, remembers=False)
+        assignment.check(problem(*(n + 1 for n in largest), 1), ((0,), (1,)), room, remembers=False)

@@ -9,7 +9,7 @@ import pytest
 
 from unrender.app.evaluation.measures import best_factors, compare_albedo, mean, measure
 from unrender.core.errors import InputError
-from unrender.losses import lpips, metrics
+from unrender.losses import metrics
 
 MASK = np.zeros((16, 20), np.float32)
 MASK[3:12, 4:15] = 1
@@ -65,13 +65,13 @@ def test_albedo_is_compared_up_to_a_factor_for_each_channel() -> None:
 @pytest.mark.slow
 def test_lpips_is_given_pictures_from_minus_one_to_one(monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
-    monkeypatch.setattr(lpips, "available", lambda: True)
+    monkeypatch.setattr(metrics, "available", lambda: True)
     monkeypatch.setattr(
-        lpips, "_network", lambda: lambda one, two: torch.mean(torch.abs(one[0, :, 0, 0] - two[0, :, 0, 0]))
+        metrics, "_network", lambda: lambda one, two: torch.mean(torch.abs(one[0, :, 0, 0] - two[0, :, 0, 0]))
     )
     picture = np.zeros((32, 40, 3))
-    assert lpips.distance(picture + 0.75, picture) == pytest.approx(1.5)
-    assert lpips.distance(picture[:31], picture[:31]) is None
+    assert metrics.distance(picture + 0.75, picture) == pytest.approx(1.5)
+    assert metrics.distance(picture[:31], picture[:31]) is None
 
 
 def test_the_best_factors_are_those_of_least_squares() -> None:

@@ -19,7 +19,7 @@ from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
 from unrender.runs.mesh_guard import guarded
-from unrender.runs.mesh_watch import MeshWatch
+from unrender.runs.watches import MeshWatch
 from unrender.scene import remeshing
 from unrender.scene.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
 from unrender.scene.mesh_regularizer import MeshRegularizer

@@ -18,7 +18,7 @@ from browser import chromium
 from unrender.app import report
 from unrender.app.report import shapes
 from unrender.gallery import meshes
-from unrender.io import mesh_writing
+from unrender.io import mesh_files
 from unrender.runs import reopen
 from unrender.runs.folder import reader
 
@@ -44,13 +44,13 @@ def written(folder: Path, **more: np.ndarray) -> Path:
 def test_ply_and_obj_are_read_again_as_they_were() -> None:
     vertices = POINTS[OF].astype(np.float32)
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    found: Any = trimesh.load(io.BytesIO(mesh_writing.ply(vertices, CUT, normals, UV)), file_type="ply", process=False)
+    found: Any = trimesh.load(io.BytesIO(mesh_files.ply(vertices, CUT, normals, UV)), file_type="ply", process=False)
     np.testing.assert_array_equal(found.vertices.astype(np.float32), vertices)
     np.testing.assert_array_equal(found.faces, CUT)
     np.testing.assert_allclose(found.vertex_normals, normals, atol=1e-6)
     np.testing.assert_allclose(found.visual.uv, np.stack([UV[:, 0], 1 - UV[:, 1]], 1), atol=1e-6)
     for uv in (None, UV):
-        text = mesh_writing.obj(vertices, CUT, uv)
+        text = mesh_files.obj(vertices, CUT, uv)
         found: Any = trimesh.load(io.BytesIO(text), file_type="obj", process=False, maintain_order=True)
         np.testing.assert_array_equal(found.vertices.astype(np.float32), vertices)
         np.testing.assert_array_equal(found.faces, CUT)

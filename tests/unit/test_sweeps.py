@@ -135,7 +135,7 @@ def searches(kind: str) -> Search:
     space = axes("learning_rate=0.0003:3:log", "spp=2:16:log")
     if kind == "tpe":
         pytest.importorskip("optuna")
-        from unrender.app.sweeps.tpe import TPE
+        from unrender.app.sweeps.search import TPE
 
         return TPE(space, 24, 5)
     return Random(space, 24, 5)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import unrender as ur
-from unrender.runs.tensorboard import TensorBoard
+from unrender.runs.callbacks import TensorBoard
 
 PACKAGE = "needs tensorboardX: pip install 'unrender[tensorboard]'"
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unrender.app.capture import photometric, turntable
+from unrender.app.capture import photometric_folder, turntable
 from unrender.app.capture.cameras import Lens
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import CapturedView
 from unrender.app.capture.formats import is_lit, lights
 from unrender.app.capture.stored import StoredViews
 from unrender.core.errors import InputError
@@ -136,9 +136,9 @@ def test_least_squares_finds_normals_where_no_shadow_falls() -> None:
     colours = rng.uniform(0.2, 0.9, (5, 4, 3))
     towards = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
     values = np.einsum("kd,ijd->kij", towards, normals)[..., None] * colours
-    found, reflectance = photometric.least_squares(values, towards)
+    found, reflectance = photometric_folder.least_squares(values, towards)
     np.testing.assert_allclose(found, normals, atol=1e-9)
     np.testing.assert_allclose(reflectance, colours, atol=1e-9)
-    assert photometric.lit(values.mean(-1)).all()
+    assert photometric_folder.lit(values.mean(-1)).all()
     values[2, 0, 0] = 0
-    assert not photometric.lit(values.mean(-1))[0, 0]
+    assert not photometric_folder.lit(values.mean(-1))[0, 0]

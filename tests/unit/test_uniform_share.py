@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unrender.app.distributed.batches import joined
+from unrender.app.distributed.assignment import joined
 from unrender.app.distributed.messages import Batch
 from unrender.pixels import tiles as tiles_module
 from unrender.pixels import uniform_share
 from unrender.pixels.base import DrawStatistics
-from unrender.pixels.pooling import pool
+from unrender.pixels.map_denoising import pool
 from unrender.pixels.uniform_share import MOST, SHARES, ShareEvidence
 
 

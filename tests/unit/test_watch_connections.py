@@ -20,8 +20,8 @@ from report_folders import write_run
 
 from browser import chromium
 from unrender.app.watch import Address, connections, server
+from unrender.app.watch.connections import Redirect
 from unrender.app.watch.monitor import RunMonitor
-from unrender.app.watch.redirect import Redirect
 
 PATIENCE = 20.0
 

@@ -22,7 +22,7 @@ from benchmarks.adaptive.over_uniform.run import rough_box
 from benchmarks.internals import Key, SampleRequest, Tree, with_differential_bsdf
 from benchmarks.paths import descent
 from benchmarks.pixel_schemes import pixels
-from unrender.gallery import parts, skies
+from unrender.gallery import parts
 
 ALPHAS = (0.02, 0.05, 0.15, 0.5)
 KINDS = ("ordinary", "differential")
@@ -40,7 +40,7 @@ def _metal(shape: str, truth: float, resolution: int) -> Callable[[], dict[str, 
     def scene() -> dict[str, Any]:
         silver = {"type": "roughconductor", "material": "Ag", "alpha": truth, "distribution": "ggx"}
         sun = np.array([-0.35, 0.75, -0.56])
-        sky = skies.picture(tuple(sun / np.linalg.norm(sun)), 0.12, (60.0, 55.0, 45.0))
+        sky = parts.picture(tuple(sun / np.linalg.norm(sun)), 0.12, (60.0, 55.0, 45.0))
         of_shape = {
             "plate": lambda: parts.rectangle((0, 0, 0), (1.2, 0, 0), (0, 0.75, -0.95), silver),
             "ball": lambda: {"type": "sphere", "radius": 1.0, "bsdf": silver},
@@ -49,7 +49,7 @@ def _metal(shape: str, truth: float, resolution: int) -> Callable[[], dict[str, 
             "type": "scene",
             "camera": parts.camera((0, 0.8, 4), (0, 0, 0), 36.0, resolution),
             "metal": of_shape[shape](),
-            "sky": skies.environment(sky),
+            "sky": parts.environment(sky),
         }
 
     return scene

@@ -10,6 +10,7 @@ that are None are left out where that is their default, and else listed under "n
 from __future__ import annotations
 
 import dataclasses
+import re
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,16 +18,70 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from unrender.core import registry, short_forms
+from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.registry import GROUP
 from unrender.core.suggestions import did_you_mean
 
-__all__ = ["NotStorable", "build", "component", "fields", "table"]
+__all__ = ["NotStorable", "build", "component", "fields", "parse", "table"]
+
+
+_CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
+_NEXT = "then"
+"""The field that takes what follows the word "then"."""
+
+
+def parse(text: str, kind: str) -> Any:
+    """The component that `text` describes: its name in any case, and the numbers of its first fields in their order.
+
+    Args:
+        text: "name", "name(number, ...)", or two of these with "then" between them where the first has a field `then`.
+        kind: of `registry.KINDS`.
+
+    Raises:
+        InputError: an unknown name, or arguments that do not fit.
+    """
+    first, *rest = re.split(r"\bthen\b", text, maxsplit=1)
+    match = _CALL.fullmatch(first)
+    known = {name.lower(): made_by for name, made_by in registry.components(kind).items()}
+    name = match[1].lower() if match else ""
+    if match is None or name not in known:
+        hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
+        raise InputError(f"{kind}: unknown {(match[1] if match else text)!r}{hint}")
+    every = [field for field in dataclasses.fields(known[name]) if field.init]
+    numbers = [field for field in every if field.name != _NEXT]
+    given = [part.strip() for part in match[2].split(",")] if match[2] and match[2].strip() else []
+    required = [field.name for field in numbers if field.default is dataclasses.MISSING]
+    if not len(required) <= len(given) <= len(numbers):
+        raise InputError(f"{kind}: expected {name}({', '.join(field.name for field in numbers)}), got {text!r}")
+    arguments: dict[str, Any] = {field.name: _number(part, kind) for field, part in zip(numbers, given, strict=False)}
+    if rest:
+        if len(numbers) == len(every):
+            raise InputError(f'{kind}: only {_with_next(known)} can have something after "then", got {text!r}')
+        arguments[_NEXT] = parse(rest[0], kind)
+    try:
+        return known[name](**arguments)
+    except InputError as error:
+        raise InputError(f"{kind}: {error}") from error
+
+
+def _with_next(known: dict[str, type]) -> str:
+    names = [name for name, made_by in known.items() if any(each.name == _NEXT for each in dataclasses.fields(made_by))]
+    return ", ".join(names)
+
+
+def _number(text: str, kind: str) -> int | float:
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            pass
+    raise InputError(f"{kind}: expected a number, got {text!r}")
+
 
 _TYPE, _NONE = "type", "none"
 _IN_SHORT = ("parameterisation", "schedule")
-"""Kinds that have a short text form, "name(number, ...)" (`core.short_forms`)."""
+"""Kinds that have a short text form, "name(number, ...)" (`core.tables`)."""
 _DEEPEST = 16
 _LONGEST_LIST = 4096
 _T = TypeVar("_T")
@@ -89,7 +144,7 @@ def _component(given: Any, kind: str | None, folder: Path | None, depth: int) ->
     if depth > _DEEPEST:
         raise InputError("nested too deeply")
     if kind in _IN_SHORT and isinstance(given, str):
-        return short_forms.parse(given, kind)
+        return parse(given, kind)
     given = {_TYPE: given} if kind is not None and isinstance(given, str) else given
     known = registry.table_components() if kind is None else registry.components(kind)
     if not isinstance(given, Mapping) or not isinstance(given.get(_TYPE), str):

@@ -7,11 +7,10 @@ import io
 
 import numpy as np
 
-from unrender.display import maps
 from unrender.io.thumbnails import reduced
 from unrender.losses.metrics import exposure, srgb
 
-__all__ = ["data_uri", "png", "shown_image", "shown_map"]
+__all__ = ["data_uri", "is_map", "plane", "planes", "png", "shown_image", "shown_map"]
 
 
 def png(colours: np.ndarray, effort: int = 6) -> bytes:
@@ -40,16 +39,49 @@ def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int =
 
     One channel is grey over the range of `like` (by default its own); three are sRGB, exposed only where values pass 1.
     """
-    plane = maps.plane(np.asarray(values))
-    if plane is None:
+    picture = plane(np.asarray(values))
+    if picture is None:
         return None
     scale = np.asarray(values if like is None else like)
     finite = scale[np.isfinite(scale)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    small = reduced(plane, largest)
+    small = reduced(picture, largest)
     with np.errstate(over="ignore", invalid="ignore"):
-        if plane.shape[-1] == 1:
+        if picture.shape[-1] == 1:
             span = high - low if high > low else 1.0
             grey = np.clip(np.nan_to_num((small - low) / span), 0.0, 1.0)
             return np.repeat(grey, 3, axis=-1)
         return srgb(small[..., :3] * (1.0 if high <= 1 else 1 / high))
+
+
+_VALUES_IN_A_TABLE = 16
+
+
+def is_map(array: np.ndarray) -> bool:
+    """Whether a parameter is shown as a picture: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
+    if array.size == 0:
+        return False
+    if array.ndim == 2:
+        return array.size > _VALUES_IN_A_TABLE and min(array.shape) > 1
+    return array.ndim in (3, 4) and array.shape[-1] in (1, 3, 4) and sum(n > 1 for n in array.shape[:-1]) >= 2
+
+
+def plane(array: np.ndarray) -> np.ndarray | None:
+    """(H, W, C) of a map: the texture itself or a volume's first middle slice; None for what is no map."""
+    return next(iter(planes(array).values()), None)
+
+
+def planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
+    """{label: (H, W, C)}: the texture itself, or a volume's middle slices along its axes."""
+    if array is None or not is_map(array):
+        return {}
+    if array.ndim == 2:
+        return {"": array[..., None]}
+    if array.ndim == 3:
+        return {"": array}
+    found = {}
+    for axis, name in enumerate("zyx"):
+        plane = np.take(array, array.shape[axis] // 2, axis=axis)
+        if min(plane.shape[:2]) > 1:
+            found[f"middle slice along {name}"] = plane
+    return found or {"slice": array.reshape(-1, *array.shape[2:])}

@@ -16,7 +16,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
-from unrender.estimators.damping import damping, smoothed_variance
+from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem

@@ -17,9 +17,8 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
-from unrender.estimators.damping import damping, smoothed_variance
 from unrender.estimators.emitter_selection import EmitterRequest
-from unrender.estimators.gradient_sum import GradientSum
+from unrender.estimators.gradient_sum import GradientSum, damping, smoothed_variance
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All

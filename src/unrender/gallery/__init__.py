@@ -2,6 +2,6 @@
 
 from unrender.gallery.catalogue import names, options, problem, summary
 from unrender.gallery.fields import Option
-from unrender.gallery.vase_photographs import photographs
+from unrender.gallery.sunlit_vase import photographs
 
 __all__ = ["Option", "names", "options", "photographs", "problem", "summary"]

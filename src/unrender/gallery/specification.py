@@ -1,29 +1,118 @@
-"""From a specification, the true scene and the parameters to recover, to a problem with references and truth."""
+"""From a specification, the true scene and the parameters to recover, to a problem with references and truth.
+
+Reference images are cached between processes. The key of an image is all that decides it: the numbers and the structure of the loaded
+scene, the sensor, samples, path length, and the versions of what renders it. A file that cannot be read is rendered anew and replaced.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import math
+import os
+import re
 from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender.backend.variant import ensure
+from unrender.backend import cache
+from unrender.backend.variant import current, ensure, llvm_version
 from unrender.core import phases
+from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.gallery import reference_cache
+from unrender.io import bounded_files, files
 from unrender.losses import Loss
 from unrender.rendering.mitsuba import film
-from unrender.rendering.mitsuba.pixel_filter import PixelFilters
+from unrender.rendering.mitsuba.pixel_filter import PixelFilters, is_box
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["ProblemSource", "Specification", "build_problem", "reference"]
+__all__ = ["ProblemSource", "Specification", "build_problem", "digest", "recall", "reference"]
+
+
+_FORMAT = 2
+_NAME = "reference"
+_ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")
+"""Parts of a scene's description that differ from one load to the next."""
+_SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) = .*\n", re.MULTILINE)
+"""What a rendering leaves behind in a sampler, and the next one sets."""
+
+
+def recall(scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray]) -> np.ndarray:
+    """The image of the cache, else what `render` returns, which is kept there.
+
+    Args:
+        scene: a loaded Mitsuba scene.
+        sensor, spp, max_depth: how it is rendered.
+        render: makes the image, (H, W, 3) float32.
+    """
+    place = cache.folder(cache.REFERENCES)
+    if place is None:
+        return render()
+    path = place / f"{digest(scene, sensor, spp, max_depth)}.npz"
+    width, height = scene.sensors()[sensor].film().crop_size()
+    found = _read(path, (int(height), int(width), 3))
+    if found is None:
+        found = render()
+        with contextlib.suppress(InputError):  # a full disk: the image is there all the same
+            files.write_arrays(path, {_NAME: found})
+            cache.trim(place, cache.LARGEST[cache.REFERENCES])
+    return found
+
+
+def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
+    """A name for the image: SHA-256 of what decides it."""
+    state = hashlib.sha256()
+    versions = [f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit")]
+    facts = [
+        _FORMAT,
+        *versions,
+        current(),
+        llvm_version(),
+        sensor,
+        spp,
+        max_depth,
+        _SAMPLER.sub("", _ADDRESS.sub("", str(scene))),
+        *(["filtered"] if not is_box(scene.sensors()[sensor].film()) else []),
+    ]
+    state.update("\n".join(map(str, facts)).encode())
+    parameters = mi.traverse(scene)
+    for key in sorted(_ADDRESS.sub("", name) + "\0" + name for name in parameters.keys()):  # noqa: SIM118 (iterating gives pairs)
+        name = key.partition("\0")[2]
+        state.update(f"\n{key.partition(chr(0))[0]} ".encode())
+        state.update(_bytes(parameters[name]))
+    return state.hexdigest()[:40]
+
+
+def _bytes(value: Any) -> bytes:
+    if isinstance(value, (bool, int, float, str)):
+        return repr(value).encode()
+    array = np.asarray(value.matrix if hasattr(value, "matrix") else value)
+    return f"{array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes()
+
+
+def _read(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The image, or None where there is none that can be used."""
+    if not path.exists():
+        return None
+    try:
+        found = bounded_files.read_float_arrays(path, path.parent).get(_NAME)
+    except InputError:
+        return None
+    if found is None or found.shape != shape or found.dtype != np.float32:
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # used just now
+    return found
+
 
 _LANES = 1 << 21
 """Paths per pass of a reference: as many as fit a small machine's memory."""
@@ -101,9 +190,7 @@ def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
     in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:
-        return reference_cache.recall(
-            scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, advance)
-        )
+        return recall(scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, advance))
 
 
 def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable[[float], None]) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, skies, textures
+from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
@@ -55,7 +55,7 @@ class SunGlossy:
                 )
                 for number, a in enumerate(angles)
             },
-            "sky": skies.environment(skies.picture(_SUN, np.radians(2.5), (500.0, 450.0, 370.0))),
+            "sky": parts.environment(parts.picture(_SUN, np.radians(2.5), (500.0, 450.0, 370.0))),
             "ground": parts.rectangle((0, 0, 0), (60, 0, 0), (0, 0, -60), parts.diffuse(0.3, 0.27, 0.22)),
             "doll": meshes.sheet("doll", meshes.lathe(*_profile(96), 96), lacquer, closed=True),
         }

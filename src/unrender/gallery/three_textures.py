@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, skies, textures, two_planets
+from unrender.gallery import fields, meshes, parts, textures, two_planets
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
@@ -57,7 +57,7 @@ class ThreeTextures:
                 )
                 for number, a in enumerate(angles)
             },
-            "sky": skies.environment(skies.picture(_SUN, np.radians(8.0), (45.0, 40.0, 32.0))),
+            "sky": parts.environment(parts.picture(_SUN, np.radians(8.0), (45.0, 40.0, 32.0))),
             "ground": parts.rectangle((0, 0, 0), (30, 0, 0), (0, 0, -30), parts.diffuse(0.3, 0.27, 0.22)),
             "ball": _painted("ball", ball + _place(0), planet),
             "jar": _painted("jar", jar + _place(1), self._photograph("chelsea")),

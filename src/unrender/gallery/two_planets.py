@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, skies, textures
+from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
@@ -82,7 +82,7 @@ def _ball(name: str, x: float, texture: np.ndarray) -> Any:
 
 def sky() -> dict[str, Any]:
     """A dusk with a large sun."""
-    return skies.environment(skies.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK))
+    return parts.environment(parts.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK))
 
 
 def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[str, Any]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import os
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from unrender.core.errors import InputError
 from unrender.core.text import shorten
-from unrender.io import bounded_files, image_size, mesh_files, spectrum_files, tensor_files, volumes
+from unrender.io import bounded_files, image_size, mesh_files, spectrum_files, volumes
 
-__all__ = ["MOST_VALUES", "AssetChecks"]
+__all__ = ["MOST_VALUES", "AssetChecks", "check_tensors"]
+
 
 MOST_VALUES = 1 << 30
 """Of all pictures and grids of a scene together."""
@@ -72,8 +77,47 @@ _CHECKS: dict[str, Callable[[Path], int | None]] = {
     **dict.fromkeys(("bitmap", "envmap"), _picture),
     **dict.fromkeys(("gridvolume", "sdfgrid"), volumes.check_vol),
     **dict.fromkeys(("ellipsoids", "ellipsoidsmesh"), _splats),
-    **dict.fromkeys(("measured", "measured_polarized"), tensor_files.check),
+    **dict.fromkeys(("measured", "measured_polarized"), lambda path: check_tensors(path)),
     "ply": mesh_files.check_ply,
     "obj": mesh_files.check_obj,
     "spectrum": spectrum_files.check,
 }
+
+
+_MAGIC = b"tensor_file"
+_MOST_FIELDS, _MOST_AXES = 1000, 16
+_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}
+"""Of each type of number: whole ones of 8 to 64 bits, with and without sign; float16, float32, float64."""
+
+
+def check_tensors(path: Path) -> None:
+    """Raise `InputError` unless all tensors of a file lie within it."""
+    try:
+        with bounded_files.open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if file.read(12).rstrip(b"\0") != _MAGIC:
+                raise ValueError("no tensor file")
+            _, fields = _read(file, "<HI")
+            if fields > _MOST_FIELDS:
+                raise ValueError("too many tensors")
+            for _ in range(fields):
+                _check_field(file, size)
+    except (struct.error, ValueError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a tensor file that can be read ({error})") from error
+
+
+def _check_field(file: IO[bytes], size: int) -> None:
+    (length,) = _read(file, "<H")
+    file.read(length)
+    axes, kind, offset = _read(file, "<HBQ")
+    if axes > _MOST_AXES:
+        raise ValueError("too many axes")
+    shape = _read(file, f"<{axes}Q")
+    if offset + math.prod(shape) * _BYTES[kind] > size:
+        raise ValueError("a tensor that leads out of the file")
+
+
+def _read(file: IO[bytes], form: str) -> tuple[int, ...]:
+    return struct.unpack(form, file.read(struct.calcsize(form)))

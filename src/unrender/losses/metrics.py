@@ -7,7 +7,10 @@ value that a peak signal-to-noise ratio could refer to, and a lamp in the pictur
 
 from __future__ import annotations
 
+import functools
 import math
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +18,11 @@ import numpy as np
 from unrender.core.errors import InputError
 
 __all__ = [
+    "MISSING",
     "RELATIVE_EPSILON",
+    "available",
     "displayed",
+    "distance",
     "exposure",
     "flip",
     "has_flip",
@@ -26,6 +32,7 @@ __all__ = [
     "srgb",
     "ssim",
 ]
+
 
 RELATIVE_EPSILON = 1e-2
 """Added to the squared reference by `relative_mse`, so that black pixels do not decide."""
@@ -135,3 +142,38 @@ def has_flip() -> bool:
     from importlib.util import find_spec
 
     return find_spec("flip_evaluator") is not None
+
+
+MISSING = "LPIPS is left out: it needs pip install lpips, and AlexNet's weights in PyTorch's folder hub/checkpoints"
+_LEAST = 32
+"""Pixels a side that the network needs."""
+
+
+def available() -> bool:
+    """Whether the package is installed and AlexNet's weights lie where torchvision keeps them."""
+    if any(find_spec(name) is None for name in ("torch", "torchvision", "lpips")):
+        return False
+    import torch  # pyright: ignore[reportMissingImports]
+
+    return any((Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth"))
+
+
+def distance(image: np.ndarray, reference: np.ndarray) -> float | None:
+    """Of two pictures (H, W, 3) as displayed, in [0, 1], by AlexNet. Smaller is better. None where it cannot be computed."""
+    if min(image.shape[:2]) < _LEAST or not available():
+        return None
+    import torch  # pyright: ignore[reportMissingImports]
+
+    one, two = (
+        torch.from_numpy(np.ascontiguousarray(2 * x.transpose(2, 0, 1)[None] - 1, np.float32))
+        for x in (image, reference)
+    )
+    with torch.no_grad():
+        return float(_network()(one, two))
+
+
+@functools.cache
+def _network() -> Any:
+    import lpips  # pyright: ignore[reportMissingImports]
+
+    return lpips.LPIPS(net="alex", verbose=False)  # pyright: ignore[reportAttributeAccessIssue]

@@ -10,7 +10,7 @@ from typing import Any
 import pydantic
 from pydantic import BaseModel, ConfigDict
 
-from unrender.core import registry, short_forms
+from unrender.core import registry, tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import grouped
@@ -132,7 +132,7 @@ def parse_schedule(text: str | None) -> Schedule | None:
     Raises:
         InputError: an unknown name, or arguments that do not fit.
     """
-    return None if text is None else short_forms.parse(text, "schedule")
+    return None if text is None else tables.parse(text, "schedule")
 
 
 def _in_words(schema: Mapping[str, Any]) -> str:

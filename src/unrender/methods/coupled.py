@@ -11,7 +11,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.meta import MetaEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.meta_options import MetaCommonOptions
+from unrender.methods.meta import MetaCommonOptions
 from unrender.optimizers.base import Optimizer
 
 __all__ = ["CoupledMethod"]

@@ -14,7 +14,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise
 from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
-from unrender.optimizers.trust_region import trust_region_step
+from unrender.optimizers.newton import trust_region_step
 
 __all__ = ["AveragedNewton", "AveragedNewtonState"]
 

@@ -14,9 +14,8 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch
-from unrender.pixels.pooling import pool
-from unrender.pixels.tile_samples import Maps, TileSamples, finite
-from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
+from unrender.pixels.map_denoising import pool
+from unrender.pixels.tiles import InverseCdfTable, Maps, Tiles, TileSamples, cut, finite
 from unrender.pixels.uniform_share import ShareEvidence
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem

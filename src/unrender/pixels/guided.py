@@ -15,8 +15,7 @@ from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, check_batch
 from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_map
-from unrender.pixels.tile_samples import FACTORS, Maps, TileSamples, finite
-from unrender.pixels.tiles import InverseCdfTable, Tiles, cut
+from unrender.pixels.tiles import FACTORS, InverseCdfTable, Maps, Tiles, TileSamples, cut, finite
 from unrender.pixels.uniform_share import ShareEvidence
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem

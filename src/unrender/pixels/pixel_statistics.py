@@ -13,7 +13,7 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.pixels.pooling import pool
+from unrender.pixels.map_denoising import pool
 from unrender.pixels.tiles import InverseCdfTable, Tiles
 from unrender.rendering.renderer import CountingSession
 from unrender.scene.batches import PixelBatch, PixelSample

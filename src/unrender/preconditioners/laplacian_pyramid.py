@@ -22,7 +22,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.preconditioners import grid
-from unrender.preconditioners.around import Around, around_axis
+from unrender.preconditioners.base import Around, around_axis
 
 __all__ = ["LaplacianPyramid"]
 

@@ -11,7 +11,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid
-from unrender.preconditioners.around import Around, around_axis
+from unrender.preconditioners.base import Around, around_axis
 from unrender.preconditioners.mesh import MeshTopology
 
 __all__ = ["LargeSteps"]

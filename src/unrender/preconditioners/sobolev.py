@@ -14,7 +14,7 @@ from unrender.core import arrays, checks, periodic
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.preconditioners import grid, grid_pyramid
-from unrender.preconditioners.around import Around, around_axis
+from unrender.preconditioners.base import Around, around_axis
 from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
 __all__ = ["Sobolev"]

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from unrender.core import lazy
 
 if TYPE_CHECKING:
+    from unrender.runs.callbacks import TensorBoard
     from unrender.runs.live import Live
-    from unrender.runs.tensorboard import TensorBoard
 
 __getattr__, _ = lazy.attach(
     __name__,

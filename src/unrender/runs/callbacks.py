@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
+import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.io.thumbnails import reduced
+from unrender.losses.metrics import exposure, srgb
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
-__all__ = ["Callback"]
+
+__all__ = ["Callback", "TensorBoard"]
 
 
 class Callback:
@@ -26,3 +37,63 @@ class Callback:
 
     def on_end(self, run: Run, result: Result) -> None:
         """After the last step."""
+
+
+_LARGEST = 512
+_VIEWS = 8
+
+
+class TensorBoard(Callback):
+    """Writes event files that TensorBoard shows: loss, gradient noise and parameter errors at every step, pictures now and then.
+
+    Scalars have the step on their horizontal axis: `loss`, `gradient_noise`, `samples`, `seconds` (of optimization), and
+    `parameter_error/KEY` where the truth is known. Pictures are those that the loss saw, `view/N`, in sRGB at their reference's exposure.
+
+    Args:
+        directory: where the event files go; made where it is missing. One folder per run.
+        picture_seconds: the least time between pictures, > 0; None for no pictures.
+
+    Raises:
+        InputError: the package tensorboardX is missing, or the folder cannot be written to.
+    """
+
+    def __init__(self, directory: str | Path, picture_seconds: float | None = 10.0):
+        if picture_seconds is not None and not 0 < picture_seconds < math.inf:
+            raise InputError(
+                f"TensorBoard: picture_seconds must be positive and finite, or None, got {picture_seconds!r}"
+            )
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise InputError("TensorBoard needs a package of its own: pip install 'unrender[tensorboard]'") from error
+        try:
+            self._writer = SummaryWriter(logdir=str(directory))
+        except OSError as error:
+            raise InputError(f"TensorBoard: {directory}: cannot be written: {error.strerror or error}") from error
+        self._every = picture_seconds
+        self._next = 0.0
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        scalars = {name: record.get(name) for name in ("loss", "gradient_noise", "samples", "seconds")}
+        scalars |= {f"parameter_error/{key}": error for key, error in record.get("parameter_error", {}).items()}
+        for name, value in scalars.items():
+            if value is not None and math.isfinite(value):
+                self._writer.add_scalar(name, value, record["step"])
+        if self._every is not None and (run.stopped or time.monotonic() >= self._next):
+            self._pictures(run, record["step"])
+            self._next = time.monotonic() + self._every
+
+    def on_end(self, run: Run, result: Result) -> None:
+        """See `Callback.on_end`."""
+        del run, result
+        self._writer.close()
+
+    def _pictures(self, run: Run, step: int) -> None:
+        images = run.estimate.info.get("images", {}) if run.estimate is not None else {}
+        for view, image in images.items():
+            reference = np.asarray(run.problem.views[view].reference)
+            shown = arrays.numpy(image)
+            if view < _VIEWS and shown.shape == reference.shape:
+                colours = srgb(reduced(shown, _LARGEST) * exposure(reference))
+                self._writer.add_image(f"view/{view}", (colours * 255 + 0.5).astype(np.uint8), step, dataformats="HWC")

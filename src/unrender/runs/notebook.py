@@ -2,22 +2,62 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.core import periodic
-from unrender.display import formatting, maps, notebook
+from unrender.core import periodic, phases
+from unrender.display import formatting, notebook, pictures
+from unrender.display.notebook_bar import NotebookBar
 from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure
-from unrender.runs import curves
+from unrender.runs import figure
+from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result
+    from unrender.runs.run import Run
 
-__all__ = ["error_title", "html", "line", "measures", "shown_pictures", "start_errors"]
+
+__all__ = ["NotebookProgress", "error_title", "html", "line", "measures", "shown_pictures", "start_errors"]
+
+
+class NotebookProgress(Callback):
+    """A bar in a notebook's cell: compiling, steps with loss and parameter error, final pictures; then one line. A context manager."""
+
+    def __init__(self) -> None:
+        self._bar = NotebookBar()
+        self._listening = phases.listening(self._bar)
+        self._told = ""
+
+    def __enter__(self) -> NotebookProgress:
+        self._listening.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._listening.__exit__(None, None, None)
+        self._bar.close(self._told)
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        """See `Callback.on_step`."""
+        parts = [
+            f"step {run.step}" + (f" of {run.steps}" if run.steps else ""),
+            f"loss {formatting.number(record['loss'])}",
+        ]
+        if errors := record.get("parameter_error"):
+            parts.append("error " + ", ".join(map(formatting.number, errors.values())))
+        self._bar.show(", ".join(parts), run.progress())
+
+    def on_end(self, run: Run, result: Result) -> None:
+        """See `Callback.on_end`."""
+        del run
+        self._told = f"{result.steps} steps in {formatting.duration(result.seconds)}"
+        self._told += (
+            f" and {formatting.duration(result.warmup_seconds)} to compile" if result.warmup_seconds >= 0.5 else ""
+        )
+
 
 _VIEWS, _MAPS = 2, 3
 
@@ -30,8 +70,8 @@ def line(result: Result) -> str:
 def html(result: Result) -> str:
     """Pictures, recovered maps beside truth and start, curves, where the time went, warnings."""
     end = result.seconds or 1.0
-    seconds, loss = curves.loss(result.history)
-    errors = curves.parameter_errors(result.history, start_errors(result))
+    seconds, loss = figure.loss(result.history)
+    errors = figure.parameter_errors(result.history, start_errors(result))
     lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
     drawn = [
         chart(error_title(result), lines, "seconds", end),
@@ -57,7 +97,7 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
             picture = result.pictures.get(f"view{view}/{what}")
             if picture is not None:
                 shown[f"view {view}: {'start' if what == 'initial' else what}"] = shown_image(picture, reference)
-    for key in [key for key, values in result.parameters.items() if maps.is_map(values)][:_MAPS]:
+    for key in [key for key, values in result.parameters.items() if pictures.is_map(values)][:_MAPS]:
         truth, columns = result.truth.get(key), found[key].repeated
         like = result.parameters[key] if truth is None else truth
         for what, values in (("truth", truth), ("start", result.initial[key]), ("recovered", result.parameters[key])):

@@ -18,15 +18,12 @@ from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.runs import advice, components
-from unrender.runs.bounds_watch import BoundsWatch
 from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import CallbackHook, Hook
-from unrender.runs.influence import InfluenceWatch
 from unrender.runs.loop import Descent, descend, prepare
-from unrender.runs.mesh_watch import MeshWatch
 from unrender.runs.metadata import (
     RunAnnotations,
     RunMetadata,
@@ -36,13 +33,14 @@ from unrender.runs.metadata import (
     first_values,
     to_numpy,
 )
-from unrender.runs.notebook_progress import NotebookProgress
+from unrender.runs.notebook import NotebookProgress
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, terminate_if_told
 from unrender.runs.verify import Verify
+from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 from unrender.scene.serialization import origin

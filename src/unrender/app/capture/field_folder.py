@@ -11,12 +11,12 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import CapturedView
 from unrender.app.capture.overlays import png
 from unrender.app.capture.problem_folder import sensor_element
 from unrender.app.capture.stored import StoredViews
 from unrender.app.capture.writing import MASKS, PROBLEM, REFERENCES, SCENE, add_value, problem_text, write_exr
-from unrender.app.evaluation.held_out import HELD_OUT
+from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.app.stages.stages_file import Stage, Stages

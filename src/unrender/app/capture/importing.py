@@ -13,11 +13,9 @@ from unrender.app.capture import (
     atlas,
     decoding,
     field_folder,
-    flips,
     formats,
     hull,
     overlays,
-    photometric,
     photometric_folder,
     problem_folder,
     turntable,
@@ -230,7 +228,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     variant.ensure()
     capture = lights.read(folder, options.masks)
     with phases.phase("photographs"):
-        views = photometric.prepare(capture, options.resolution, options.scale, options.hold_out)
+        views = photometric_folder.prepare(capture, options.resolution, options.scale, options.hold_out)
     name = folder.resolve().name
     chosen = options.unknowns or LIT_DEFAULT
     _write_folder(out, lambda place: photometric_folder.write(place, name, views, chosen))
@@ -355,9 +353,9 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
         except InputError as error:
             if str(error) != hull.EMPTY:
                 raise
-            raise InputError(f"{folder}: {flips.explain(capture, training, None, 0.0)}") from error
+            raise InputError(f"{folder}: {hull.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
-        refusal = "" if mean >= flips.SUFFICIENT else flips.explain(capture, training, given, mean)
+        refusal = "" if mean >= hull.SUFFICIENT else hull.explain(capture, training, given, mean)
     turned = turntable.stands_still(views) if options.turntable is None else options.turntable
     if turned and options.turntable is None:
         notices.append(TURNTABLE)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import CapturedView
 from unrender.app.capture.silhouettes import Silhouettes
 from unrender.core.text import printable
 from unrender.losses.metrics import srgb

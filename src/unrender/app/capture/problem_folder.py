@@ -11,7 +11,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from unrender.app.capture import unknowns
-from unrender.app.capture.captured_view import CapturedView, CapturedViews
+from unrender.app.capture.capture import CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
 from unrender.app.capture.overlays import png
 from unrender.app.capture.silhouettes import Silhouettes
@@ -27,7 +27,7 @@ from unrender.app.capture.writing import (
     problem_text,
     write_exr,
 )
-from unrender.app.evaluation.held_out import HELD_OUT
+from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError

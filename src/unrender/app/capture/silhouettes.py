@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from unrender.app.capture.cameras import Lens
-from unrender.app.capture.captured_view import CapturedViews
+from unrender.app.capture.capture import CapturedViews
 from unrender.app.capture.mesh import Mesh
 
 __all__ = ["Silhouettes", "overlap"]

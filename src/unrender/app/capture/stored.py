@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import CapturedView
 
 __all__ = ["StoredArrays", "StoredViews"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unrender.app.capture.captured_view import CapturedViews
+from unrender.app.capture.capture import CapturedViews
 
 __all__ = ["axis", "light_turns", "stands_still"]
 

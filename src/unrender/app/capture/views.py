@@ -9,8 +9,7 @@ import numpy as np
 
 from unrender.app.capture import decoding, pictures
 from unrender.app.capture.cameras import Lens
-from unrender.app.capture.capture import Capture, Photograph
-from unrender.app.capture.captured_view import CapturedView
+from unrender.app.capture.capture import Capture, CapturedView, Photograph
 from unrender.app.capture.stored import StoredViews
 from unrender.app.capture.undistortion import Resampling, pinhole
 from unrender.core.errors import InputError

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from importlib import metadata
 
 from unrender.app.cli import memory
-from unrender.app.cli.exit_status import ENVIRONMENT, INPUT, INTERRUPTED, WORDS
-from unrender.app.cli.signals import Signals
+from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, WORDS, Signals
 from unrender.backend import limits, variant
 from unrender.core.checks import encode_text
 from unrender.core.errors import UnrenderError, VariantError

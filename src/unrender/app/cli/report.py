@@ -8,8 +8,24 @@ from typing import Annotated
 import typer
 
 from unrender.app.cli import arguments
+from unrender.app.sweeps import folders
+from unrender.app.sweeps.record import SweepRecord
+from unrender.core.errors import InputError
 
-__all__ = ["report"]
+__all__ = ["report", "write_page"]
+
+
+_MOST = 6
+
+
+def write_page(folder: Path, record: SweepRecord) -> Path:
+    """Write compare.html of the six best finished trials; returns its path. Raises `InputError` where none has finished."""
+    directories = folders.best(folder, record, _MOST)
+    if not directories:
+        raise InputError(f"{folder}: no trial of the sweep has finished")
+    from unrender.app import report
+
+    return report.write_comparison(*report.load_comparison(directories), folder)
 
 
 def report(
@@ -18,7 +34,6 @@ def report(
     ],
 ) -> None:
     """Write the page of a run folder anew, or that of a sweep's best trials, and print where it is."""
-    from unrender.app.cli.sweep_page import write_page
     from unrender.app.sweeps.record import SWEEP, read_sweep
     from unrender.display.terminal import echo
 

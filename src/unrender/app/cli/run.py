@@ -24,7 +24,7 @@ from unrender.app.cli.arguments import (
     WorkersOption,
 )
 from unrender.app.cli.dealing import Compress
-from unrender.app.cli.exit_status import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
+from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
 

@@ -16,10 +16,21 @@ import time
 from types import FrameType, TracebackType
 from typing import Any
 
-from unrender.app.cli.exit_status import WORDS
 from unrender.core.signals import GRACEFUL
 
-__all__ = ["Signals"]
+__all__ = ["DOUBTFUL", "ENVIRONMENT", "FAILED", "INPUT", "INTERRUPTED", "TERMINATED", "WORDS", "Signals"]
+
+INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
+"""Invalid input; the machine lacks something; the run was given up; the check by fresh pictures failed."""
+INTERRUPTED, TERMINATED = 130, 143
+"""Ctrl-C, and SIGTERM: 128 and the number of the signal, as shells and schedulers expect."""
+WORDS = {
+    FAILED: "the run failed: it was given up, and what was finite is kept",
+    DOUBTFUL: "the result is doubtful: see the warnings",
+    INTERRUPTED: "interrupted",
+    TERMINATED: "terminated",
+}
+"""The line on standard error for those that no error comes with."""
 
 _LATER, _LONGEST = 0.02, 1.5
 """Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""

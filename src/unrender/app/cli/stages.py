@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.exit_status import DOUBTFUL
+from unrender.app.cli.signals import DOUBTFUL
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed

@@ -188,7 +188,7 @@ def search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
     count = plan.trials or _TRIALS
     if plan.search == "random":
         return plan, Random(axes, count, plan.seed)
-    from unrender.app.sweeps.tpe import TPE
+    from unrender.app.sweeps.search import TPE
 
     return plan, TPE(axes, count, plan.seed)
 

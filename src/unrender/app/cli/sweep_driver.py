@@ -12,10 +12,12 @@ from functools import partial
 from pathlib import Path
 
 import typer
+from rich.table import Table
+from rich.text import Text
 
-from unrender.app.cli import arguments, sweep_page, sweep_table, tasks
+from unrender.app.cli import arguments, report, tasks
 from unrender.app.cli.execute import introduce
-from unrender.app.cli.exit_status import FAILED, INTERRUPTED, TERMINATED
+from unrender.app.cli.signals import FAILED, INTERRUPTED, TERMINATED
 from unrender.app.cli.task_display import TaskDisplay
 from unrender.app.cli.tasks import Job, RunTask
 from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorkers, Workers, connect
@@ -25,13 +27,98 @@ from unrender.app.sweeps.search import Search
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.backend.variant import check_threads
 from unrender.core.errors import InputError
+from unrender.core.text import visible
+from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.io import files
 from unrender.runs.folder.lock import Lock
+from unrender.runs.folder.schema import DOUBTFUL
 from unrender.runs.result import TERMINATED as TOLD_TO_TERMINATE
 from unrender.scene.problem import Problem
 
-__all__ = ["Session", "run_trials"]
+__all__ = ["Session", "best_so_far", "line", "run_command", "run_trials", "show"]
+
+
+_SHOWN, _SHOWN_LIVE = 10, 5
+
+
+def line(trial: TrialRecord) -> str:
+    """One trial in words."""
+    what = f"trial {trial.number}: {_settings(trial)}: "
+    if trial.status == "failed":
+        return f"{what}failed: {trial.message}"
+    share = max((float(share) for share in trial.runs[0].rungs), default=0.0)
+    where = f" (pruned at {share:.0%})" if trial.status == "pruned" else ""
+    where += "".join(f" ({status})" for status in sorted({run.status for run in trial.runs} & DOUBTFUL))
+    return f"{what}error {_error(trial)}{where}"
+
+
+def best_so_far(trials: Trials) -> Table:
+    """The best trials that have ended."""
+    return _table(list(trials.ended.values()), _SHOWN_LIVE)
+
+
+def show(console: Console, record: SweepRecord) -> None:
+    """The outcome: the best trials, how many there were, and what to type for the best one."""
+    if record.trials:
+        console.print(_table(record.trials, _SHOWN))
+    counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "pruned", "failed")}
+    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    console.print(f"{told or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all", highlight=False)
+    reasons: dict[str, list[int]] = {}
+    for trial in record.trials:
+        if trial.status == "failed":
+            reasons.setdefault(trial.message, []).append(trial.number)
+    for message, numbers in reasons.items():
+        which = ", ".join(map(str, numbers[:_SHOWN])) + (", …" if len(numbers) > _SHOWN else "")
+        console.print(
+            f"failed (trial {which}): {visible(message)}", markup=False, highlight=False, soft_wrap=True, style="red"
+        )
+    if record.best_line:
+        console.print(f"best: {record.best_line}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"to run it: {run_command(record)}", markup=False, highlight=False, soft_wrap=True)
+
+
+def run_command(record: SweepRecord) -> str:
+    """What to type for a run with the best settings."""
+    plan = record.plan
+    words = ["unrender", "run", plan.problem, "--method", plan.method]
+    words += [w for name, value in plan.problem_settings.items() for w in ("-p", f"{name}={value}")]
+    words += [w for name, value in plan.settings.items() for w in ("-s", f"{name}={value}")]
+    words += ["--steps", str(plan.steps)] if plan.steps is not None else []
+    words += ["--seconds", f"{plan.seconds:g}"] if plan.seconds is not None else []
+    return f"{shlex.join(words)} {record.best_line}"
+
+
+def _table(trials: list[TrialRecord], most: int) -> Table:
+    ranks = {"finished": 0, "pruned": 1}
+    known = [(ranks[t.status], t.error, t) for t in trials if t.error is not None and t.status in ranks]
+    ordered = [t for _, _, t in sorted(known, key=lambda entry: (entry[0], entry[1], entry[2].number))]
+    names = list(ordered[0].settings) if ordered else []
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for heading in ("trial", *names, "error", "steps", "seconds", ""):
+        table.add_column(Text(visible(heading)), overflow="fold")
+    for trial in ordered[:most]:
+        steps = "+".join(str(run.steps) for run in trial.runs)
+        seconds = f"{sum(run.seconds for run in trial.runs):.1f}"
+        values = [Text(visible(trial.settings.get(name, ""))) for name in names]
+        doubts = sorted({run.status for run in trial.runs} & DOUBTFUL)
+        note = "; ".join(doubts) if trial.status == "finished" else trial.status
+        table.add_row(str(trial.number), *values, _error(trial), steps, seconds, note)
+    return table
+
+
+def _error(trial: TrialRecord) -> str:
+    if trial.error is None:
+        return "–"
+    if trial.standard_error is None:
+        return formatting.number(trial.error)
+    return formatting.with_error(trial.error, trial.standard_error)
+
+
+def _settings(trial: TrialRecord) -> str:
+    return ", ".join(f"{name}={value}" for name, value in trial.settings.items())
+
 
 _POLL_SECONDS = 0.5
 _WINDOW = 4
@@ -105,7 +192,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
                 state.save(session.folder)
                 _drive(console, session, state, executor, job)
         state.save(session.folder, "finished" if trials.done else "interrupted")
-        sweep_table.show(console, state.record)
+        show(console, state.record)
         _page(console, session.folder, state)
     finally:
         if not trials.done and (session.folder / SWEEP).exists():
@@ -173,7 +260,7 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
     """Until all trials have ended, or one is interrupted."""
     plan, trials = state.record.plan, state.trials
-    display = TaskDisplay(console, trials.search.trials, "trials", lambda: sweep_table.best_so_far(trials))
+    display = TaskDisplay(console, trials.search.trials, "trials", lambda: best_so_far(trials))
     display.skip(len(trials.ended))
     with display:
         while not trials.done and not state.stopped:
@@ -188,7 +275,7 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
                 if record is None:
                     break
                 trials.end(record)
-                display.end(record.number, sweep_table.line(record))
+                display.end(record.number, line(record))
                 state.save(session.folder)
 
 
@@ -230,5 +317,5 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
 def _page(console: Console, folder: Path, state: _State) -> None:
     """A page that compares the best trials."""
     if folders.best(folder, state.record):
-        page = sweep_page.write_page(folder, state.record)
+        page = report.write_page(folder, state.record)
         console.print(f"page: {page}", markup=False, highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.exit_status import FAILED
+from unrender.app.cli.signals import FAILED
 from unrender.app.cli.sweep import MARK, plan_of, search_of
 from unrender.app.cli.sweep_driver import Session, run_trials
 from unrender.app.distributed.cluster import Workers

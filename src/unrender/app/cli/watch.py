@@ -76,7 +76,7 @@ def _similar(directory: Path) -> str:
 
 def _open(address: server.Address, stack: contextlib.ExitStack) -> Callable[[], object] | None:
     """Open the page in a browser; returns what to call once the browser is there."""
-    from unrender.app.watch.redirect import Redirect
+    from unrender.app.watch.connections import Redirect
 
     try:
         redirect = stack.enter_context(Redirect(address.url))

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from unrender.app.distributed import capacity
-from unrender.app.distributed.assignment import total
-from unrender.app.distributed.batches import joined, split
+from unrender.app.distributed import assignment
+from unrender.app.distributed.assignment import joined, split, total
 from unrender.app.distributed.hosts import Hosts
 from unrender.app.distributed.memories import Memories, Memory, Recipe
 from unrender.app.distributed.messages import Call, ImageState, Pair, Pilot, Reply, payload_bytes
@@ -127,7 +126,7 @@ class DistributedExecutor:
             )
         for key in self._problem.remeshings:
             raise InputError(f"{key}: remeshing: meshes of distributed runs keep their triangles; leave it out")
-        capacity.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
+        assignment.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
 
     def estimate_gradient(self, problem: Problem, request: GradientRequest) -> GradientSample:
         del problem  # each share has its own

@@ -13,8 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.app.evaluation import held_out as held_out_photographs
-from unrender.app.evaluation import pictures, scenes, sheets
+from unrender.app.evaluation import pictures, scenes
 from unrender.app.evaluation.measures import Albedo, Measures, best_factors, compare_albedo, mean, measure
 from unrender.app.evaluation.pictures import mask_of, names_of
 from unrender.app.exporting import ready_made
@@ -25,7 +24,7 @@ from unrender.core import arrays, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
-from unrender.losses import lpips
+from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -102,7 +101,7 @@ def judge(
     files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
     light = None if environment is None else scenes.read_light(Path(environment))
     problem, found = reopen.problem_of(run), folders.read(run)
-    given = held_out_photographs.find(Path(run), problem) if held_out is None else Path(held_out)
+    given = scenes.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _found(Path(run), problem, found)
     of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
     judged, values, notices = _problem(problem, given, values, found)
@@ -127,8 +126,8 @@ def judge(
         measures, albedo = files.write_folder(place, fill)
     except OSError as error:
         raise InputError(f"judge: {place}: {error.strerror or error}") from error
-    if measured and not lpips.available():
-        notices.append(lpips.MISSING)
+    if measured and not metrics.available():
+        notices.append(metrics.MISSING)
     if not measured:
         notices.append("nothing is measured: the photographs show another light; --held-out names ones that show this")
     return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
@@ -205,7 +204,7 @@ def _render(
     path = scenes.export_scene(problem, values, scratch / "scene")
     own, _ = read_environment(scenes.load_scene(path), [])
     if own is not None:
-        (folder / f"{LIGHT}.png").write_bytes(sheets.environment_picture(own))
+        (folder / f"{LIGHT}.png").write_bytes(pictures.environment_picture(own))
         ready_made.write_bitmap(ready_made.as_bitmap(own), folder / f"{LIGHT}.exr")
     relit = []
     if light is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.losses import lpips, metrics
+from unrender.losses import metrics
 
 __all__ = ["Albedo", "Measures", "best_factors", "compare_albedo", "mean", "measure", "shown"]
 
@@ -30,7 +30,7 @@ class Measures:
 
     psnr: float
     ssim: float | None
-    lpips: float | None
+    metrics: float | None
     exposure: float
 
 
@@ -70,7 +70,7 @@ def measure(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> Meas
     psnr = 10 * math.log10(1 / error) if error > 0 else math.inf
     rows, columns = np.nonzero(mask > 0)
     box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    return Measures(psnr, _ssim(one, two, mask), lpips.distance(one[box], two[box]), factor)
+    return Measures(psnr, _ssim(one, two, mask), metrics.distance(one[box], two[box]), factor)
 
 
 def _ssim(one: np.ndarray, two: np.ndarray, mask: np.ndarray) -> float | None:

@@ -2,19 +2,82 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw
 
-from unrender.app.evaluation import sheets
 from unrender.app.evaluation.measures import Measures, shown
 from unrender.app.exporting import ready_made
+from unrender.core.text import printable
 from unrender.losses import metrics
+from unrender.losses.metrics import exposure, srgb
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["FOLDER", "SHEET", "mask_of", "names_of", "write"]
+__all__ = ["FOLDER", "MOST_ROWS", "SHEET", "environment_picture", "mask_of", "names_of", "plain", "sheet", "write"]
+
+
+MOST_ROWS = 48
+_CELL, _LABEL, _GAP = 240, 14, 4
+_BACKGROUND, _INK = (20, 20, 20), (220, 220, 220)
+_WIDE = 1024
+
+
+def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], headings: Sequence[str]) -> bytes:
+    """PNG: a row of pictures, (H, W, 3) in [0, 1], for each label; two rows side by side where there are many."""
+    groups = 2 if len(rows) > 4 else 1
+    count = len(headings)
+    lines = -(-len(rows) // groups)
+    width = groups * (count * (_CELL + _GAP) + 2 * _GAP)
+    cells = [[_fitted(picture) for picture in pictures] for _, pictures in rows]
+    tall = max(cell.height for line in cells for cell in line)
+    page = Image.new("RGB", (width, _LABEL + _GAP + lines * (tall + _LABEL + _GAP)), _BACKGROUND)
+    draw = ImageDraw.Draw(page)
+    for group in range(groups):
+        for column, heading in enumerate(headings):
+            left = group * (width // groups) + column * (_CELL + _GAP)
+            draw.text((left + 3, 1), heading, fill=_INK)
+    for place, ((label, _), line) in enumerate(zip(rows, cells, strict=True)):
+        top = _LABEL + _GAP + place // groups * (tall + _LABEL + _GAP)
+        left = place % groups * (width // groups)
+        draw.text((left + 3, top), printable(label).encode("latin-1", "replace").decode("latin-1"), fill=_INK)
+        for column, cell in enumerate(line):
+            page.paste(cell, (left + column * (_CELL + _GAP), top + _LABEL))
+    return _encoded(page)
+
+
+def environment_picture(values: np.ndarray) -> bytes:
+    """PNG of an environment map (H, W, 3), exposed so that all but its brightest twentieth is seen; small ones enlarged."""
+    picture = Image.fromarray(_bytes(srgb(values * exposure(values))))
+    factor = max(1, _WIDE // picture.width)
+    return _encoded(picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST))
+
+
+def plain(picture: np.ndarray) -> bytes:
+    """PNG of a picture (H, W, 3) in [0, 1]."""
+    return _encoded(Image.fromarray(_bytes(picture)))
+
+
+def _encoded(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _fitted(picture: np.ndarray) -> Image.Image:
+    """As wide as a cell, pixels as squares where it is enlarged."""
+    found = Image.fromarray(_bytes(picture))
+    scale = _CELL / max(found.size)
+    size = (max(1, round(found.width * scale)), max(1, round(found.height * scale)))
+    return found.resize(size, Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX)
+
+
+def _bytes(picture: np.ndarray) -> np.ndarray:
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
 
 SHEET, FOLDER = "sheet.png", "pictures"
 _DIFFERENCE = 4
@@ -65,15 +128,15 @@ def write(
         else:
             third = np.clip(_DIFFERENCE * np.abs(rendered - wanted), 0, 1)
         cells = (wanted, rendered, third)
-        if index < sheets.MOST_ROWS:
+        if index < MOST_ROWS:
             box = _box(mask)
             label = _label(name, measures[index]) if measures else name
             rows.append((label, [cell[box] for cell in cells]))
         stem = f"{index:04d}-{ready_made.file_name(name)}"
         for kind, cell in zip(kinds, cells, strict=True):
-            (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(sheets.plain(cell))
+            (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(plain(cell))
     last = "under the other light" if relit else f"difference x {_DIFFERENCE}"
-    (folder / SHEET).write_bytes(sheets.sheet(rows, ["photograph", "rendering", last]))
+    (folder / SHEET).write_bytes(sheet(rows, ["photograph", "rendering", last]))
 
 
 def _label(name: str, measures: Measures) -> str:

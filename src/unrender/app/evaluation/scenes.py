@@ -12,12 +12,28 @@ import numpy as np
 
 from unrender.app.exporting import ready_made
 from unrender.app.exporting.scene_folder import export
+from unrender.app.stages import run_folders
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.rendering.mitsuba.description import load
 from unrender.scene.problem import Problem
 
-__all__ = ["export_scene", "load_scene", "read_light", "render", "sensors", "turned_up", "up_axis"]
+__all__ = ["HELD_OUT", "export_scene", "find", "load_scene", "read_light", "render", "sensors", "turned_up", "up_axis"]
+
+
+HELD_OUT = "held-out.toml"
+
+
+def find(run: Path, problem: Problem) -> Path:
+    """held-out.toml beside the problem file of a run, or beside that of the stages that it is one of. Raises `InputError`."""
+    staged = run_folders.stage_of(run)
+    origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
+    beside = None if origin is None else Path(origin).parent / HELD_OUT
+    if beside is None or not beside.is_file():
+        where = "" if beside is None else f", and there is none at {beside}"
+        raise InputError(f"{run}: give --held-out FILE, a problem file with other views{where}")
+    return beside
+
 
 LIGHT = "light"
 _LEVEL = 0.3

@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.app.exporting import asset, maps, ready_made
+from unrender.app.exporting import asset, ready_made, textures
 from unrender.app.exporting.formats import MITSUBA, OWN
 from unrender.app.exporting.formats import check as check_formats
 from unrender.app.exporting.formats import write as write_formats
@@ -43,7 +43,7 @@ _FOLDERS = {
     mi.ObjectType.Emitter: ready_made.BITMAPS,
 }
 _OF_SCENE = {SCENE, *_FOLDERS.values(), "files"}
-_OWN = {maps.RECORD, maps.TABLE, maps.FOLDER, *_OF_SCENE, *OWN}
+_OWN = {textures.RECORD, textures.TABLE, textures.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
 _POSITIONS = "vertex_positions"
 _ROUNDING = 1e-4
@@ -105,7 +105,7 @@ def export(
     """
     variant.ensure()
     out, asked = Path(out), check_formats(formats)
-    files.check_replaceable(out, _OWN, maps.RECORD, overwrite, f"export to {out}", "an earlier export")
+    files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
     problem, parameters = _opened(what)
     renderer = scene_renderer(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
@@ -142,12 +142,12 @@ def _write(
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
     repeated = {key: measure.repeated for key, measure in problem.measures.items()}
-    notices = maps.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
+    notices = textures.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
     others = [name for name in asked if name != MITSUBA]
     if renderer.pair.emissive:
         if others:
             raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
-        why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {maps.FOLDER}"
+        why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {textures.FOLDER}"
         return [*notices, why], {}
     of_scene = scene_values(problem.renderer, values)
     renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
@@ -268,7 +268,7 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
                 taken[path] = f"{kind}/{name}"
         node.props["filename"] = taken[path]
     for path in folder.glob("*/*"):  # what a recovered value took the place of
-        if path.parent.name != maps.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
+        if path.parent.name != textures.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
             path.unlink()
 
 

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from unrender.app.report import panels, tone_mapping
 from unrender.app.report.curves import Band
 from unrender.app.report.equal_time import Comparison, Metric
-from unrender.display import formatting, maps, plots
+from unrender.display import formatting, pictures, plots
 
 __all__ = ["overview_figure"]
 
@@ -70,7 +70,7 @@ def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     found = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
     found += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
     show = panels.ColourScale(first.truth[key])
-    return [(title, show.colours(plane)) for title, array in found if (plane := maps.plane(array)) is not None]
+    return [(title, show.colours(plane)) for title, array in found if (plane := pictures.plane(array)) is not None]
 
 
 def _draw(axes: Axes, metric: Metric, axis: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import webbrowser
 from pathlib import Path
 
-from unrender.app.report import convergence, html, image_metrics, panels, shapes, tables
+from unrender.app.report import html, image_metrics, panels, shapes, tables
 from unrender.display import plots
 from unrender.io.files import write
 from unrender.runs.folder.reader import read
@@ -50,7 +50,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         maps=[panels.map_of_run(run, key) for key in maps[:_MAPS]],
         more_maps=max(0, len(maps) - _MAPS),
         rows=[tables.parameter_row(run, key) for key in run.parameters],
-        charts={axis: convergence.charts(run, axis) for axis in plots.AXES},
+        charts={axis: tables.charts(run, axis) for axis in plots.AXES},
     )
     path = write(run.path / "report.html", content)
     if open_after:

@@ -10,8 +10,8 @@ import numpy as np
 from unrender.app.report import tone_mapping
 from unrender.app.report.tone_mapping import INLINE, ColourBar, Picture, PictureEncoder
 from unrender.core import periodic
-from unrender.display import formatting, maps
-from unrender.display.maps import is_map
+from unrender.display import formatting, pictures
+from unrender.display.pictures import is_map
 from unrender.runs.folder.reader import RunFolder, ViewPictures
 from unrender.runs.sensitivity import around, hardly_seen
 
@@ -97,8 +97,8 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
         stacks.append(
             (_error(encoder, before, high, "Error at the start", f"View {view}: error before the first step"),)
         )
-    maps = _maps_of_view(view, shown, encoder)
-    stacks += [(figure,) for figure in maps or [Figure(result, name)]]
+    pictures = _maps_of_view(view, shown, encoder)
+    stacks += [(figure,) for figure in pictures or [Figure(result, name)]]
     stacks.append((_error(encoder, error, high, f"Error of the {what}", f"View {view}: error of the {what}"),))
     return Panel(f"View {view}", _exposure_note(factor), tuple(stacks), True)
 
@@ -156,9 +156,9 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
     assert result is not None
     scale = ColourScale(result if truth is None or not is_map(truth) else truth)
     stacks: list[tuple[Slider | Figure, ...]] = []
-    planes = maps.planes(result)
+    planes = pictures.planes(result)
     for label, plane in planes.items():
-        start, wanted = maps.planes(initial).get(label), maps.planes(truth).get(label)
+        start, wanted = pictures.planes(initial).get(label), pictures.planes(truth).get(label)
         errors = {
             caption: tone_mapping.absolute_error(one, wanted)
             for caption, one in (("Error at the start", start), ("Error", plane))
@@ -176,7 +176,7 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
                     Figure(scale.picture(encoder, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
                 )
             column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
-        if sensitivity is not None and (told := maps.planes(sensitivity).get(label)) is not None:
+        if sensitivity is not None and (told := pictures.planes(sensitivity).get(label)) is not None:
             column.append(
                 _sensitivity(encoder, told, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
             )
@@ -192,8 +192,8 @@ def map_of_methods(
 ) -> Panel:
     """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
     scale = ColourScale(truth)
-    label, wanted = next(iter(maps.planes(truth).items()))
-    found = {name: maps.planes(result).get(label) for name, result in results.items()}
+    label, wanted = next(iter(pictures.planes(truth).items()))
+    found = {name: pictures.planes(result).get(label) for name, result in results.items()}
     errors = {
         name: tone_mapping.absolute_error(plane, wanted)
         for name, plane in found.items()

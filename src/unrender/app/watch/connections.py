@@ -2,17 +2,26 @@
 
 Whoever has an account on this machine can connect to 127.0.0.1. Connections that ask nothing, ask slowly, or ask without the token
 must not keep the owner's browser out.
+
+Everyone can read the arguments of a process, so the browser is handed a file that only its owner can read, which leads to the page.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import html
+import os
+import shutil
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["BACKLOG", "Connection", "admit", "enough_files"]
+__all__ = ["BACKLOG", "Connection", "Redirect", "admit", "enough_files"]
+
 
 BACKLOG = 1024
 """Connections that may wait to be accepted; accepting them all at once must not use up the process's files."""
@@ -92,3 +101,47 @@ def enough_files() -> None:
     wanted = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+_PAGE = """<!doctype html>
+<meta charset="utf-8">
+<meta name="referrer" content="no-referrer">
+<meta http-equiv="refresh" content="0; url={url}">
+<title>unrender watch</title>
+<p><a href="{url}">The live page</a>
+"""
+
+
+class Redirect:
+    """A file that leads a browser to an address, in a folder of its own; both are the owner's alone. A context manager: removed at the end.
+
+    Args:
+        url: where it leads.
+
+    Attributes:
+        path: of the file.
+
+    Raises `OSError` where it cannot be written.
+    """
+
+    def __init__(self, url: str):
+        self._folder = Path(tempfile.mkdtemp(prefix="unrender-watch-"))  # mode 0700
+        self.path = self._folder / "open.html"
+        try:
+            found = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(found, "w", encoding="utf-8") as file:
+                file.write(_PAGE.format(url=html.escape(url)))
+        except BaseException:
+            self.remove()
+            raise
+
+    def __enter__(self) -> Redirect:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove it: once the browser has followed it, it is of no more use. Again does nothing."""
+        with contextlib.suppress(OSError):
+            shutil.rmtree(self._folder)

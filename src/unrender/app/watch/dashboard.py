@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
-from unrender.app.report import convergence, html, panels, tables
+from unrender.app.report import html, panels, tables
 from unrender.app.report.tone_mapping import PictureData, PictureEncoder
 from unrender.app.watch import monitor
 from unrender.app.watch.monitor import Snapshot
@@ -187,10 +187,10 @@ def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
 def _charts(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> dict[str, list[plots.Chart]]:
     runs = {label: s.run for label, s in zip(labels, snapshots, strict=True) if s.run is not None}
     if len(snapshots) == 1 and runs:
-        found = {axis: convergence.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
+        found = {axis: tables.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
     else:
         colours = {label: i % _COLOURS for i, label in enumerate(labels)}
-        found = {axis: convergence.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
+        found = {axis: tables.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
     return found
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,27 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
+from unrender.io.file_conversion import PLAIN, FileConversion
+from unrender.io.volumes import read_grid
 from unrender.rendering.mitsuba import description as loading
 from unrender.rendering.mitsuba import emissive, turntable_light
+from unrender.rendering.mitsuba.description import parse
 from unrender.rendering.mitsuba.equal_objects import equal_objects
-from unrender.rendering.mitsuba.grid_transforms import attached_media
+from unrender.rendering.mitsuba.scene_graph import all_shapes
 
-__all__ = ["SceneDescription", "is_loaded", "load", "load_resolved", "media"]
+__all__ = [
+    "MediumKey",
+    "SceneDescription",
+    "attached_media",
+    "conversion",
+    "extinction_transforms",
+    "is_loaded",
+    "load",
+    "load_resolved",
+    "media",
+    "read_vertices",
+]
+
 
 SceneDescription = str | Path | dict | Callable[[], Any] | Any
 """An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
@@ -108,3 +125,148 @@ def _one_line(error: Exception) -> str:
 def media(scene: mi.Scene) -> list[mi.Medium]:
     """All participating media of a scene, once for each place they are in, in an order that two loads share."""
     return [medium for _, medium in attached_media(scene)]
+
+
+MediumKey = tuple[str, str, int]
+"""The id of a shape or sensor; "interior", "exterior" or "medium"; how many of the same name came before, since shapes of an XML file may
+have no id."""
+
+
+def attached_media(scene: mi.Scene) -> list[tuple[MediumKey, Any]]:
+    """All participating media of a scene, once for each shape side or sensor that has one, in an order that two loads share."""
+    shapes, sensors = all_shapes(scene), scene.sensors()
+    found = [
+        ((shape.id(), side), medium)
+        for shape in shapes
+        for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium()))
+    ]
+    found += [((sensor.id(), "medium"), sensor.get_medium()) for sensor in sensors]
+    return _numbered((owner, medium) for owner, medium in found if medium is not None)
+
+
+def _numbered(slots: Iterable[tuple[tuple[str, str], Any]]) -> list[tuple[MediumKey, Any]]:
+    before: Counter[tuple[str, str]] = Counter()
+    found = []
+    for owner, held in slots:
+        found.append(((*owner, before[owner]), held))
+        before[owner] += 1
+    return found
+
+
+def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumKey, np.ndarray]:
+    """The affine map (4, 4) from [0, 1]³ to the world of each medium's extinction grid.
+
+    Args:
+        description: an XML file or a Mitsuba dictionary, of a scene that Mitsuba loads.
+
+    Media and volumes that are ready-made objects have none.
+    """
+    nodes: Any = parse(description).state.nodes
+    top = list(_children(nodes, nodes[0]).values())
+    groups = [node for node in top if node.props.plugin_name() == "shapegroup"]
+    slots = []
+    for node in (*top, *(child for group in groups for child in _children(nodes, group).values())):
+        if node.type in (mi.ObjectType.Shape, mi.ObjectType.Sensor):
+            for name, child in _children(nodes, node).items():
+                side = name if node.type == mi.ObjectType.Shape else "medium"
+                # The parser does not know the type of media that are plugins in Python.
+                if child.type == mi.ObjectType.Medium or side in ("interior", "exterior") or "sigma_t" in child.props:
+                    owner = node.props.id(), side
+                    slots.append((owner, _transform(nodes, child)))
+    return {key: matrix for key, matrix in _numbered(slots) if matrix is not None}
+
+
+def _children(nodes: Any, node: Any) -> dict[str, Any]:
+    """The nodes that a node holds, by property."""
+    props = node.props
+    resolved = mi.Properties.Type.ResolvedReference
+    return {name: nodes[props[name].index()] for name in props.keys() if props.type(name) == resolved}  # noqa: SIM118
+
+
+def _transform(nodes: Any, medium: Any) -> np.ndarray | None:
+    volume = _children(nodes, medium).get("sigma_t")
+    if volume is None or volume.props.plugin_name() != "gridvolume":
+        return None
+    props = volume.props
+    to_world = np.eye(4)
+    if "to_world" in props:
+        to_world = np.array(props["to_world"].matrix, np.float64).reshape(4, 4)
+    if props.get("use_grid_bbox", False) and "filename" in props:
+        try:
+            box = np.array(read_grid(props["filename"]).box).reshape(2, 3)
+        except InputError:  # found by Mitsuba on another path
+            return None
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = np.diag(box[1] - box[0]), box[0]
+        return to_world @ place
+    return to_world
+
+
+_RAW = re.compile(r"^\s*raw = (1|true)\b", re.MULTILINE)
+_ENVIRONMENT_COLUMNS = 1
+"""Columns that Mitsuba adds at each end of an environment map, and copies anew whenever its data change."""
+_KEPT = ("to_world", "face_normals", "flip_normals", "flip_tex_coords")
+_INDEXED = "serialized"
+
+
+def conversion(parameters: mi.SceneParameters, key: str, description: SceneDescription) -> FileConversion:
+    """Return how Mitsuba converts a file to the values of the parameter `key`.
+
+    Args:
+        parameters: of the loaded scene.
+        key: of a parameter that is an array.
+        description: what the scene was loaded from; its shapes place the vertices of mesh files.
+    """
+    value, node = parameters[key], parameters.properties[key][2]
+    if isinstance(node, mi.Mesh) and key.rpartition(".")[2].startswith("vertex_"):
+        return FileConversion(vertices=partial(read_vertices, description, key))
+    if not key.endswith("data") or not dr.is_tensor_v(value):
+        return PLAIN
+    columns = _ENVIRONMENT_COLUMNS if node.class_name() == "EnvironmentMapEmitter" else 0
+    raw = isinstance(node, mi.Texture) and _RAW.search(str(node)) is not None
+    return FileConversion(raw, dr.type_v(value) == dr.VarType.Float16, columns)
+
+
+def read_vertices(description: SceneDescription, key: str, path: Path) -> np.ndarray:
+    """Return values at the vertices of a mesh file, as if the scene's shape named that file.
+
+    Mitsuba loads the file: with the shape's transform, its own order of vertices, and the duplicates that it makes for normals and
+    texture coordinates.
+
+    Args:
+        description: of the scene.
+        key: such as "block.vertex_positions".
+        path: of an .obj, .ply or .serialized file.
+
+    Returns:
+        (n V,) float32.
+
+    Raises:
+        InputError: the file cannot be read or has no such values, or the scene does not tell how its shape is placed.
+    """
+    if bounded_files.kind(path) != "file":
+        raise InputError(f"{path}: {bounded_files.no_file(path)}")
+    owner, _, name = key.rpartition(".")
+    given: Any = description() if callable(description) else description
+    if is_loaded(given):
+        raise InputError(
+            f"{path}: a loaded scene does not tell how its shapes are placed; give the .xml file or an array"
+        )
+    parsed = loading.parse(Path(given) if isinstance(given, (str, Path)) else given)
+    shape = next((node.props for node in parsed.state.nodes if node.props.id() == owner), None)
+    if shape is None:
+        raise InputError(f"{path}: the scene's description has no shape of the name {owner}; give an array")
+    plugin = path.suffix.lower().removeprefix(".")
+    named: dict[str, Any] = {"type": plugin, "filename": str(path.resolve())}
+    named |= {option: shape[option] for option in _KEPT if option in shape}
+    if plugin == _INDEXED and "shape_index" in shape:
+        named["shape_index"] = shape["shape_index"]
+    try:
+        values = mi.traverse(loading.load(named))
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    except RuntimeError as error:
+        raise InputError(f"{path}: Mitsuba could not load it: {' '.join(str(error).split())[:200]}") from error
+    if name not in values:
+        raise InputError(f"{path}: the mesh has no {name}")
+    return np.array(values[name], np.float32).reshape(-1)

@@ -18,10 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import emissive, file_conversions, film
+from unrender.rendering.mitsuba import emissive, film, scene_loading
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.emitter_tables import emitter_tables
-from unrender.rendering.mitsuba.grid_transforms import attached_media, extinction_transforms
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
 from unrender.rendering.mitsuba.integrators.pointer_tables import pointer_table
@@ -39,9 +38,15 @@ from unrender.rendering.mitsuba.parameters import (
 )
 from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.poses import is_bare
-from unrender.rendering.mitsuba.range_table import Range
+from unrender.rendering.mitsuba.ranges import Range
 from unrender.rendering.mitsuba.scene_graph import object_ids
-from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, media
+from unrender.rendering.mitsuba.scene_loading import (
+    SceneDescription,
+    attached_media,
+    extinction_transforms,
+    is_loaded,
+    media,
+)
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleRequest
 
@@ -324,7 +329,7 @@ class ScenePair:
 
     def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
         """`info` with what the values of the parameter stand for, and what a file becomes."""
-        conversion = file_conversions.conversion(self.current_parameters, key, self.description)
+        conversion = scene_loading.conversion(self.current_parameters, key, self.description)
         kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
         form = is_nonlinear(self.current_parameters, key, info.singular)
         return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1], nonlinear=form)

@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import printable
-from unrender.io import files, mesh_writing
+from unrender.io import files, mesh_files
 from unrender.scene.problem import Problem
 from unrender.scene.surfaces import Surface
 
@@ -96,5 +96,5 @@ def write_files(folder: Path, problem: Problem, parameters: Mapping[str, np.ndar
         name = re.sub(r"[^A-Za-z0-9._-]", "_", key.rpartition(".")[0])[:100] or "mesh"
         vertices, uv = np.asarray(parameters[key], np.float32).reshape(-1, 3), problem.texture_coordinates(key)
         (folder / FOLDER).mkdir(exist_ok=True)
-        files.write(folder / FOLDER / f"{name}.ply", mesh_writing.ply(vertices, faces, uv=uv), name_too=False)
-        files.write(folder / FOLDER / f"{name}.obj", mesh_writing.obj(vertices, faces, uv))
+        files.write(folder / FOLDER / f"{name}.ply", mesh_files.ply(vertices, faces, uv=uv), name_too=False)
+        files.write(folder / FOLDER / f"{name}.obj", mesh_files.obj(vertices, faces, uv))

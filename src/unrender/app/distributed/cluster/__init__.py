@@ -2,8 +2,7 @@
 
 from unrender.app.distributed.cluster.connection import Cluster, connect, load_ray
 from unrender.app.distributed.cluster.tasks import Ended, Executor, InProcess, OnWorkers
-from unrender.app.distributed.cluster.worker import prepare_worker
-from unrender.app.distributed.cluster.workers import Share, Workers, share
+from unrender.app.distributed.cluster.workers import Share, Workers, prepare_worker, share
 
 __all__ = [
     "Cluster",

@@ -6,9 +6,34 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from unrender.backend import variant
 from unrender.core.errors import InputError
 
-__all__ = ["Share", "Workers", "share"]
+__all__ = ["Share", "Workers", "prepare_worker", "share"]
+
+
+_prepared: list[tuple[str, int]] = []
+
+
+def prepare_worker(name: str, threads: int) -> str:
+    """Choose the variant and the number of threads, once a process: later calls with the same arguments do nothing.
+
+    Args:
+        name: of the variant, or "auto".
+        threads: of the processor, >= 1.
+
+    Returns:
+        The variant in use.
+
+    Raises:
+        VariantError: this machine cannot run it.
+    """
+    chosen = variant.use(name)
+    if (name, threads) not in _prepared:
+        variant.use_threads(threads)
+        _prepared[:] = [(name, threads)]
+    return chosen
+
 
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?):([0-9]{1,5})\Z")
 _MOST = 100_000

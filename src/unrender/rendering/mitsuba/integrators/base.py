@@ -31,6 +31,7 @@ __all__ = [
     "total",
 ]
 
+
 KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
 """Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
 

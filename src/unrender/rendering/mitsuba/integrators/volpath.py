@@ -23,16 +23,17 @@ from unrender.rendering.mitsuba.integrators.base import (
     largest,
     relative,
 )
-from unrender.rendering.mitsuba.integrators.connections import ConnectionSample, connect
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
 from unrender.rendering.mitsuba.integrators.volume_path import (
+    ConnectionSample,
     Flight,
     PathStart,
     SampledDirection,
     Vertex,
     VolumeContext,
     VolumePathState,
+    connect,
 )
 
 __all__ = ["VolumePair"]

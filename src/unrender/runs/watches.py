@@ -1,4 +1,4 @@
-"""Meshes that fold over, pass through themselves, or leave the pictures, while a run goes on."""
+"""Hooks that warn of parameters without influence, numbers left at their bounds, and faulty meshes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,55 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
     from unrender.runs.run import Run
 
-__all__ = ["MeshWatch"]
+
+__all__ = ["BoundsWatch", "InfluenceWatch", "MeshWatch"]
+
+
+_NEAR = 0.01
+"""Of a range with two ends: so near to one of them counts as there."""
+
+
+class BoundsWatch(Hook):
+    """Warns of single numbers that began inside of a range with two ends, and end next to one of these.
+
+    There, a derivative may vanish or be mostly noise, so that a descent that overshot does not come back.
+    """
+
+    def warnings(self, descent: Descent) -> list[str]:
+        """See `Hook.warnings`."""
+        run, found = descent.run, []
+        for key, (low, high) in run.problem.bounds.items() if run.stopped else ():
+            first = run.problem.first_values[key]
+            if first.size != 1 or low is None or high is None:
+                continue
+            last, near = float(arrays.numpy(run.parameters[key]).item()), _NEAR * (high - low)
+            for bound in (low, high):
+                if abs(last - bound) <= near < abs(float(first.item()) - bound):
+                    found.append(
+                        f"parameter {key}: ended at {last:.3g}, next to its bound {bound:g}: where that is not to be expected, "
+                        "try another seed or a lower learning_rate"
+                    )
+        return found
+
+
+_STEPS = 5
+
+
+class InfluenceWatch(Hook):
+    """Warns of parameters whose gradient was exactly zero in each of the first five steps."""
+
+    def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
+        """See `Hook.on_update`."""
+        run, zero = descent.run, descent.state.zero_gradient
+        if not applied or run.step > _STEPS:
+            return
+        for key, gradient in estimate.gradient.items():
+            zero[key] = zero[key] and arrays.number(memory.square(gradient)) == 0.0
+            if zero[key] and run.step == _STEPS:
+                run.warnings.append(
+                    f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"
+                )
+
 
 _EVERY, _TRIANGLES = 25, 100
 """Steps between two looks for self-intersections: so many, or one for so many triangles, where that is more."""
