@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,46 +16,24 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
+    Camera,
     ParameterInfo,
     Renderer,
     Rendering,
     RenderSession,
     SampleRequest,
     Space,
-    counted_vertices,
+    WithCameras,
     differentiated,
 )
+from unrender.rendering.wrapper import SessionWrapper
 
-__all__ = ["POSES", "Camera", "Corrections", "PosedCameras", "PosedCamerasSession", "PosedPaths", "WithCameras"]
+__all__ = ["POSES", "Corrections", "PosedCameras", "PosedCamerasSession", "PosedPaths"]
 
 POSES = "poses"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 _FEWEST = 3
 """Cameras: two that may move as one have less than one pose left between them."""
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A sensor that can be moved.
-
-    Attributes:
-        rotation, translation: keys of its pose parameters, (3,) each: a rotation vector about where it stands, in radians, and a shift
-            in units of the world.
-        place: where it stands, (3,).
-    """
-
-    rotation: str
-    translation: str
-    place: np.ndarray
-
-
-@runtime_checkable
-class WithCameras(Protocol):
-    """A renderer that knows where its sensors stand."""
-
-    def cameras(self) -> Mapping[int, Camera]:
-        """{sensor: its camera}, of those that can be moved."""
-        ...
 
 
 class Corrections:
@@ -163,7 +141,6 @@ class PosedCameras(WithParameter):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        """See `Renderer.prepare`."""
         wanted, own = differentiated(keys, derivatives), [key for key in keys if key != POSES]
         if len(own) == len(keys):
             return self.inner.prepare(own, space, wanted)
@@ -181,54 +158,32 @@ class PosedPaths:
     sensors: tuple[int, ...]
 
 
-class PosedCamerasSession:
+class PosedCamerasSession(SessionWrapper):
     """Images and derivatives with respect to the cameras' poses and to the parameters of a session. See `RenderSession`."""
 
     def __init__(self, renderer: PosedCameras, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
+        super().__init__(inner)
+        self._renderer = renderer
         self._trees: list[tuple[Array, Tree]] = []
 
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(self._scene(parameters), request)
-        return Rendering(found.images, None, PosedPaths(found.paths, _sensors(request)))
-
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         rest = {key: value for key, value in parameters.items() if key != POSES}
         poses = self._renderer.corrections.poses(np.asarray(parameters[POSES]))
         return self._inner.image_batch({**rest, **poses}, request)
 
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
-        return Rendering(found.images, found.previous, PosedPaths(found.paths, _sensors(request)))
+    def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
+        return replace(found, paths=PosedPaths(found.paths, _sensors(request)))
 
-    def adjoint(self, parameters: Tree, paths: PosedPaths, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        found = self._inner.adjoint(self._scene(parameters), paths.inner, weights)
-        return self._outer(parameters, found, paths)
+    def _paths(self, paths: PosedPaths) -> Any:
+        return paths.inner
 
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: PosedPaths, weights: Array, weights_previous: Array
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        states = self._scene(current), self._scene(previous)
-        found = self._inner.adjoint_pair(*states, paths.inner, weights, weights_previous)
-        return self._outer(current, found[0], paths), self._outer(previous, found[1], paths)
-
-    def tangent_moment(self, parameters: Tree, paths: PosedPaths, tangents: Tree) -> Array:
-        """See `RenderSession.tangent_moment`, and `PosedCameras` for what is left out."""
-        poses = self._scene({POSES: parameters[POSES]})
+    def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
+        """Return those of the scene's parameters; the poses are left out."""
+        poses = self._state({POSES: parameters[POSES]})
         still = {key: arrays.zeros_like(value) for key, value in poses.items()}
-        rest = {key: value for key, value in tangents.items() if key != POSES}
-        return self._inner.tangent_moment(self._scene(parameters), paths.inner, {**rest, **still})
+        return {**{key: value for key, value in tangents.items() if key != POSES}, **still}
 
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        return counted_vertices(self._inner, self._scene(parameters), request)
-
-    def _scene(self, parameters: Tree) -> Tree:
+    def _state(self, parameters: Tree) -> Tree:
         """With the cameras' own parameters: the same arrays for the same poses, which the scene then need not set again."""
         given = parameters[POSES]
         known = next((tree for poses, tree in self._trees if poses is given), None)
@@ -239,7 +194,7 @@ class PosedCamerasSession:
             self._trees = [*self._trees[-1:], (given, known)]
         return {**{key: value for key, value in parameters.items() if key != POSES}, **known}
 
-    def _outer(self, parameters: Tree, found: Tree, paths: PosedPaths) -> Tree:
+    def _gradient(self, parameters: Tree, found: Tree, paths: PosedPaths) -> Tree:
         renderer = self._renderer
         cameras = list(renderer.corrections.cameras.values())
         seen = [cameras[renderer.rows[sensor]] for sensor in paths.sensors if sensor in renderer.rows]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
@@ -17,21 +16,19 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
     EmitterMoments,
     ParameterInfo,
-    Renderer,
     Rendering,
     RenderSession,
     SampleRequest,
     Space,
-    counted_vertices,
     differentiated,
     drawing_emitters,
-    with_differential_bsdf,
 )
+from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 __all__ = ["FactorSession", "PictureFactors", "PicturePaths", "PictureRenderer", "PictureSession", "WithParameter"]
 
 
-class WithParameter:
+class WithParameter(RendererWrapper):
     """A renderer with one parameter more than the one inside it, 0 at first.
 
     Args:
@@ -39,42 +36,21 @@ class WithParameter:
 
     Attributes:
         key: of the parameter. No scene has it: Mitsuba's keys have a dot.
-        notices: of the inner renderer.
     """
 
     key: ClassVar[str]
 
-    def __init__(self, inner: Renderer):
-        self.inner = inner
-        self.notices = tuple(getattr(inner, "notices", ()))
-
     def info(self) -> ParameterInfo:
-        """Of the parameter."""
+        """Return what the renderer says of the parameter."""
         raise NotImplementedError
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
         return {**self.inner.parameters(), self.key: self.info()}
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`."""
         found = self.inner.values([key for key in keys if key != self.key])
         nothing = self.array(np.zeros(self.info().shape, np.float32))
         return {key: nothing if key == self.key else found[key] for key in keys}
-
-    def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
-        return self.inner.resolutions()
-
-    def array(self, values: np.ndarray) -> Array:
-        """See `Renderer.array`."""
-        return self.inner.array(values)
-
-    def with_differential_bsdf(self) -> WithParameter:
-        """See `DifferentialBsdfRenderer`. Raises `InputError` where the inner renderer is none."""
-        found = copy.copy(self)
-        found.inner = with_differential_bsdf(self.inner)
-        return found
 
 
 class PictureRenderer(WithParameter):
@@ -83,7 +59,6 @@ class PictureRenderer(WithParameter):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        """See `Renderer.prepare`."""
         own = [key for key in keys if key != self.key]
         inner = self.inner.prepare(own, space, differentiated(own, derivatives))
         return inner if len(own) == len(keys) else self.session(inner)
@@ -112,70 +87,59 @@ class PicturePaths:
 _Renderer = TypeVar("_Renderer", bound=PictureRenderer)
 
 
-class PictureSession(Generic[_Renderer]):
+class PictureSession(SessionWrapper, Generic[_Renderer]):
     """Images and derivatives with respect to what acts on each pixel and to the parameters of a session. See `RenderSession`."""
 
     def __init__(self, renderer: _Renderer, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
+        super().__init__(inner)
+        self._renderer = renderer
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(self._scene(parameters), request)
+        found = self._inner.image(self._state(parameters), request)
         places = self._places(request)
-        images = self._shown(parameters, places, found.images)
+        images = self._seen(parameters, places, found.images)
         return Rendering(images, None, PicturePaths(found.paths, found.images, None, places))
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
+        found = self._inner.image_pair(self._state(current), self._state(previous), request, space)
         if found.previous is None:
             raise InputError(f"{self._renderer.key}: the renderer returned one image of the two")
         places = self._places(request)
-        images = self._shown(current, places, found.images)
-        before = self._shown(previous, places, found.previous)
+        images = self._seen(current, places, found.images)
+        before = self._seen(previous, places, found.previous)
         return Rendering(images, before, PicturePaths(found.paths, found.images, found.previous, places))
 
     def adjoint(self, parameters: Tree, paths: PicturePaths, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
         weighted, own = self._pulled_back(parameters, paths.places, paths.images, weights)
-        scene = self._scene(parameters)
+        scene = self._state(parameters)
         found = self._inner.adjoint(scene, paths.inner, weighted) if scene else {}
         return self._ordered(parameters, found, own)
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: PicturePaths, weights: Array, weights_previous: Array
     ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
         now, own = self._pulled_back(current, paths.places, paths.images, weights)
         before, own_before = self._pulled_back(previous, paths.places, paths.previous, weights_previous)
-        states = self._scene(current), self._scene(previous)
+        states = self._state(current), self._state(previous)
         found = self._inner.adjoint_pair(*states, paths.inner, now, before) if states[0] else ({}, {})
         return self._ordered(current, found[0], own), self._ordered(previous, found[1], own_before)
-
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        return counted_vertices(self._inner, self._scene(parameters), request)
-
-    def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
-        return drawing_emitters(self._inner).emitters()
 
     def emitter_moments(
         self, parameters: Tree, paths: PicturePaths, tangents: Tree, weights: Array, noise: Array
     ) -> EmitterMoments:
         """See `EmitterSession.emitter_moments`, for the derivatives by the scene's parameters alone."""
-        inner, scene = drawing_emitters(self._inner), self._scene(parameters)
+        inner, scene = drawing_emitters(self._inner), self._state(parameters)
         if not scene:
             zeros = inner.emitters() * 0.0
             return EmitterMoments(zeros, zeros)
         slopes = self._slopes(parameters, paths.places, paths.images, weights)
-        return inner.emitter_moments(scene, paths.inner, self._scene(tangents), weights * slopes, noise * slopes)
+        return inner.emitter_moments(scene, paths.inner, self._state(tangents), weights * slopes, noise * slopes)
 
     def _places(self, request: SampleRequest) -> Any:
         """See `PicturePaths.places`."""
         del request
 
-    def _shown(self, parameters: Tree, places: Any, images: Array) -> Array:
+    def _seen(self, parameters: Tree, places: Any, images: Array) -> Array:
         """What the parameter makes of images."""
         raise NotImplementedError
 
@@ -189,11 +153,11 @@ class PictureSession(Generic[_Renderer]):
 
     def _inner_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         """The images of the inner session's `image_batch`; one for all where it has no parameters."""
-        if scene := self._scene(parameters):
+        if scene := self._state(parameters):
             return self._inner.image_batch(scene, request)
         return self._inner.image({}, replace(request, groups=1)).images
 
-    def _scene(self, parameters: Tree) -> Tree:
+    def _state(self, parameters: Tree) -> Tree:
         return {key: value for key, value in parameters.items() if key != self._renderer.key}
 
     def _ordered(self, parameters: Tree, found: Tree, own: Array) -> Tree:
@@ -248,15 +212,15 @@ class FactorSession(PictureSession[PictureFactors]):
         images = paths.images if arrays.shape(paths.images)[0] > 1 else paths.images[0]
         along = renderer.along(tangents[renderer.key], paths.places, images)
         moment = along * along
-        if scene := self._scene(parameters):
-            moment = moment + self._inner.tangent_moment(scene, paths.inner, self._scene(tangents))
+        if scene := self._state(parameters):
+            moment = moment + self._inner.tangent_moment(scene, paths.inner, self._state(tangents))
         factors = self._factors(parameters, paths.places, images)
         return moment * (factors * factors)
 
     def _places(self, request: SampleRequest) -> Array:
         return self._renderer.places(request)
 
-    def _shown(self, parameters: Tree, places: Array, images: Array) -> Array:
+    def _seen(self, parameters: Tree, places: Array, images: Array) -> Array:
         return images * self._factors(parameters, places, images)
 
     def _slopes(self, parameters: Tree, places: Array, images: Array, weights: Array) -> Array:

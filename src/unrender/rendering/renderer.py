@@ -19,31 +19,6 @@ from unrender.core.trees import Tree
 from unrender.io.file_conversion import PLAIN, FileConversion
 from unrender.rendering.parameter_errors import Role
 
-__all__ = [
-    "CountingSession",
-    "DifferentialBsdfRenderer",
-    "EmitterMoments",
-    "EmitterSession",
-    "LossWeights",
-    "ParameterInfo",
-    "PictureFormat",
-    "Remeshable",
-    "RenderSession",
-    "Renderer",
-    "Rendering",
-    "ReplacedMesh",
-    "SampleRequest",
-    "Space",
-    "StockLoop",
-    "StockRenderer",
-    "WithFormats",
-    "counted_vertices",
-    "differentiated",
-    "drawing_emitters",
-    "format_of",
-    "with_differential_bsdf",
-]
-
 Space = Literal["path", "primary"]
 """Where two states share samples: one set of paths, or one set of random numbers."""
 
@@ -363,6 +338,30 @@ class WithFormats(Protocol):
 def format_of(renderer: Any, sensor: int) -> PictureFormat:
     """Return the format of a sensor's film; RGB of any sign where the renderer has no films."""
     return renderer.formats()[sensor] if isinstance(renderer, WithFormats) else PictureFormat(signed=True)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A sensor that can be moved.
+
+    Attributes:
+        rotation, translation: keys of its pose parameters, (3,) each: a rotation vector about where it stands, in radians, and a shift
+            in units of the world.
+        place: where it stands, (3,).
+    """
+
+    rotation: str
+    translation: str
+    place: np.ndarray
+
+
+@runtime_checkable
+class WithCameras(Protocol):
+    """A renderer that knows where its sensors stand."""
+
+    def cameras(self) -> Mapping[int, Camera]:
+        """{sensor: its camera}, of those that can be moved."""
+        ...
 
 
 @runtime_checkable

@@ -127,12 +127,12 @@ class RespondingSession(PictureSession[RespondingRenderer]):
         tangent = tangents[RESPONSE]
         along = at.by_contrast * tangent[:, 0] + at.by_brightness * tangent[:, 1]
         moment = along * along
-        if scene := self._scene(parameters):
-            of_scene = self._inner.tangent_moment(scene, paths.inner, self._scene(tangents))
+        if scene := self._state(parameters):
+            of_scene = self._inner.tangent_moment(scene, paths.inner, self._state(tangents))
             moment = moment + of_scene * at.slopes * at.slopes
         return moment
 
-    def _shown(self, parameters: Tree, places: None, images: Array) -> Array:
+    def _seen(self, parameters: Tree, places: None, images: Array) -> Array:
         del places
         return _of(parameters, images).values
 

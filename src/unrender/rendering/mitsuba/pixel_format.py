@@ -9,13 +9,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.pixel_filter import has_negative_lobes
 from unrender.rendering.mitsuba.session import MitsubaSession
-from unrender.rendering.renderer import EmitterMoments, PictureFormat, Rendering, SampleRequest, Space
+from unrender.rendering.renderer import PictureFormat, Rendering, SampleRequest
+from unrender.rendering.wrapper import SessionWrapper
 
 __all__ = ["LuminanceSession", "formats"]
 
@@ -36,58 +36,27 @@ def formats(sensors: Sequence[Any]) -> list[PictureFormat]:
     return found
 
 
-class LuminanceSession:
+class LuminanceSession(SessionWrapper):
     """A session whose images have their luminance in all three channels. See `RenderSession`.
 
     Args:
         inner: renders RGB.
     """
 
-    def __init__(self, inner: MitsubaSession):
-        self._inner = inner
+    _inner: MitsubaSession
 
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        found = self._inner.image(parameters, request)
-        return replace(found, images=_luminance(found.images))
+    def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
+        previous = None if found.previous is None else _luminance(found.previous)
+        return replace(found, images=_luminance(found.images), previous=previous)
+
+    def _weights(self, weights: mi.TensorXf) -> mi.TensorXf:
+        return _pulled_back(weights)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
-        """See `RenderSession.image_batch`."""
         return _luminance(self._inner.image_batch(parameters, request))
 
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        found = self._inner.image_pair(current, previous, request, space)
-        return replace(found, images=_luminance(found.images), previous=_luminance(found.previous))
-
-    def adjoint(self, parameters: Tree, paths: Any, weights: mi.TensorXf) -> Tree:
-        """See `RenderSession.adjoint`."""
-        return self._inner.adjoint(parameters, paths, _pulled_back(weights))
-
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: Any, weights: mi.TensorXf, weights_previous: mi.TensorXf
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        both = _pulled_back(weights), _pulled_back(weights_previous)
-        return self._inner.adjoint_pair(current, previous, paths, *both)
-
     def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> mi.TensorXf:
-        """See `RenderSession.tangent_moment`."""
         return self._inner.tangent_moment(parameters, paths, tangents, _WEIGHTS)
-
-    def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
-        return self._inner.emitters()
-
-    def emitter_moments(
-        self, parameters: Tree, paths: Any, tangents: Tree, weights: mi.TensorXf, noise: mi.TensorXf
-    ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`; the noise is that of the inner session's channels."""
-        return self._inner.emitter_moments(parameters, paths, tangents, _pulled_back(weights), noise)
-
-    def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
-        """See `CountingSession.vertices`."""
-        return self._inner.vertices(parameters, request)
 
 
 def _luminance(images: Any) -> mi.TensorXf:

@@ -14,7 +14,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.camera_poses import Camera
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
@@ -28,7 +27,15 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import LossWeights, ParameterInfo, PictureFormat, ReplacedMesh, Space, differentiated
+from unrender.rendering.renderer import (
+    Camera,
+    LossWeights,
+    ParameterInfo,
+    PictureFormat,
+    ReplacedMesh,
+    Space,
+    differentiated,
+)
 
 __all__ = ["MitsubaRenderer", "StockSession"]
 
