@@ -85,7 +85,7 @@ ILLUSTRATIONS = {
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
     "unrender.app.distributed.distribute.distribute": "it starts worker processes, as tests/render/test_dealt_runs.py does",
-    "unrender.app.cli.sweep_function.sweep": "it starts worker processes; tests/cli/test_sweep_command.py has a sweep from Python",
+    "unrender.app.cli.sweep.sweep": "it starts worker processes; tests/cli/test_sweep_command.py has a sweep from Python",
 }
 
 

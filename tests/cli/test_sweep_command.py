@@ -113,8 +113,7 @@ def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.Monke
         plans.append((record.plan, session.workers, session.threads, search.trials))
         write_sweep(session.folder, record)
 
-    for home in ("sweep_function", "sweep_driver"):
-        monkeypatch.setattr(f"unrender.app.cli.{home}.run_trials", run_trials)
+    monkeypatch.setattr("unrender.app.cli.sweep_driver.run_trials", run_trials)
     found = ur.app.sweep("quad", "plain", over, steps=3, trials=5, settings={"beta_2": 0.9}, threads=1, out="python")
     words = ["--method", "plain", "--over", "learning_rate=0.01:0.1:log", "--over", "spp=1,4", "--steps", 3]
     assert unrender("sweep", "quad", *words, "--trials", 5, "-s", "beta_2=0.9", "--threads", 1).status == 0

@@ -91,6 +91,15 @@ def test_axes_that_make_no_sense_are_one_line(given: list[str], message: str) ->
         parse_axes(given, PLAIN, ["beta_1"])
 
 
+def test_values_from_python_are_taken_as_they_are() -> None:
+    given = {"schedule": ["none", "steps(100, 0.5)"], "spp": [1, 4], "one_rate": [True, False], "beta_1": "0.1:0.9:3"}
+    found = parse_axes(given, PLAIN)
+    assert [axis.choices for axis in found[:3]] == [("none", "steps(100, 0.5)"), ("1", "4"), ("true", "false")]
+    assert found == axes(*(f"{axis.name}={axis.text}" for axis in found))
+    with pytest.raises(InputError, match="has a comma"):
+        parse_axes({"schedule": ["none,none"]}, PLAIN)
+
+
 def test_a_grid_without_points_or_too_large_is_refused() -> None:
     with pytest.raises(InputError, match="needs a number of points"):
         Grid(axes("learning_rate=0.1:1"))

@@ -6,7 +6,7 @@ from unrender.core import lazy
 
 if TYPE_CHECKING:
     from unrender.app.capture.importing import ImportOptions, import_capture
-    from unrender.app.cli.sweep_function import sweep
+    from unrender.app.cli.sweep import sweep
     from unrender.app.distributed.distribute import distribute
     from unrender.app.evaluation.judge import judge
     from unrender.app.evaluation.turntable import turntable
@@ -20,7 +20,7 @@ __getattr__, _ = lazy.attach(
         "export": "exporting.scene_folder",
         "import_capture": "capture.importing",
         "judge": "evaluation.judge",
-        "sweep": "cli.sweep_function",
+        "sweep": "cli.sweep",
         "turntable": "evaluation.turntable",
     },
 )

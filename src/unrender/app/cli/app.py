@@ -16,7 +16,7 @@ from unrender.app.cli.methods import methods
 from unrender.app.cli.report import report
 from unrender.app.cli.resume import resume
 from unrender.app.cli.run import run
-from unrender.app.cli.sweep import sweep
+from unrender.app.cli.sweep import sweep_command
 from unrender.app.cli.turntable import turntable
 from unrender.app.cli.watch import watch
 
@@ -33,7 +33,7 @@ app.command()(run)
 app.command()(resume)
 app.command()(watch)
 app.command()(compare)
-app.command()(sweep)
+app.command("sweep")(sweep_command)
 app.command()(report)
 app.command()(export)
 app.command()(judge)

@@ -1,9 +1,10 @@
-"""`unrender sweep`: a search over a method's options."""
+"""`unrender sweep`, and `unrender.app.sweep`: a search over a method's options."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,11 +25,12 @@ from unrender.core.errors import InputError
 from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
+    from unrender.app.cli.sweep_driver import Session
     from unrender.app.sweeps.record import SweepPlan, SweepRecord
     from unrender.app.sweeps.search import Search
-    from unrender.methods import Method
+    from unrender.display.terminal import Console
 
-__all__ = ["MARK", "plan_of", "search_of", "sweep"]
+__all__ = ["sweep", "sweep_command"]
 
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
@@ -70,7 +72,7 @@ _Seed = Annotated[int, typer.Option(min=0, help="Of the search, and of each tria
 _Out = Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")]
 
 
-def sweep(
+def sweep_command(
     context: typer.Context,
     what: _What,
     method_name: _MethodName = "auto",
@@ -101,7 +103,7 @@ def sweep(
     each seed, in one folder with sweep.json. A sweep that was interrupted or killed goes on with `unrender sweep DIR`.
     """
     from unrender.app.cli.sweep_driver import Session, run_trials
-    from unrender.app.sweeps.record import SweepRecord, read_sweep
+    from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console
 
     console = Console(highlight=False)
@@ -109,21 +111,97 @@ def sweep(
     if _is_sweep(what):
         _check_alone(context, what)
         record = _extended(read_sweep(Path(what)), trials)
-        run_trials(console, Session(Path(what), where, threads), record, search_of(record.plan)[1])
+        run_trials(console, Session(Path(what), where, threads), record, _search_of(record.plan)[1])
         return
-    names = {"trials": trials, "prune": prune, "window": window, "seeds": seeds, "seed": seed, "steps": steps}
-    names |= {"seconds": seconds, "final_spp": final_spp, "variant": variant, "cached": not no_cache}
-    names |= {"problem": what, "method": method_name, "over": over or [], "search": search}
-    names |= {"settings": arguments.settings(settings, "--set")}
-    names |= {"problem_settings": arguments.settings(problem_settings, "--problem-set")}
+    given = {
+        "problem": what, "method": method_name, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
+        "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": not no_cache,
+        "settings": arguments.settings(settings, "--set"),
+        "problem_settings": arguments.settings(problem_settings, "--problem-set"),
+    }  # fmt: skip
     with phases.phase("loading"):
-        plan, found = search_of(plan_of(names))
-    folder = arguments.folder(out, f"{arguments.short_name(what)}-sweep", overwrite, MARK)
+        planned = _planned(given, over or [])
+    folder = _folder(planned, out, overwrite)
+    _begin(console, planned, arguments.command_line(context), Session(folder, where, threads, fresh=True))
+
+
+def sweep(
+    problem: str | Path,
+    method: str = "auto",
+    over: Mapping[str, str | Sequence[Any]] | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    search: Literal["grid", "random", "tpe"] | None = None,
+    trials: int | None = None,
+    prune: bool = False,
+    window: int | None = None,
+    steps: int | None = None,
+    seconds: float | None = None,
+    seeds: int = 1,
+    seed: int = 0,
+    workers: int | str | None = None,
+    threads: int | None = None,
+    out: str | Path | None = None,
+    problem_settings: Mapping[str, Any] | None = None,
+    variant: str = "auto",
+    final_spp: int | None = None,
+    overwrite: bool = False,
+    insecure: bool = False,
+) -> SweepRecord:
+    """Search a method's options for those of the least error, on one problem: `unrender sweep` as a function, silent.
+
+        found = unrender.app.sweep("room.toml", "rcv", {"learning_rate": "0.001:0.1:log", "spp": [2, 8]}, trials=40, workers="auto")
+        best = found.trials[found.best].settings
+
+    Args:
+        problem: a problem file, or the name of a gallery problem: workers open it themselves.
+        method: its name.
+        over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
+        settings: options that stay the same.
+        search: which settings to try; None for a grid, or random ones where a range has no points.
+        trials, prune, window: how many by random or tpe, None for 16; see the guide.
+        steps, seconds: budget of each run; None of both for 300 steps.
+        seeds, seed: how many runs of each trial, and the first one's seed.
+        workers: how many processes, "auto", or where, as of `deal`; None for this process.
+        threads: of the processor for each run; None chooses.
+        out: folder of the results; None for a new one in out/.
+        problem_settings: options of a gallery problem.
+        variant: Mitsuba's.
+        final_spp: samples per pixel of the final pictures.
+        overwrite: whether `out` may hold an earlier sweep, which is lost.
+        insecure: whether to join a cluster that other users can enter.
+
+    Returns:
+        What sweep.json holds; `best` is None where every trial failed.
+
+    Raises:
+        InputError: an argument makes no sense (the line names the command's option), or Ray or Optuna is needed and missing.
+        KeyboardInterrupt: what was reached is in `out`; `unrender sweep DIR` goes on.
+    """
+    import io
+
+    from unrender.app.cli.signals import FAILED
+    from unrender.app.cli.sweep_driver import Session
+    from unrender.app.sweeps.axes import as_text
+    from unrender.app.sweeps.record import read_sweep
+    from unrender.display.terminal import Console
+
+    given = {
+        "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
+        "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": True,
+        "settings": {name: as_text(value) for name, value in (settings or {}).items()},
+        "problem_settings": {name: as_text(value) for name, value in (problem_settings or {}).items()},
+    }  # fmt: skip
+    where = arguments.workers(None if workers is None else str(workers), insecure)
+    planned = _planned(given, over or {})
+    folder = _folder(planned, None if out is None else Path(out), overwrite)
     try:
-        record = SweepRecord(command=arguments.command_line(context), plan=plan)
-        run_trials(console, Session(folder, where, threads, fresh=True), record, found)
-    finally:
-        arguments.remove_if_empty(folder)
+        session = Session(folder, where, threads, fresh=True)
+        _begin(Console(file=io.StringIO()), planned, "unrender.app.sweep", session)
+    except typer.Exit as end:
+        if end.exit_code != FAILED:
+            raise KeyboardInterrupt from end
+    return read_sweep(folder)
 
 
 def _is_sweep(what: str) -> bool:
@@ -133,35 +211,43 @@ def _is_sweep(what: str) -> bool:
     return Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names())
 
 
-def plan_of(names: dict[str, Any]) -> SweepPlan:
-    """The plan of what was typed. Raises `InputError`."""
+def _planned(
+    given: dict[str, Any], over: Sequence[str] | Mapping[str, str | Sequence[Any]]
+) -> tuple[SweepPlan, Search]:
+    """Return the plan of a sweep and its search. Raises `InputError`."""
+    from unrender.app.sweeps.axes import parse_axes
     from unrender.app.sweeps.record import SweepPlan
+    from unrender.methods import method
     from unrender.runs.folder import schema
 
-    steps, seconds = arguments.budget(names["steps"], names["seconds"])
-    arguments.check_problem(names["problem"], names["problem_settings"])
-    arguments.check_variant(names["variant"])
-    axes, method = _axes(names["method"], names["over"], names["settings"])
-    search = _kind(names["search"], axes)
-    changes = {"steps": steps, "seconds": seconds, "method": method.name, "search": search}
-    check_seed("--seed", names["seed"], names["seeds"])
-    return schema.validate(
-        SweepPlan, {**names, **changes, "problem": arguments.absolute(names["problem"])}, "unrender sweep"
-    )
+    steps, seconds = arguments.budget(given["steps"], given["seconds"])
+    arguments.check_problem(given["problem"], given["problem_settings"])
+    arguments.check_variant(given["variant"])
+    chosen = method(given["method"])
+    axes = parse_axes(over, chosen, given["settings"])
+    chosen.configure(given["settings"])
+    check_seed("--seed", given["seed"], given["seeds"])
+    changes = {"steps": steps, "seconds": seconds, "method": chosen.name, "search": _kind(given["search"], axes)}
+    changes |= {"problem": arguments.absolute(given["problem"]), "over": [f"{a.name}={a.text}" for a in axes]}
+    return _search_of(schema.validate(SweepPlan, {**given, **changes}, "unrender sweep"))
 
 
-def _axes(method_name: str, over: list[str], given: dict[str, str]) -> tuple[Any, Method]:
-    from unrender.app.sweeps.axes import parse_axes
-    from unrender.methods import method
+def _folder(planned: tuple[SweepPlan, Search], out: Path | None, overwrite: bool) -> Path:
+    return arguments.folder(out, f"{arguments.short_name(planned[0].problem)}-sweep", overwrite, MARK)
 
-    chosen = method(method_name)
-    axes = parse_axes(over, chosen, given)
-    chosen.configure(given)
-    return axes, chosen
+
+def _begin(console: Console, planned: tuple[SweepPlan, Search], command: str, session: Session) -> None:
+    from unrender.app.cli.sweep_driver import run_trials
+    from unrender.app.sweeps.record import SweepRecord
+
+    try:
+        run_trials(console, session, SweepRecord(command=command, plan=planned[0]), planned[1])
+    finally:
+        arguments.remove_if_empty(session.folder)
 
 
 def _kind(search: str | None, axes: Any) -> Any:
-    """The search by name. Raises `InputError`."""
+    """Return the search by name. Raises `InputError`."""
     from unrender.core.suggestions import did_you_mean
 
     if search is None:
@@ -174,23 +260,21 @@ def _kind(search: str | None, axes: Any) -> Any:
     return search
 
 
-def search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
-    """The search of a plan, and the plan with its number of trials. Raises `InputError`."""
-    from unrender.app.sweeps.search import Grid, Random
+def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
+    """Return the plan with its number of trials, and its search. Raises `InputError`."""
+    from unrender.app.sweeps.axes import parse_axes
+    from unrender.app.sweeps.search import TPE, Grid, Random
+    from unrender.methods import method
 
-    axes, _ = _axes(plan.method, plan.over, plan.settings)
+    axes = parse_axes(plan.over, method(plan.method), plan.settings)
     if plan.search == "grid":
         found = Grid(axes)
         if plan.trials not in (None, found.trials):
             raise InputError(f"--trials {plan.trials}: a grid has all of its {found.trials} points; leave it out")
         return plan.model_copy(update={"trials": found.trials}), found
-    plan = plan.model_copy(update={"trials": plan.trials or _TRIALS})
     count = plan.trials or _TRIALS
-    if plan.search == "random":
-        return plan, Random(axes, count, plan.seed)
-    from unrender.app.sweeps.search import TPE
-
-    return plan, TPE(axes, count, plan.seed)
+    kind = Random if plan.search == "random" else TPE
+    return plan.model_copy(update={"trials": count}), kind(axes, count, plan.seed)
 
 
 def _check_alone(context: typer.Context, folder: str) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from unrender.core.errors import InputError
 from unrender.methods.base import Method
 
-__all__ = ["Axis", "parse_axes"]
+__all__ = ["Axis", "as_text", "parse_axes"]
 
 _DIGITS = 4
 """Significant digits of numbers from a range, so that they can be typed again."""
@@ -72,42 +73,62 @@ class Axis:
         return low + share * (high - low)
 
 
-def parse_axes(given: Iterable[str], method: Method, fixed: Iterable[str] = ()) -> tuple[Axis, ...]:
-    """The axes of `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`.
+def parse_axes(
+    given: Iterable[str] | Mapping[str, str | Sequence[Any]], method: Method, fixed: Iterable[str] = ()
+) -> tuple[Axis, ...]:
+    """Return the axes of a sweep.
 
     Args:
-        given: as typed.
+        given: `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`; or by name, the text after `NAME=` or a list of values.
         method: whose options they are; every value must be one that it takes.
         fixed: options that are set already.
 
     Raises:
         InputError: none is given, or one is malformed, given twice, fixed already, or no option of the method.
     """
-    axes: dict[str, Axis] = {}
+    found = []
     taken = set(fixed)
+    for name, values in (given if isinstance(given, Mapping) else _by_name(given)).items():
+        if name in taken:
+            raise InputError(f"--over {name}: it is fixed by --set")
+        if isinstance(values, str):
+            found.append(_range(name, values, method) or _choices(name, values, _split(values), method))
+        else:
+            listed = [as_text(value) for value in values]
+            found.append(_choices(name, ",".join(listed), listed, method))
+    if not found:
+        raise InputError("sweep: nothing to vary; give --over NAME=VALUE,VALUE or --over NAME=LOW:HIGH")
+    return tuple(found)
+
+
+def as_text(value: Any) -> str:
+    """Return a value of an option as sweep.json and the command line hold it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _by_name(given: Iterable[str]) -> dict[str, str]:
+    found: dict[str, str] = {}
     for text in given:
         name, equals, values = (part.strip() for part in text.partition("="))
         if not (equals and name and values):
             raise InputError(f"--over {text}: expected NAME=VALUE,VALUE or NAME=LOW:HIGH[:log][:POINTS]")
-        if name in axes:
+        if name in found:
             raise InputError(f"--over {text}: {name} is given twice")
-        if name in taken:
-            raise InputError(f"--over {text}: {name} is fixed by --set")
-        axes[name] = _range(name, values, method) or _choices(name, values, method)
-    if not axes:
-        raise InputError("sweep: nothing to vary; give --over NAME=VALUE,VALUE or --over NAME=LOW:HIGH")
-    return tuple(axes.values())
+        found[name] = values
+    return found
 
 
-def _choices(name: str, values: str, method: Method) -> Axis:
-    choices = tuple(part.strip() for part in _split(values))
+def _choices(name: str, text: str, values: Sequence[str], method: Method) -> Axis:
+    choices = tuple(part.strip() for part in values)
     for choice in choices:
         if not choice:
-            raise InputError(f"--over {name}={values}: a value is empty")
+            raise InputError(f"--over {name}={text}: a value is empty")
         if choices.count(choice) > 1:
-            raise InputError(f"--over {name}={values}: {choice} is given twice")
+            raise InputError(f"--over {name}={text}: {choice} is given twice")
+        if len(_split(choice)) > 1:
+            raise InputError(f"--over {name}={text}: {choice} has a comma, which separates values")
         method.configure({name: choice})
-    return Axis(name, values, choices)
+    return Axis(name, text, choices)
 
 
 def _split(values: str) -> list[str]:
