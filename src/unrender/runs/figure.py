@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,38 +19,7 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
 
 
-__all__ = ["ResultFigure", "loss", "parameter_errors", "plot"]
-
-
-_POINTS = 200
-
-Curve = tuple[np.ndarray, np.ndarray]
-"""Seconds, ascending, and values."""
-
-
-def loss(history: Sequence[Mapping[str, Any]]) -> Curve:
-    """The loss of the steps' own samples: means over up to 200 groups of consecutive steps; NaN where none was finite."""
-    seconds = np.array([record["seconds"] for record in history], float)
-    values = np.array([record["loss"] for record in history], float)
-    values[~np.isfinite(values)] = np.nan
-    groups = np.array_split(np.arange(len(history)), min(len(history), _POINTS)) if len(history) else []
-    means = [np.mean(kept) if (kept := values[g][np.isfinite(values[g])]).size else np.nan for g in groups]
-    return np.array([seconds[g[-1]] for g in groups]), np.array(means, float)
-
-
-def parameter_errors(history: Sequence[Mapping[str, Any]], initial: Mapping[str, float]) -> dict[str, Curve]:
-    """{key: error} where it was measured, from the start's `initial` on."""
-    found: dict[str, Curve] = {}
-    for key, first in initial.items():
-        known = [
-            (record["seconds"], record["parameter_error"][key])
-            for record in history
-            if key in record.get("parameter_error", {})
-        ]
-        if known:
-            seconds, values = np.array([(0.0, first), *known], float).T
-            found[key] = seconds, values
-    return found
+__all__ = ["ResultFigure", "plot"]
 
 
 _WIDTH, _CURVES_HEIGHT, _COLUMNS = 9.0, 2.8, 6
@@ -85,13 +53,13 @@ def plot(result: Result) -> ResultFigure:
             axes.set_title(_title(caption), fontsize=8)
             axes.set_axis_off()
     below = grid[rows].subgridspec(1, 2)
-    errors = parameter_errors(result.history, notebook.start_errors(result))
+    errors = notebook.error_curves(result.history, notebook.start_errors(result))
     _draw(figure.add_subplot(below[0]), notebook.error_title(result).lower().replace("rmse", "RMSE"), errors)
-    _draw(figure.add_subplot(below[1]), "loss, of the steps' samples", {"loss": loss(result.history)})
+    _draw(figure.add_subplot(below[1]), "loss, of the steps' samples", {"loss": notebook.loss_curve(result.history)})
     return figure
 
 
-def _draw(axes: Axes, title: str, drawn: dict[str, Curve]) -> None:
+def _draw(axes: Axes, title: str, drawn: dict[str, notebook.Curve]) -> None:
     axes.set_title(title, fontsize=9, loc="left")
     axes.set_xlabel("seconds", fontsize=9)
     axes.tick_params(which="both", labelsize=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure
-from unrender.runs import figure
 from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
@@ -22,6 +22,37 @@ if TYPE_CHECKING:
 
 
 __all__ = ["NotebookProgress", "error_title", "html", "line", "measures", "shown_pictures", "start_errors"]
+
+
+_POINTS = 200
+
+Curve = tuple[np.ndarray, np.ndarray]
+"""Seconds, ascending, and values."""
+
+
+def loss_curve(history: Sequence[Mapping[str, Any]]) -> Curve:
+    """The loss of the steps' own samples: means over up to 200 groups of consecutive steps; NaN where none was finite."""
+    seconds = np.array([record["seconds"] for record in history], float)
+    values = np.array([record["loss"] for record in history], float)
+    values[~np.isfinite(values)] = np.nan
+    groups = np.array_split(np.arange(len(history)), min(len(history), _POINTS)) if len(history) else []
+    means = [np.mean(kept) if (kept := values[g][np.isfinite(values[g])]).size else np.nan for g in groups]
+    return np.array([seconds[g[-1]] for g in groups]), np.array(means, float)
+
+
+def error_curves(history: Sequence[Mapping[str, Any]], initial: Mapping[str, float]) -> dict[str, Curve]:
+    """{key: error} where it was measured, from the start's `initial` on."""
+    found: dict[str, Curve] = {}
+    for key, first in initial.items():
+        known = [
+            (record["seconds"], record["parameter_error"][key])
+            for record in history
+            if key in record.get("parameter_error", {})
+        ]
+        if known:
+            seconds, values = np.array([(0.0, first), *known], float).T
+            found[key] = seconds, values
+    return found
 
 
 class NotebookProgress(Callback):
@@ -70,8 +101,8 @@ def line(result: Result) -> str:
 def html(result: Result) -> str:
     """Pictures, recovered maps beside truth and start, curves, where the time went, warnings."""
     end = result.seconds or 1.0
-    seconds, loss = figure.loss(result.history)
-    errors = figure.parameter_errors(result.history, start_errors(result))
+    seconds, loss = loss_curve(result.history)
+    errors = error_curves(result.history, start_errors(result))
     lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
     drawn = [
         chart(error_title(result), lines, "seconds", end),

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from types import FrameType
 
-from unrender.app.cli.exit_status import ENVIRONMENT
+from unrender.app.cli.signals import ENVIRONMENT
 from unrender.backend import limits
 from unrender.core.errors import VariantError
 from unrender.core.text import one_line

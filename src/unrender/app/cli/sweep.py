@@ -26,6 +26,7 @@ from unrender.core.random import check_seed
 
 if TYPE_CHECKING:
     from unrender.app.cli.sweep_driver import Session
+    from unrender.app.distributed.cluster import Workers
     from unrender.app.sweeps.record import SweepPlan, SweepRecord
     from unrender.app.sweeps.search import Search
     from unrender.display.terminal import Console
@@ -157,19 +158,11 @@ def sweep(
         problem: a problem file, or the name of a gallery problem: workers open it themselves.
         method: its name.
         over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
-        settings: options that stay the same.
-        search: which settings to try; None for a grid, or random ones where a range has no points.
-        trials, prune, window: how many by random or tpe, None for 16; see the guide.
-        steps, seconds: budget of each run; None of both for 300 steps.
-        seeds, seed: how many runs of each trial, and the first one's seed.
-        workers: how many processes, "auto", or where, as of `deal`; None for this process.
-        threads: of the processor for each run; None chooses.
-        out: folder of the results; None for a new one in out/.
-        problem_settings: options of a gallery problem.
-        variant: Mitsuba's.
-        final_spp: samples per pixel of the final pictures.
-        overwrite: whether `out` may hold an earlier sweep, which is lost.
-        insecure: whether to join a cluster that other users can enter.
+        settings, problem_settings: options of the method and of a gallery problem that stay the same.
+        search, trials, prune, window: which settings to try (None for a grid, or random ones where a range has no points), and how many.
+        steps, seconds, seeds, seed, final_spp, variant: of each run, as for `unrender sweep`.
+        workers, threads, insecure: how many processes, "auto", or where; threads of each; whether others may enter the cluster.
+        out, overwrite: folder of the results, None for a new one in out/; whether an earlier sweep there is lost.
 
     Returns:
         What sweep.json holds; `best` is None where every trial failed.
@@ -178,30 +171,38 @@ def sweep(
         InputError: an argument makes no sense (the line names the command's option), or Ray or Optuna is needed and missing.
         KeyboardInterrupt: what was reached is in `out`; `unrender sweep DIR` goes on.
     """
+    given: dict[str, Any] = {
+        "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
+        "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": True,
+    }  # fmt: skip
+    where = arguments.workers(None if workers is None else str(workers), insecure)
+    planned = _planned(given | {"settings": _texts(settings), "problem_settings": _texts(problem_settings)}, over or {})
+    return _run_silently(planned, where, threads, _folder(planned, None if out is None else Path(out), overwrite))
+
+
+def _run_silently(
+    planned: tuple[SweepPlan, Search], workers: Workers | None, threads: int | None, folder: Path
+) -> SweepRecord:
     import io
 
     from unrender.app.cli.signals import FAILED
     from unrender.app.cli.sweep_driver import Session
-    from unrender.app.sweeps.axes import as_text
     from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console
 
-    given = {
-        "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
-        "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": True,
-        "settings": {name: as_text(value) for name, value in (settings or {}).items()},
-        "problem_settings": {name: as_text(value) for name, value in (problem_settings or {}).items()},
-    }  # fmt: skip
-    where = arguments.workers(None if workers is None else str(workers), insecure)
-    planned = _planned(given, over or {})
-    folder = _folder(planned, None if out is None else Path(out), overwrite)
     try:
-        session = Session(folder, where, threads, fresh=True)
+        session = Session(folder, workers, threads, fresh=True)
         _begin(Console(file=io.StringIO()), planned, "unrender.app.sweep", session)
     except typer.Exit as end:
         if end.exit_code != FAILED:
             raise KeyboardInterrupt from end
     return read_sweep(folder)
+
+
+def _texts(given: Mapping[str, Any] | None) -> dict[str, str]:
+    from unrender.app.sweeps.axes import as_text
+
+    return {name: as_text(value) for name, value in (given or {}).items()}
 
 
 def _is_sweep(what: str) -> bool:
