@@ -52,7 +52,7 @@ def fixed_point(
             for key, value in x.items():
                 known = (above[key] > 0) & (below[key] > 0)
                 ratio = np.where(known, above[key], 1.0) / np.where(known, below[key], 1.0)
-                low, high = problem.bounds[key]
+                low, high = problem.unknowns[key].bounds
                 x[key] = np.clip(value * ratio**part, low, high).astype(np.float32)
             clock += time.perf_counter() - began
             step += 1

@@ -74,7 +74,7 @@ def stock_loop(
                 optimizer.set_learning_rate({key: max(rate * fall, 1e-9) for key, rate in rates.items()})
             optimizer.step()
             for key in start:
-                low, high = problem.bounds[key]
+                low, high = problem.unknowns[key].bounds
                 optimizer[key] = project(optimizer[key], low, high)
             parameters.update(optimizer)
             value = float(np.array(dr.detach(loss)).reshape(-1)[0])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,15 +46,14 @@ class Kept(ur.protocols.Callback):
 
 def blind(problem: ur.Problem) -> ur.Problem:
     """The same without the truth: errors are no part of a run's time."""
-    found = copy.copy(problem)
-    found.surfaces, found.truth = {}, {}
-    return found
+    unknowns = {key: replace(unknown, truth=None, surface=None) for key, unknown in problem.unknowns.items()}
+    return problem.with_parts(unknowns=unknowns)
 
 
 def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
     """What was reached in the end, and the curve of the surface's error over seconds; pictures alone where no surface is known."""
     first, last = _picture_error(problem, problem.initial_values()), _picture_error(problem, found[-1][1])
-    if not problem.surfaces:
+    if all(unknown.surface is None for unknown in problem.unknowns.values()):
         return {"pictures": last / first}
     (key,) = problem.faces
     start = problem.parameter_error(problem.initial())[key]

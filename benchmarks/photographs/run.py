@@ -124,7 +124,7 @@ def stock(
             if falling:
                 optimizer.set_learning_rate(rate * LAST_RATE ** min(clock / seconds, 1.0))
             for key in start:
-                optimizer[key] = project(optimizer[key], *problem.bounds[key])
+                optimizer[key] = project(optimizer[key], *problem.unknowns[key].bounds)
             parameters.update(optimizer)
             dr.sync_thread()
             clock += time.process_time() - began

@@ -31,7 +31,7 @@ def stepper(problem: ur.Problem, estimator: Any) -> Callable[[int], None]:
     def step(number: int) -> None:
         found, state["s"] = estimator.estimate(problem, state["p"], state["s"], Key(0, number))
         steps, state["m"] = optimizer.update(found, state["m"], state["p"])
-        state["p"] = {k: project(x + steps[k], *problem.bounds[k]) for k, x in state["p"].items()}
+        state["p"] = {k: project(x + steps[k], *problem.unknowns[k].bounds) for k, x in state["p"].items()}
         dr.eval(state["p"], state["m"])
 
     return step

@@ -233,8 +233,7 @@ def test_losses_of_whole_images_and_views_of_workers_are_refused() -> None:
     class Whole(ur.losses.L2):
         pixelwise = False  # pyright: ignore[reportAssignmentType]
 
-    asked = problem()
-    asked.loss = Whole()
+    asked = problem().replaced(loss=Whole())
     with pytest.raises(ur.InputError, match="Whole is of whole images, in which each pixel needs as many samples"):
         Counts().init(asked, asked.initial())
 

@@ -55,7 +55,7 @@ def test_runs_are_alike_and_change_executors_on_the_way(name: str, tmp_path: Pat
     problem = analytic.problem(views=VIEWS)
     alone = run(problem, tmp_path / "alone", STEPS)
     executor = EXECUTORS[name](problem)
-    other = problem.executed_by(executor)
+    other = problem.with_parts(executor=executor)
     whole = run(other, tmp_path / "whole", STEPS)
     run(other, tmp_path / "begun", STEPS // 2)
     resumed = ur.resume(tmp_path / "begun", problem, steps=STEPS)

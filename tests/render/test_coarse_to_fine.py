@@ -318,7 +318,7 @@ def test_dealt_views_become_finer_as_those_of_one_process(name: str, compress: b
     alone = ur.Problem(renderer, [parameter], views)
     shares = ((0, 2), (1,))
     parts = tuple(ViewShare(ur.Problem(renderer, [parameter], [views[v] for v in part]), part) for part in shares)
-    dealt = alone.executed_by(DistributedExecutor(alone, shares, LocalHosts(parts), compress))
+    dealt = alone.with_parts(executor=DistributedExecutor(alone, shares, LocalHosts(parts), compress))
     one, other, seeded = (
         ur.optimize(each, *PAIRS[name], 9, seed=seed) for each, seed in ((alone, 0), (dealt, 0), (alone, 1))
     )
@@ -336,7 +336,7 @@ def test_auto_starts_a_grid_coarse_whoever_has_the_views() -> None:
     parameter = ur.Parameter(KEY, initial=0.5)
     alone = ur.Problem(renderer, [parameter], views)
     parts = tuple(ViewShare(ur.Problem(renderer, [parameter], [views[v]]), (v,)) for v in (0, 1))
-    dealt = alone.executed_by(DistributedExecutor(alone, ((0,), (1,)), LocalHosts(parts)))
+    dealt = alone.with_parts(executor=DistributedExecutor(alone, ((0,), (1,)), LocalHosts(parts)))
     one, other = (ur.optimize(each, "auto", steps=16) for each in (alone, dealt))
     for result in (one, other):
         assert [h["resolution"][KEY] for h in result.history if "resolution" in h] == [(4, 4, 4), (8, 8, 8)]

@@ -451,7 +451,7 @@ def test_the_pose_of_the_cup_turns_it_about_its_axis():
 @pytest.mark.slow
 def test_what_moves_stays_in_the_picture_within_its_bounds(name):
     problem = ur.gallery.problem(name, reference_spp=1)
-    corners = np.array(list(problem.bounds.values()), float)
+    corners = np.array([unknown.bounds for unknown in problem.unknowns.values()], float)
     points = np.array([(0, 0)] + [(corners[0, a], corners[1, b]) for a in (0, 1) for b in (0, 1)])
     brightness = np.array(pictures(problem, points)).mean(axis=(1, 2))
     np.testing.assert_allclose(brightness[1:], brightness[[0] * 4], rtol=2e-3)

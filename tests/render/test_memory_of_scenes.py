@@ -81,11 +81,11 @@ def test_both_loads_and_the_problem_share_the_values_that_were_loaded(renderer: 
     assert pair.loaded()._own[KEY].array.index == pair.loaded(previous=True)._own[KEY].array.index
     picture = np.full((6, 6, 3), 0.3, np.float32)
     problem = ur.Problem(renderer, [ur.Parameter(KEY)], [ur.View(picture)])
-    assert np.shares_memory(problem.first_values[KEY], pair.loaded()._own[KEY].numpy())
-    assert not problem.first_values[KEY].flags.writeable
+    assert np.shares_memory(problem.unknowns[KEY].initial, pair.loaded()._own[KEY].numpy())
+    assert not problem.unknowns[KEY].initial.flags.writeable
     assert problem.initial_values()[KEY].flags.writeable
     result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=2)
-    assert np.shares_memory(result.initial[KEY], problem.first_values[KEY])
+    assert np.shares_memory(result.initial[KEY], problem.unknowns[KEY].initial)
     assert (result.parameters[KEY] != result.initial[KEY]).any()
 
 
@@ -93,4 +93,4 @@ def test_what_a_user_gives_is_copied() -> None:
     given = np.full((8, 8, 3), 0.4, np.float32)
     problem = ur.Problem(scene, [ur.Parameter(KEY, initial=given)], [ur.View(np.full((6, 6, 3), 0.3, np.float32))])
     given[:] = 0.1
-    assert problem.first_values[KEY].min() == pytest.approx(0.4)
+    assert problem.unknowns[KEY].initial.min() == pytest.approx(0.4)

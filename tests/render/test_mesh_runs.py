@@ -14,6 +14,7 @@ import trimesh
 import unrender as ur
 from unrender.runs.folder import reader
 from unrender.runs.metadata import RunAnnotations
+from unrender.runs.remeshing import remeshed
 from unrender.scene.problem import Problem
 
 SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}
@@ -27,7 +28,9 @@ def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_p
         replace(p, remeshing={"steps": [5], "method": "subdivide"}) if p.key == STATUE else p for p in made.parameters
     ]
     scene = made.renderer.pair.description  # type: ignore
-    problem = Problem(scene, given, made.views, made.loss, made.max_depth, surfaces=made.surfaces)
+    known = made.unknowns[STATUE].surface
+    assert known is not None
+    problem = Problem(scene, given, made.views, made.loss, made.max_depth, surfaces={STATUE: known})
     result = ur.optimize(problem, steps=11, run_directory=tmp_path / "run", annotations=RunAnnotations(final_spp=32))
     run = reader.read(tmp_path / "run")
     assert run.error_after[STATUE] < 0.9 * run.error_before[STATUE]
@@ -42,7 +45,7 @@ def test_auto_brings_shape_and_texture_nearer_across_a_change_of_triangles(tmp_p
     written: Any = trimesh.load(tmp_path / "run/meshes/statue.ply", process=False)
     np.testing.assert_array_equal(written.vertices.astype(np.float32).reshape(-1), result.parameters[STATUE])
     # What is exported renders what the last picture shows.
-    moved = problem.remeshed({STATUE: _mesh(run)})
+    moved = remeshed(problem, {STATUE: _mesh(run)})
     exported = ur.app.export((moved, result.parameters), tmp_path / "scene", formats=["mitsuba", "ply", "obj"])
     for path in (tmp_path / "scene/ply/statue.ply", tmp_path / "scene/obj/asset.obj"):
         again: Any = trimesh.load(path, process=False, maintain_order=True)

@@ -267,7 +267,7 @@ def test_a_value_that_a_plugin_refuses_is_an_input_error() -> None:
     """The sky's turbidity has a range; bounds that leave it meet Mitsuba's own error, in one line, and what was set before stays."""
     key = "sky.turbidity"
     made = problem(box(sky={"type": "sunsky", "turbidity": 4.0}), key)
-    assert made.bounds[key] == (1.0, 10.0)
+    assert made.unknowns[key].bounds == (1.0, 10.0)
     session = made.renderer.prepare([key], None, False)
     first = session.image({key: mi.TensorXf([3.0], ())}, SampleRequest(0, 4, 1)).images[0].numpy()
     with pytest.raises(

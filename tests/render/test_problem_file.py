@@ -79,9 +79,9 @@ def test_reads_everything_relative_to_the_file(folder: Path):
     assert problem.name == "the wall"
     assert problem.max_depth == 3
     assert problem.loss == losses.Huber(0.2)
-    assert problem.bounds == {KEY: (0.1, None)}
+    assert problem.unknowns[KEY].bounds == (0.1, None)
     assert problem.learning_rates == {KEY: 0.02}
-    assert problem.preconditioners == {KEY: LargeSteps(3)}
+    assert problem.unknowns[KEY].preconditioner == LargeSteps(3)
     np.testing.assert_allclose(problem.initial()[KEY].numpy(), 0.5029, atol=1e-4)
     np.testing.assert_allclose(problem.truth[KEY], np.broadcast_to([0.5, 0.4, 0.3], (8, 8, 3)))
     np.testing.assert_array_equal(problem.views[0].reference, REFERENCE)
@@ -104,7 +104,7 @@ def test_little_is_required(folder: Path):
     problem = Problem.from_file(str(write(folder, SHORT)))
     assert problem.name == "problem"
     assert problem.loss == losses.L1()
-    assert problem.bounds == {KEY: (0.0, 1.0)}
+    assert problem.unknowns[KEY].bounds == (0.0, 1.0)
     assert problem.max_depth == 6
 
 

@@ -34,7 +34,7 @@ def elsewhere(problem: Problem, share: float = 0.2) -> dict[str, np.ndarray]:
     found = {}
     for key, start in problem.initial().items():
         value = np.array(start.numpy())
-        low, high = problem.bounds[key]
+        low, high = problem.unknowns[key].bounds
         moved = value * (1 + share * rng.uniform(-1, 1, value.shape)) + (0.03 if low is None else 0) * rng.normal(
             size=value.shape
         )

@@ -25,10 +25,12 @@ from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.traits import Traits
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter, ParameterSettings
 from unrender.scene.problem import Problem
+from unrender.scene.unknown import Unknown
 from unrender.scene.view import View
 
 SHAPE = (4, 4)
@@ -93,11 +95,18 @@ def test_rates_are_shares_of_the_range_or_of_the_size() -> None:
 
 
 def test_an_albedo_begins_slowly_beside_an_unknown_extinction() -> None:
-    known: Any = SimpleNamespace(coordinates=SimpleNamespace(transforms={}), faces={})
     fog, haze = "fog.interior_medium.{}.data", "haze.interior_medium.{}.data"
     found = {fog.format("albedo"): 0.6, fog.format("sigma_t"): 2.0, haze.format("albedo"): 0.6}
-    known.initial_values = lambda: {key: np.full((2, 2, 2, 1), value) for key, value in found.items()}
-    known.bounds = {key: (0.0, None if "sigma_t" in key else 1.0) for key in found}
+    unknowns = {
+        key: Unknown(
+            Parameter(key),
+            np.full((2, 2, 2, 1), value, np.float32),
+            (0.0, None if "sigma_t" in key else 1.0),
+            ErrorMeasure(),
+        )
+        for key, value in found.items()
+    }
+    known: Any = SimpleNamespace(unknowns=unknowns)
     assert list(first_rates.first_rates(known, 0.1).values()) == pytest.approx([0.02, 0.2, 0.1])
 
 
@@ -132,8 +141,9 @@ def test_the_problem_is_kept_as_it_was_given() -> None:
     given = problem()
     plan = method("auto").plan(given)
     assert plan.problem is given
-    assert list(plan.configured().parameterisations) == ["gain"]
-    assert given.parameterisations == {}
+    configured = plan.configured().unknowns
+    assert [key for key, unknown in configured.items() if unknown.parameterisation is not None] == ["gain"]
+    assert all(unknown.parameterisation is None for unknown in given.unknowns.values())
 
 
 def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,13 +277,16 @@ def test_mini_batches_of_views_are_damped_as_whole_views_are(loss: Any, monkeypa
         assert chosen(problem(loss))[0].tolerance == expected
 
 
-def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_meshes_have_a_memory_where_noise_biases_the_loss() -> None:
     """And where a step shows half of the views."""
 
     def image(loss: Any, sampler: Any) -> str:
         made = problem(loss)
-        monkeypatch.setattr(made, "faces", {"map": None})
-        return type(sampling.image(Traits(made, module.AutoMethod.model_validate({}), CONSTANTS), sampler)[0]).__name__
+        unknowns = {**made.unknowns, "map": dataclasses.replace(made.unknowns["map"], faces=np.zeros((0, 3)))}
+        moving = made.with_parts(unknowns=unknowns)
+        return type(
+            sampling.image(Traits(moving, module.AutoMethod.model_validate({}), CONSTANTS), sampler)[0]
+        ).__name__
 
     for loss, name in (
         (losses.L1(), "RecursiveControlVariate"),

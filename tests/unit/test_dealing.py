@@ -113,7 +113,7 @@ class Crowded(LocalHosts):
 
 def dealt(problem: ur.Problem, count: int, compress: bool = False, lose: Sequence[int] = ()) -> ur.Problem:
     shares = assign([16] * len(problem.views), count)
-    return problem.executed_by(DistributedExecutor(problem, shares, Losing(problem, shares, lose), compress))
+    return problem.with_parts(executor=DistributedExecutor(problem, shares, Losing(problem, shares, lose), compress))
 
 
 def descend(problem: ur.Problem, name: str, **options: Any) -> ur.Result:
@@ -194,7 +194,10 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     whole = descend(dealt(problem, 3, compress=True), name)
     for die in (2, 5, 8, 11):
         hosts = Crowded(problem, shares, (die, die + 1, die + 5))
-        assert apart(whole, descend(problem.executed_by(DistributedExecutor(problem, shares, hosts, True)), name)) == 0
+        assert (
+            apart(whole, descend(problem.with_parts(executor=DistributedExecutor(problem, shares, hosts, True)), name))
+            == 0
+        )
 
 
 def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +225,7 @@ def test_exposures_of_all_views_are_sent_to_each_share() -> None:
     problem = ur.Problem(given.renderer, unknown, bright)
     shares = assign([16] * 3, 2)
     held = [ViewShare(unpacked(packed(problem, views, WITHOUT_RAY), WITHOUT_RAY), views) for views in shares]
-    together = problem.executed_by(DistributedExecutor(problem, shares, LocalHosts(tuple(held))))
+    together = problem.with_parts(executor=DistributedExecutor(problem, shares, LocalHosts(tuple(held))))
     alone = descend(problem, "plain")
     assert np.ptp(alone.parameters["exposure"], axis=0).min() > 0.05
     assert apart(alone, descend(together, "plain")) < 1e-12
@@ -248,7 +251,7 @@ def test_the_workers_of_a_resumed_run_have_the_variant_that_they_had(tmp_path: P
     problem = analytic.problem(views=2)
     shares = assign([16] * 2, 2)
     executor = DistributedExecutor(problem, shares, LocalHosts(shares_of(problem, shares)), variant="cuda_ad_rgb")
-    descend(problem.executed_by(executor), "plain", steps=1, run_directory=tmp_path / "dealt")
+    descend(problem.with_parts(executor=executor), "plain", steps=1, run_directory=tmp_path / "dealt")
     descend(problem, "plain", steps=1, run_directory=tmp_path / "alone")
     before, never = (load_run(tmp_path / name, steps=2).record for name in ("dealt", "alone"))
     assert before.variant != "cuda_ad_rgb"  # the driver's

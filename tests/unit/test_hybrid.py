@@ -248,7 +248,7 @@ def test_a_block_is_the_estimate_of_the_numbers_alone() -> None:
     own = found.require("test", BlockEstimate)
     alone = HeldParameters(asked.renderer, {"map": point["map"]})
     inner = ur.GaussNewton(8, 4)
-    part = asked.rendered_by(alone)
+    part = asked.with_parts(renderer=alone)
     expected, _ = inner.estimate(
         part, {"pose": point["pose"]}, inner.init(part, {"pose": point["pose"]}), Key(3).fold(1 << 33)
     )

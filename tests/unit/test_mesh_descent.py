@@ -18,14 +18,16 @@ from unrender.gallery import blobs, meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
+from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.watches import MeshWatch
 from unrender.scene import remeshing
-from unrender.scene.mesh_checks import check_regularizer, check_self_intersections, check_surfaces, mesh_notices
+from unrender.scene.mesh_checks import check_regularizer, check_self_intersection, check_surfaces, mesh_notices
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.self_intersections import crossing_triangles
 from unrender.scene.surfaces import Surface, folds, surface_error
+from unrender.scene.unknown import Unknown
 
 POINTS, FACES = meshes.icosphere(2)
 COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)
@@ -95,11 +97,11 @@ def test_regularizers_have_the_gradient_of_their_value(terms: dict[str, float]) 
 
 def test_a_regularizer_needs_a_mesh() -> None:
     with pytest.raises(ur.InputError, match="vertex positions of a mesh"):
-        check_regularizer({"edges": 1.0}, SimpleNamespace(moving_mesh=None))  # type: ignore
+        check_regularizer({"edges": 1.0}, None)  # type: ignore
     with pytest.raises(ur.InputError, match="no option edge"):
-        check_regularizer({"edge": 1.0}, SimpleNamespace(moving_mesh=lambda: (POINTS, FACES)))  # type: ignore
+        check_regularizer({"edge": 1.0}, (POINTS, FACES))  # type: ignore
     with pytest.raises(ur.InputError, match="its mesh has no edges"):
-        check_regularizer({"edges": 1.0}, SimpleNamespace(moving_mesh=lambda: (POINTS, FACES[:0])))  # type: ignore
+        check_regularizer({"edges": 1.0}, (POINTS, FACES[:0]))  # type: ignore
 
 
 def test_no_triangle_turns_over_in_a_step() -> None:
@@ -275,10 +277,16 @@ def test_unusual_meshes_have_a_line() -> None:
     )
 
 
+def of_mesh(key: str, positions: np.ndarray, faces: np.ndarray, self_intersection: Any) -> SimpleNamespace:
+    """What a watch asks of a problem whose unknown is a mesh."""
+    given = ur.Parameter(key, self_intersection=self_intersection)
+    unknown = Unknown(given, positions.reshape(-1), (None, None), ErrorMeasure(), faces=faces)
+    return SimpleNamespace(unknowns={key: unknown}, faces={key: faces})
+
+
 def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     key = "ball.vertex_positions"
-    problem = SimpleNamespace(faces={key: FACES}, initial_values=lambda: {key: POINTS.reshape(-1)})
-    problem.self_intersections = {key: "ignore"}
+    problem = of_mesh(key, POINTS, FACES, "ignore")
     crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
     run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
     descent, watch = SimpleNamespace(run=run), MeshWatch()
@@ -294,27 +302,23 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
 
 
 def test_what_to_do_with_self_intersections_is_checked() -> None:
-    mesh, colour = "ball.vertex_positions", "ball.bsdf.reflectance.value"
-    given = [ur.Parameter(mesh, self_intersection="prevent"), ur.Parameter(colour)]
-    assert check_self_intersections(given, {mesh: FACES}) == {mesh: "prevent"}
+    check_self_intersection("prevent", (POINTS, FACES))
+    check_self_intersection("warn", None)
     with pytest.raises(ur.InputError, match='expected "warn", "prevent" or "ignore", got \'never\''):
-        check_self_intersections([ur.Parameter(mesh, self_intersection="never")], {mesh: FACES})  # type: ignore
+        check_self_intersection("never", (POINTS, FACES))
     with pytest.raises(ur.InputError, match="it is of the vertex positions of a mesh"):
-        check_self_intersections([ur.Parameter(colour, self_intersection="prevent")], {mesh: FACES})
+        check_self_intersection("prevent", None)
 
 
 def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
     key, away = "ball.vertex_positions", np.repeat([0.0, 3.0], len(POINTS))[:, None] * [1.0, 0, 0]
     vertices, faces = np.concatenate([POINTS, POINTS]), np.concatenate([FACES, FACES + len(POINTS)])
-    problem = SimpleNamespace(
-        faces={key: faces}, initial_values=lambda: {key: vertices + away}, self_intersections={key: "warn"}
-    )
+    problem = of_mesh(key, vertices + away, faces, "ignore")
     run = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], step=25, stopped="")
     watch, estimate = MeshWatch(), Estimate(0.0, {key: np.ones(vertices.size)})
-    problem.self_intersections[key] = "ignore"
     watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
     assert run.warnings == []
-    problem.self_intersections[key] = "warn"
+    run.problem = of_mesh(key, vertices + away, faces, "warn")
     for run.step in (24, 25, 50):
         watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
     (line,) = run.warnings

@@ -329,7 +329,7 @@ def test_what_a_method_chose_names_it(method: str) -> None:
 def test_each_is_registered(name: str) -> None:
     made = registry.components("parameterisation")[name.capitalize()]
     assert made in (Identity, Log, Logit, Softplus)
-    assert problem(made(), (0, 2)).parameterisations["map"] == made()
+    assert problem(made(), (0, 2)).unknowns["map"].parameterisation == made()
 
 
 @pytest.mark.parametrize(

@@ -56,9 +56,9 @@ def problem(parameters: Any = (WALL,), views: Any = (VIEW,), **more: Any) -> Pro
 def test_takes_the_scenes_own_values_and_physical_bounds_by_default():
     made = problem([WALL, Parameter("lamp.scale")])
     np.testing.assert_allclose(made.initial()["wall.value"], [0.2, 0.4, 0.6])
-    assert made.bounds == {"wall.value": (0.0, 1.0), "lamp.scale": (None, None)}
+    assert [unknown.bounds for unknown in made.unknowns.values()] == [(0.0, 1.0), (None, None)]
     assert made.learning_rates == {}
-    assert made.preconditioners == {}
+    assert all(unknown.preconditioner is None for unknown in made.unknowns.values())
     assert made.truth == {}
     assert made.notices == []
 
@@ -110,14 +110,14 @@ def test_a_number_is_moved_into_its_bounds_too(initial: Any, bounds: Any):
     [((None, None), (None, None)), ((0, None), (0.0, None)), ((-np.inf, 2.5), (None, 2.5)), ([0, np.inf], (0.0, None))],
 )
 def test_given_bounds_replace_the_physical_ones(bounds: Any, kept: Any):
-    assert problem([Parameter("wall.value", bounds=bounds)]).bounds["wall.value"] == kept
+    assert problem([Parameter("wall.value", bounds=bounds)]).unknowns["wall.value"].bounds == kept
 
 
 def test_keeps_rates_and_preconditioners_by_key():
     smooth = LargeSteps(5.0)
     made = problem([Parameter("wall.value", learning_rate=1), Parameter("floor.data", preconditioner=smooth)])
     assert made.learning_rates == {"wall.value": 1.0}
-    assert made.preconditioners == {"floor.data": smooth}
+    assert [unknown.preconditioner for unknown in made.unknowns.values()] == [None, smooth]
 
 
 def test_references_are_float32_and_alpha_is_dropped():

@@ -112,7 +112,7 @@ def test_meshes_turn_or_are_a_picture(tmp_path: Path) -> None:
         assert page.complaints == []
 
 
-def test_a_problem_gets_the_triangles_that_a_run_ended_with(tmp_path: Path) -> None:
+def test_a_problem_gets_the_triangles_that_a_run_ended_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Judging, turning and exporting render the result of a mesh that was remeshed; one that was not stays as it is."""
     points, faces = meshes.icosphere(0)
     finer = {f"{KEY}/first_faces": faces}
@@ -124,7 +124,8 @@ def test_a_problem_gets_the_triangles_that_a_run_ended_with(tmp_path: Path) -> N
     )
     np.savez(path / "meshes.npz", **{f"{KEY}/faces": FACES, **finer})  # type: ignore
     run = reader.read(path)
-    problem: Any = SimpleNamespace(faces={KEY: faces}, remeshed=lambda found: found)
+    problem: Any = SimpleNamespace(faces={KEY: faces})
+    monkeypatch.setattr(reopen, "remeshed", lambda problem, found: found)
     found: Any = reopen.with_meshes(problem, run)
     np.testing.assert_array_equal(found[KEY].faces, FACES)
     np.testing.assert_array_equal(found[KEY].vertices, POINTS.astype(np.float32))

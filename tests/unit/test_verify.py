@@ -185,7 +185,9 @@ def test_values_that_render_no_number_are_worse() -> None:
     problem = made()
     assert isinstance(problem.renderer, AnalyticRenderer)
     broken = Broken({"x": np.full(SIZE, 0.5)}, problem.renderer.matrix, shape=(SIDE, SIDE))
-    result = ur.optimize(problem.rendered_by(broken), ur.PathGradient(spp=2), ur.optimizers.Adam(0.05), steps=30)
+    result = ur.optimize(
+        problem.with_parts(renderer=broken), ur.PathGradient(spp=2), ur.optimizers.Adam(0.05), steps=30
+    )
     assert result.status == "worse than start"
     assert result.verification["end"] == [None, None]
 

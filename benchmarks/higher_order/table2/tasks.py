@@ -62,7 +62,7 @@ def begin(problem: ur.Problem, task: Task, run: int, rate: float | None = None) 
         offset += value.size
     own = {} if rate is None else {key: rate * task.widths[key] for key in task.scales}
     parameters = [
-        replace(p, initial=moved[p.key], bounds=problem.bounds[p.key], learning_rate=own.get(p.key))
+        replace(p, initial=moved[p.key], bounds=problem.unknowns[p.key].bounds, learning_rate=own.get(p.key))
         for p in problem.parameters
     ]
     return problem.replaced(parameters=parameters)

@@ -87,7 +87,7 @@ class StockShapes:
             began = work_time()
             self.parameters[self.mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
             for key in others.keys():  # noqa: SIM118 (iterating gives pairs)
-                low, high = self.problem.bounds[key]
+                low, high = self.problem.unknowns[key].bounds
                 others[key] = project(others[key], low, high)
                 self.parameters[key] = others[key]
             self.parameters.update()

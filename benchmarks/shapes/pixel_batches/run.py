@@ -96,13 +96,13 @@ def run(
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, **options)
         (key,) = problem.faces
         problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(strength), key)
-        what = "surface" if problem.surfaces else "pictures"
+        what = "surface" if problem.has_truth else "pictures"
         found[name] = {"judged by": what, "views": len(problem.views), "methods": {}}
         for way, sampler in samplers(pixels, len(problem.views)).items():
 
             def final(rate: float, sampler: PixelSampler = sampler, problem: ur.Problem = problem) -> float:
                 found = descend(problem, sampler, rate, spp, seconds, TUNING_SEED)
-                return found["surface" if problem.surfaces else "pictures"]
+                return found["surface" if problem.has_truth else "pictures"]
 
             rate, _ = search(tuple(rates), final)
             runs = [descend(problem, sampler, rate, spp, seconds, seed) for seed in range(seeds)]

@@ -102,7 +102,7 @@ METHODS: dict[str, Method] = {
 def opened(name: str, resolution: int, reference_spp: int) -> ur.Problem:
     """The gallery's problem, with spheres that move as meshes."""
     found = ur.gallery.problem(name, resolution=resolution, reference_spp=reference_spp)
-    unknown = [replace(each, bounds=found.bounds[each.key]) for each in found.parameters]
+    unknown = [replace(each, bounds=found.unknowns[each.key].bounds) for each in found.parameters]
     return ur.Problem(
         lambda: scene_description(found),
         unknown,

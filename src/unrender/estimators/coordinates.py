@@ -52,16 +52,8 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:
-    """Return the problem with the coordinates of these parameters alone."""
-    coordinates = problem.coordinates
-    found = problem.rendered_by(problem.renderer)
-    found.coordinates = replace(
-        coordinates,
-        transforms={k: φ for k, φ in coordinates.transforms.items() if k in keys},
-        preconditioners={k: S for k, S in coordinates.preconditioners.items() if k in keys},
-        repeated={k: n for k, n in coordinates.repeated.items() if k in keys},
-    )
-    return found
+    """Return the problem with these unknowns alone."""
+    return problem.with_parts(unknowns={key: problem.unknowns[key] for key in keys})
 
 
 def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEstimate:
@@ -72,11 +64,12 @@ def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEst
 
 
 def regularized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
-    """The estimate of the loss with the terms of `Problem.regularizers` added, which have no noise; itself where there are none."""
-    if not problem.regularizers:
+    """The estimate of the loss with the terms of regularizers added, which have no noise; itself where there are none."""
+    regularizers = {key: u.regularizer for key, u in problem.unknowns.items() if u.regularizer is not None}
+    if not regularizers:
         return estimate
     loss, added = estimate.loss, {}
-    for key, regularizer in problem.regularizers.items():
+    for key, regularizer in regularizers.items():
         value, gradient = regularizer.evaluate(arrays.numpy(parameters[key]))
         loss, added[key] = loss + value, arrays.like(gradient.astype(np.float32), estimate.gradient[key])
     if estimate.preconditioned:

@@ -117,7 +117,7 @@ class GaussNewton:
             raise InputError(
                 f"GaussNewton requires a loss of single pixels, such as L2, got {type(problem.loss).__name__}"
             )
-        for key in (key for key in problem.preconditioners if key in parameters):
+        for key in (key for key in problem.coordinates.preconditioners if key in parameters):
             raise InputError(f"GaussNewton: parameter {key} has a preconditioner; leave it out, H takes its place")
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         return GaussNewtonState({})
@@ -260,12 +260,12 @@ class _Point:
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The parameters with one element more by its step, for each, and then less, (2 m, n), within bounds; how far apart the two are,
         (m,)."""
-        bounds = self.problem.bounds
+        unknowns = self.problem.unknowns
         offsets = np.zeros((2, elements.size, self.theta.size))
         offsets[0, np.arange(elements.size), elements] = steps[elements]
         offsets[1, np.arange(elements.size), elements] = -steps[elements]
         states = vectors.parts(self.theta + offsets, self.parameters)
-        inside = [project(x, *bounds[key]).reshape(*x.shape[:2], -1) for key, x in states.items()]
+        inside = [project(x, *unknowns[key].bounds).reshape(*x.shape[:2], -1) for key, x in states.items()]
         points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
         distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
         return points.reshape(-1, self.theta.size), distances

@@ -231,8 +231,8 @@ class HybridGradient:
         """As each of the two estimators sees it."""
         held = {key: x for key, x in parameters.items() if key not in own}
         return (
-            problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(own))),
-            problem.rendered_by(HeldParameters(problem.renderer, held)),
+            problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(own))),
+            problem.with_parts(renderer=HeldParameters(problem.renderer, held)),
         )
 
     def _perturbed(self, renderer: Renderer, parameters: Tree) -> tuple[str, ...]:

@@ -109,9 +109,9 @@ class BlackBox:
 
     def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
         """The losses (B,) and, per view, the images (B, H, W, 3)."""
-        renderer, bounds = self.problem.renderer, self.problem.bounds
+        renderer, unknowns = self.problem.renderer, self.problem.unknowns
         session = renderer.prepare(list(self.parameters), None, derivatives=False)
-        stacked = {key: project(x, *bounds[key]) for key, x in vectors.parts(points, self.parameters).items()}
+        stacked = {key: project(x, *unknowns[key].bounds) for key, x in vectors.parts(points, self.parameters).items()}
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             request = SampleRequest(view.sensor, self.spp, self.key.fold(index).uint32())

@@ -157,7 +157,7 @@ class PathGradient:
         """The problem by the renderer that is asked for."""
         if not self.differential_bsdf:
             return problem
-        return problem.rendered_by(with_differential_bsdf(problem.renderer))
+        return problem.with_parts(renderer=with_differential_bsdf(problem.renderer))
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
         """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""

@@ -34,7 +34,7 @@ class PreconditionedPerturbations:
     """
 
     def __init__(self, problem: Problem, parameters: Tree):
-        maps = problem.preconditioners
+        maps = problem.coordinates.preconditioners
         self._maps: Mapping[str, Preconditioner] = {key: maps[key] for key in parameters if key in maps}
         self._parameters, self._theta = parameters, vectors.ravel(parameters)
         bent = [key for key in problem.coordinates.transforms if key in parameters]

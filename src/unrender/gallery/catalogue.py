@@ -61,8 +61,7 @@ def problem(name: str, **options: Any) -> Problem:
             made = specification.problem(name)
         else:
             made = build_problem(name, specification)
-    made.origin |= {"gallery": name, "options": options}
-    return made
+    return made.with_parts(origin={**made.origin, "gallery": name, "options": options})
 
 
 def _specification(name: str) -> type:

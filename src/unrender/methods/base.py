@@ -112,7 +112,8 @@ class Method:
 
 def parameterised(problem: Problem) -> tuple[str, ...]:
     """A line on which parameterisations parameters have: "moved as log (lamp.radiance)"; none where none has one."""
-    named = {key: type(given).__name__.lower() for key, given in problem.parameterisations.items()}
+    given = {key: u.parameterisation for key, u in problem.unknowns.items() if u.parameterisation is not None}
+    named = {key: type(own).__name__.lower() for key, own in given.items()}
     return (f"moved as {grouped(named)}",) if named else ()
 
 

@@ -23,12 +23,11 @@ def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
         return []
     found = []
     each = rates.per_parameter(
-        type(optimizer).__name__, problem.bounds, optimizer.learning_rate, problem.learning_rates
+        type(optimizer).__name__, problem.unknowns, optimizer.learning_rate, problem.learning_rates
     )
-    for key, (low, high) in problem.bounds.items():
-        rate = each[key]
-        natural = key not in problem.coordinates.transforms
-        if natural and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
+    for key, unknown in problem.unknowns.items():
+        rate, (low, high) = each[key], unknown.bounds
+        if unknown.transform is None and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
             found.append(
                 f"parameter {key}: a learning_rate of {rate:g} crosses its range, {low:g} to {high:g}, in "
                 f"{_steps((high - low) / rate)}; 0.005 to 0.05 of the range are usual"

@@ -65,8 +65,8 @@ def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, s
     """
     known, lines = problem.renderer.parameters(), []
     until, longest = time.perf_counter() + seconds, 0.0
-    for key, (low, high) in problem.bounds.items():
-        info = known[key]
+    for key, unknown in problem.unknowns.items():
+        info, (low, high) = known[key], unknown.bounds
         if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role != "value":
             continue
         started = time.perf_counter()
@@ -135,9 +135,9 @@ def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int, 
     factor = float(np.exp(np.mean(ratios)))
     after = {key: values[key] / factor if key in lights else values[key] * factor for key in (*lights, *colours)}
     errors = {
-        key: problem.measures[key].error(np.asarray(x), problem.truth[key])
+        key: problem.unknowns[key].measure.error(np.asarray(x), truth)
         for key, x in after.items()
-        if key in problem.truth
+        if (truth := problem.unknowns[key].truth) is not None
     }
     told = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
     return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {told}"]

@@ -80,12 +80,12 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
     problem, estimator, optimizer = plan.configured(), plan.estimator, plan.optimizer
     problem.executor.check(estimator)
     if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it
-        for key in problem.preconditioners:
+        for key in problem.coordinates.preconditioners:
             raise InputError(
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
             )
     if isinstance(optimizer, OnMeshes):
-        optimizer = optimizer.on_meshes(problem.topology, lambda key: problem.repeated.get(key, 0))
+        optimizer = optimizer.on_meshes(problem.topology, lambda key: problem.coordinates.repeated.get(key, 0))
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)
@@ -95,7 +95,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
 def initialize(run: Run, state: RunState, step: int) -> None:
     """Give a run that has not begun its initial parameters, at their resolution of a step, and initial states of that resolution."""
     problem = run.problem
-    run.parameters = {k: project(x, *problem.bounds[k]) for k, x in problem.start(step).items()}
+    run.parameters = {k: project(x, *problem.unknowns[k].bounds) for k, x in problem.start(step).items()}
     state.estimator = run.estimator.init(problem, run.parameters)
     state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 
@@ -227,7 +227,7 @@ def _warn_of_skipping(run: Run, culprit: str) -> None:
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
     """Warn of steps of meshes that are shortened, once for each."""
     for key in keys:
-        also = " or passed through others" if run.problem.self_intersections[key] == "prevent" else ""
+        also = " or passed through others" if run.problem.unknowns[key].given.self_intersection == "prevent" else ""
         line = f"{key}: triangles would have turned over{also}; such steps are shortened"
         if not any(known.endswith(line) for known in run.warnings):
             run.warnings.append(f"step {run.step}: {line}")
@@ -255,7 +255,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     found = by_coordinates(estimate, problem, parameters)
     steps, state = optimizer.update(found, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps)
-    bounded = {k: project(x, *problem.bounds[k]) for k, x in reached.items()}
+    bounded = {k: project(x, *problem.unknowns[k].bounds) for k, x in reached.items()}
     # Before they are bounded: the nearest point to what is no number may be a bound.
     finite = trees.map(arrays.is_finite, moved)
     del steps, moved, reached
@@ -267,7 +267,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     shortened = []
     for key, faces in problem.faces.items():
         wanted = arrays.numpy(bounded[key])
-        crossing = problem.self_intersections[key] != "prevent"
+        crossing = problem.unknowns[key].given.self_intersection != "prevent"
         allowed = guarded(arrays.numpy(parameters[key]), wanted, faces, crossing)
         if allowed is not wanted:
             bounded[key] = arrays.like(allowed, bounded[key])

@@ -56,8 +56,8 @@ class RunAnnotations:
 def first_values(run: Run) -> dict[str, np.ndarray]:
     """{key: array} of a run that has not begun, at the scene's own resolution: the problem's own arrays where they are equal, in place of
     copies of the run's."""
-    known = run.problem.first_values
-    return {k: known[k] if np.array_equal(known[k], x) else x for k, x in run.full().items()}
+    known = run.problem.unknowns
+    return {k: known[k].initial if np.array_equal(known[k].initial, x) else x for k, x in run.full().items()}
 
 
 @dataclass
@@ -135,7 +135,7 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
 
 def recorded_measures(problem: Problem) -> dict[str, Any]:
     """Return how errors are measured as a run folder records it: without the plain measures."""
-    return {key: measure.record() for key, measure in problem.measures.items() if measure != PLAIN}
+    return {key: u.measure.record() for key, u in problem.unknowns.items() if u.measure != PLAIN}
 
 
 def fingerprint_of(run: Run) -> dict[str, str]:

@@ -3,20 +3,56 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.optimizers.partitioned import PartitionedState
+from unrender.rendering.renderer import Remeshable, ReplacedMesh, format_of
 from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.hooks import Hook
 from unrender.runs.noise import GradientNoise
+from unrender.scene.problem import Problem
 from unrender.scene.upsampling import restarted
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
 
-__all__ = ["MeshRefinement"]
+__all__ = ["MeshRefinement", "remeshed"]
+
+
+def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
+    """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
+
+    Raises `InputError` where the renderer has no meshes to replace.
+    """
+    if not isinstance(problem.renderer, Remeshable):
+        raise InputError(f"{', '.join(meshes)}: this renderer's meshes keep their triangles")
+    given = [
+        replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
+        for p in problem.parameters
+    ]
+    shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
+    renderer = problem.renderer.with_meshes(shapes, [p.key for p in given])
+    # Checked views are RGB, which films of other formats would take for theirs.
+    plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in problem.views)
+    made = Problem(
+        renderer,
+        given,
+        problem.views if plain else problem.given_views,
+        problem.loss,
+        problem.max_depth,
+        truth={key: value for key, value in problem.truth.items() if key not in meshes},
+        name=problem.name,
+        surfaces={key: unknown.surface for key, unknown in problem.unknowns.items() if unknown.surface is not None},
+    )
+    return made.with_parts(
+        origin=problem.origin, executor=problem.executor, remeshed_from=problem.remeshed_from or problem
+    )
 
 
 class MeshRefinement(Hook):
@@ -31,16 +67,15 @@ class MeshRefinement(Hook):
     def before_step(self, descent: Descent) -> None:
         """See `Hook.before_step`."""
         run, state = descent.run, descent.state
-        due = [key for key, way in run.problem.remeshings.items() if run.step in way.steps]
+        ways = {key: unknown.remeshing for key, unknown in run.problem.unknowns.items()}
+        due = {key: way for key, way in ways.items() if way is not None and run.step in way.steps}
         if not due:
             return
         started, found = time.perf_counter(), {}
-        for key in due:
+        for key, way in due.items():
             vertices = arrays.numpy(run.parameters[key]).reshape(-1, 3)
             try:
-                mesh = run.problem.remeshings[key].apply(
-                    vertices, run.problem.faces[key], run.problem.texture_coordinates(key)
-                )
+                mesh = way.apply(vertices, run.problem.faces[key], run.problem.texture_coordinates(key))
             except InputError as error:
                 run.warnings.append(f"step {run.step}: {key}: {error}; the mesh stays as it is")
                 continue
@@ -48,9 +83,9 @@ class MeshRefinement(Hook):
             self._made[key] = len(mesh.faces)
         if not found:
             return
-        run.problem = run.problem.remeshed(found)
+        run.problem = remeshed(run.problem, found)
         kept = {key: arrays.numpy(value) for key, value in run.parameters.items() if key not in found}
-        values = {key: kept.get(key, run.problem.initial_values()[key]) for key in run.parameters}
+        values = {key: kept.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
         run.parameters = {key: run.problem.renderer.array(value) for key, value in values.items()}
         fresh = run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
         state.estimator = run.estimator.init(run.problem, run.parameters)

@@ -16,6 +16,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder.reader import RunFolder, read_run_record
+from unrender.runs.remeshing import remeshed
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
 from unrender.scene import serialization
@@ -60,12 +61,12 @@ def resume(
 
 def with_meshes(problem: Problem, run: RunFolder) -> Problem:
     """The problem with the triangles that a run's meshes ended with, where they were remeshed on the way."""
-    remeshed = {
+    replaced = {
         key: ReplacedMesh(run.parameters[key].reshape(-1, 3), mesh.faces, mesh.uv)
         for key, mesh in run.meshes.items()
         if key in problem.faces and not np.array_equal(mesh.faces, problem.faces[key])
     }
-    return problem.remeshed(remeshed) if remeshed else problem
+    return remeshed(problem, replaced) if replaced else problem
 
 
 def problem_of(directory: str | Path) -> Problem:

@@ -74,7 +74,7 @@ def sensitivity(
             square += one[key] * other[key]
         made += 1
     roots = {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
-    return {key: periodic.repeat(root, problem.repeated.get(key, 0)) for key, root in roots.items()}
+    return {key: periodic.repeat(root, problem.unknowns[key].measure.repeated) for key, root in roots.items()}
 
 
 def around(found: np.ndarray) -> np.ndarray:

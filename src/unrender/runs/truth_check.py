@@ -62,7 +62,7 @@ def further_from_truth(
     residual = pictures.residual(pictures.images(truth)) if sensitivities else math.nan
     lines = []
     for key in suspects:
-        measure, where, noise, words = problem.measures[key], None, 0.0, ""
+        measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
         start, end = before[key], after[key]
         told = sensitivities.get(key)
         if told is not None and key in problem.truth:
@@ -107,4 +107,4 @@ def _noise(problem: Problem, key: str, told: np.ndarray, where: np.ndarray | Non
         return 0.0
     known = np.asarray(problem.truth[key])
     signs = np.random.default_rng(_SIGNS_SEED).choice((-1.0, 1.0), known.shape)
-    return problem.measures[key].error(known + math.sqrt(residual / square) * signs, known, where) or 0.0
+    return problem.unknowns[key].measure.error(known + math.sqrt(residual / square) * signs, known, where) or 0.0

@@ -262,7 +262,8 @@ def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
 
 def _other_meshes(problem: Problem) -> bool:
     """Whether meshes get other triangles on the way, so that parameters of different steps have different shapes."""
-    return bool(problem.remeshings) or problem.remeshed_from is not None
+    planned = any(unknown.remeshing is not None for unknown in problem.unknowns.values())
+    return planned or problem.remeshed_from is not None
 
 
 def _lines(first: Picture, last: Picture, best: str, kept_loss: float, memory: Memory | None, worse: bool) -> list[str]:

@@ -33,8 +33,8 @@ class BoundsWatch(Hook):
     def warnings(self, descent: Descent) -> list[str]:
         """See `Hook.warnings`."""
         run, found = descent.run, []
-        for key, (low, high) in run.problem.bounds.items() if run.stopped else ():
-            first = run.problem.first_values[key]
+        for key, unknown in run.problem.unknowns.items() if run.stopped else ():
+            first, (low, high) = unknown.initial, unknown.bounds
             if first.size != 1 or low is None or high is None:
                 continue
             last, near = float(arrays.numpy(run.parameters[key]).item()), _NEAR * (high - low)
@@ -110,7 +110,7 @@ class MeshWatch(Hook):
 
     def _crosses(self, run: Run, key: str) -> str:
         """The line on a mesh that passes through itself; "" where it does not, did so no less at the start, or the line was written."""
-        if key in self._crossing or run.problem.self_intersections[key] == "ignore":
+        if key in self._crossing or run.problem.unknowns[key].given.self_intersection == "ignore":
             return ""
         before, after, joined = _joined(run, key)
         count = len(crossing_triangles(after, joined))
@@ -126,7 +126,7 @@ class MeshWatch(Hook):
 def _joined(run: Run, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3) at the start and now, and the faces (F, 3), without seams."""
     start, end = (
-        np.asarray(x).reshape(-1, 3) for x in (run.problem.initial_values()[key], arrays.numpy(run.parameters[key]))
+        np.asarray(x).reshape(-1, 3) for x in (run.problem.unknowns[key].initial, arrays.numpy(run.parameters[key]))
     )
     _, first, places = np.unique(start, axis=0, return_index=True, return_inverse=True)
     return start[first], end[first], places.reshape(-1)[run.problem.faces[key]]

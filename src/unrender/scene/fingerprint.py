@@ -59,22 +59,16 @@ def digest(*parts: bytes) -> str:
 def _take(problem: Problem) -> dict[str, str]:
     found = {"loss": repr(problem.loss), "max_depth": str(problem.max_depth)}
     start = problem.initial()
-    for parameter in problem.parameters:
-        key = parameter.key
+    for key, unknown in problem.unknowns.items():
         found[f"parameter {key}: initial"] = _of_array(arrays.numpy(start[key]))
-        found[f"parameter {key}: bounds"] = str(problem.bounds[key])
-        found[f"parameter {key}: learning_rate"] = str(problem.learning_rates.get(key))
-        found[f"parameter {key}: preconditioner"] = repr(problem.preconditioners.get(key))
-        if key in problem.parameterisations:
-            found[f"parameter {key}: parameterisation"] = repr(problem.parameterisations[key])
-        if key in problem.regularizers:
-            found[f"parameter {key}: regularizer"] = repr(problem.regularizers[key])
-        if key in problem.remeshings:
-            found[f"parameter {key}: remeshing"] = repr(problem.remeshings[key])
-        if parameter.self_intersection == "prevent":
+        found[f"parameter {key}: bounds"] = str(unknown.bounds)
+        found[f"parameter {key}: learning_rate"] = str(unknown.learning_rate)
+        found[f"parameter {key}: preconditioner"] = repr(unknown.preconditioner)
+        for name in ("parameterisation", "regularizer", "remeshing", "coarse_to_fine"):
+            if (setting := getattr(unknown, name)) is not None:
+                found[f"parameter {key}: {name}"] = repr(setting)
+        if unknown.given.self_intersection == "prevent":
             found[f"parameter {key}: self_intersection"] = "prevent"
-        if key in problem.coarse_to_fine:
-            found[f"parameter {key}: coarse_to_fine"] = repr(problem.coarse_to_fine[key])
     for index, view in enumerate(problem.views):
         found[f"view {index}: sensor"] = str(view.sensor)
         found[f"view {index}: weight"] = str(view.weight)
@@ -88,9 +82,8 @@ def _of_array(array: np.ndarray) -> str:
 
 
 def _of_scene(problem: Problem) -> dict[str, str]:
-    unknown = {parameter.key for parameter in problem.parameters}
-    known = problem.renderer.parameters()
-    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in unknown)
+    known, unknowns = problem.renderer.parameters(), problem.unknowns
+    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in unknowns)
     objects: dict[str, list[bytes]] = {}
     for key, value in problem.renderer.values(keys).items():
         name = key.partition(".")[0]

@@ -2,77 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.rendering.renderer import ParameterInfo
 from unrender.scene import mesh_regularizer, remeshing
 from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
-from unrender.scene.parameter import Parameter
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, area_normals
 
-__all__ = ["check_regularizer", "check_remeshings", "check_self_intersections", "check_surfaces", "mesh_notices"]
+__all__ = ["check_regularizer", "check_remeshing", "check_self_intersection", "check_surfaces", "mesh_notices"]
 
+_NO_MESH = "expected none: it is of the vertex positions of a mesh"
+
+_Mesh = tuple[np.ndarray, np.ndarray]
 _SELF_INTERSECTIONS = ("warn", "prevent", "ignore")
 
 
-def check_regularizer(given: Any, info: ParameterInfo) -> MeshRegularizer:
-    """A regularizer bound to the mesh. Raises `InputError`."""
+def check_regularizer(given: Any, mesh: _Mesh | None) -> MeshRegularizer | None:
+    """Return a regularizer bound to the mesh, (positions, faces); None for none. Raises `InputError`."""
+    if given is None:
+        return None
     regularizer = mesh_regularizer.of(given)
-    if info.moving_mesh is None:
-        raise InputError("expected none: it is of the vertex positions of a mesh")
-    return regularizer.on_mesh(*info.moving_mesh())
+    if mesh is None:
+        raise InputError(_NO_MESH)
+    return regularizer.on_mesh(*mesh)
 
 
-def check_remeshings(
-    parameters: Sequence[Parameter],
-    known: Mapping[str, ParameterInfo],
-    texture_coordinates: Callable[[str], np.ndarray | None],
-) -> dict[str, Remeshing]:
-    """{key: when its mesh gets other triangles} of the parameters that say so. Raises `FieldError` where it does not suit the mesh.
+def check_remeshing(given: Any, mesh: _Mesh | None, uv: Callable[[], np.ndarray | None]) -> Remeshing | None:
+    """Return when a mesh gets other triangles; None for never. Raises `InputError` where that does not suit the mesh.
 
     Args:
-        parameters: of a problem.
-        known: what the renderer says of them.
-        texture_coordinates: of a mesh, by the key of its vertex positions; None where it has none.
+        given: by the user.
+        mesh: (positions, faces); None for what is no vertex positions.
+        uv: returns its texture coordinates, or None.
     """
-    found = {}
-    for index, parameter in enumerate(parameters):
-        if parameter.remeshing is None:
-            continue
-        key = parameter.key
-        try:
-            if (mesh := known[key].moving_mesh) is None:
-                raise InputError("expected none: it is of the vertex positions of a mesh")
-            found[key] = remeshing.of(parameter.remeshing)
-            found[key].check(*mesh(), texture_coordinates(key))
-        except InputError as error:
-            place = ("parameters", index, "remeshing")
-            raise FieldError(place, str(error), f"parameter {key}: remeshing") from error
+    if given is None:
+        return None
+    if mesh is None:
+        raise InputError(_NO_MESH)
+    found = remeshing.of(given)
+    found.check(*mesh, uv())
     return found
 
 
-def check_self_intersections(parameters: Sequence[Parameter], faces: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """{key: what is done where its mesh passes through itself} of those that are vertex positions; see `Parameter`. Raises `FieldError`.
-
-    Args:
-        parameters: of a problem.
-        faces: of their meshes.
-    """
-    for index, parameter in enumerate(parameters):
-        given, place = parameter.self_intersection, ("parameters", index, "self_intersection")
-        name = f"parameter {parameter.key}: self_intersection"
-        if given not in _SELF_INTERSECTIONS:
-            raise FieldError(place, f'expected "warn", "prevent" or "ignore", got {given!r}', name)
-        if given != "warn" and parameter.key not in faces:
-            raise FieldError(place, "expected none: it is of the vertex positions of a mesh", name)
-    return {parameter.key: parameter.self_intersection for parameter in parameters if parameter.key in faces}
+def check_self_intersection(given: Any, mesh: _Mesh | None) -> None:
+    """Raise `InputError` for what is not to be done where a mesh passes through itself; see `Parameter`."""
+    if given not in _SELF_INTERSECTIONS:
+        raise InputError(f'expected "warn", "prevent" or "ignore", got {given!r}')
+    if given != "warn" and mesh is None:
+        raise InputError(_NO_MESH)
 
 
 def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str]:

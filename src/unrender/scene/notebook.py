@@ -31,19 +31,18 @@ def html(problem: Problem) -> str:
         f"reference {index}": shown_image(np.asarray(view.reference))
         for index, view in enumerate(problem.views[:_VIEWS])
     }
-    for key in list(problem.shapes())[:_MAPS]:
-        truth = problem.truth.get(key)
-        for what, values in (("start", problem.initial_values()[key]), ("truth", truth)):
-            colours = None if values is None else shown_map(values, truth)
+    for key, unknown in list(problem.unknowns.items())[:_MAPS]:
+        for what, values in (("start", unknown.initial), ("truth", unknown.truth)):
+            colours = None if values is None else shown_map(values, unknown.truth)
             if colours is not None:
                 shown[f"{what}: {key}"] = colours
     rows = {}
-    for key, shape in problem.shapes().items():
-        low, high = ("open" if side is None else f"{side:g}" for side in problem.bounds[key])
+    for key, unknown in problem.unknowns.items():
+        shape = unknown.shape()
+        low, high = ("open" if side is None else f"{side:g}" for side in unknown.bounds)
         about = [f"shape {shape}" if shape else "a number", f"bounds {low} to {high}"]
-        about += [f"learning rate {problem.learning_rates[key]:g}"] if key in problem.learning_rates else []
-        about += [f"{problem.preconditioners[key]!r:.80}"] if key in problem.preconditioners else []
-        about += [f"{problem.parameterisations[key]!r:.80}"] if key in problem.parameterisations else []
+        about += [f"learning rate {unknown.learning_rate:g}"] if unknown.learning_rate is not None else []
+        about += [f"{own!r:.80}" for own in (unknown.preconditioner, unknown.parameterisation) if own is not None]
         rows[key] = ", ".join(about)
     title = f"Problem {problem.name}: {describe_views(problem)}, {_loss(problem)}, up to {problem.max_depth} segments"
     return notebook.block(

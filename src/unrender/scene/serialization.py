@@ -17,8 +17,8 @@ import tomli_w
 
 from unrender.core import tables
 from unrender.io import files, toml_lines
-from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
+from unrender.scene.unknown import Unknown
 
 __all__ = ["ARRAYS", "FILE", "origin", "save"]
 
@@ -45,13 +45,13 @@ def save(problem: Problem, folder: Path) -> None:
 def origin(problem: Problem) -> dict[str, Any]:
     """`Problem.origin` in JSON's types."""
     options = problem.origin.get("options")
-    return problem.origin | ({} if options is None else {"options": {k: _option(v) for k, v in options.items()}})
+    return dict(problem.origin) | ({} if options is None else {"options": {k: _option(v) for k, v in options.items()}})
 
 
 def _described(problem: Problem, folder: Path) -> dict[str, Any]:
     rebuilt = "scene" in problem.origin
     store = _Arrays(folder if rebuilt else None)
-    parameters = [_parameter(problem, index, one, store) for index, one in enumerate(problem.parameters)]
+    parameters = [_parameter(index, unknown, store) for index, unknown in enumerate(problem.unknowns.values())]
     views = []
     for index, view in enumerate(problem.given_views):
         table: dict[str, Any] = {"sensor": int(view.sensor), "weight": float(view.weight)}
@@ -64,7 +64,8 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
     return {**head, "parameters": parameters, "views": views}
 
 
-def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Arrays) -> dict[str, Any]:
+def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:
+    parameter = unknown.given
     table: dict[str, Any] = {"key": parameter.key}
     if parameter.initial is not None:
         table |= store.field("initial", parameter.initial, f"parameter{index}-initial")
@@ -75,18 +76,15 @@ def _parameter(problem: Problem, index: int, parameter: Parameter, store: _Array
         table["learning_rate"] = float(parameter.learning_rate)
     if parameter.preconditioner is not None:
         table["preconditioner"] = _component(parameter.preconditioner)
-    if parameter.key in problem.parameterisations:
-        table["parameterisation"] = _component(problem.parameterisations[parameter.key])
-    if parameter.key in problem.coarse_to_fine:
-        table["coarse_to_fine"] = tables.fields(problem.coarse_to_fine[parameter.key])
-    if parameter.key in problem.regularizers:
-        table["regularizer"] = tables.fields(problem.regularizers[parameter.key])
-    if parameter.key in problem.remeshings:
-        table["remeshing"] = tables.fields(problem.remeshings[parameter.key])
+    if unknown.parameterisation is not None:
+        table["parameterisation"] = _component(unknown.parameterisation)
+    for name in ("coarse_to_fine", "regularizer", "remeshing"):
+        if (setting := getattr(unknown, name)) is not None:
+            table[name] = tables.fields(setting)
     if parameter.self_intersection != "warn":
         table["self_intersection"] = parameter.self_intersection
-    if parameter.key in problem.truth:
-        table |= store.field("truth", problem.truth[parameter.key], f"parameter{index}-truth")
+    if unknown.truth is not None:
+        table |= store.field("truth", unknown.truth, f"parameter{index}-truth")
     return table
 
 

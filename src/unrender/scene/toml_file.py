@@ -108,8 +108,7 @@ def read(path: str | Path) -> Problem:
     try:
         with confinement.within(file.parent):
             problem = _build(model, file)
-        problem.origin["file"] = str(file.resolve())
-        return problem
+        return problem.with_parts(origin={**problem.origin, "file": str(file.resolve())})
     except FieldError as error:
         place = error.place
         if place[0] == "truth":  # in a file it stands with the parameter

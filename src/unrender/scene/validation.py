@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,6 +20,7 @@ from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
+from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine
@@ -27,24 +28,23 @@ from unrender.scene.bounds import check_bounds, clip_to_bounds, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
-from unrender.scene.mesh_checks import check_regularizer
-from unrender.scene.mesh_regularizer import MeshRegularizer
-from unrender.scene.parameter import Parameter
+from unrender.scene.mesh_checks import check_regularizer, check_remeshing, check_self_intersection, mesh_notices
+from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.unknown import Unknown
 
 __all__ = [
-    "CheckedParameter",
     "check_loss",
     "check_loss_function",
     "check_max_depth",
     "check_parameter",
-    "check_parameterisation",
-    "check_preconditioner",
     "check_sequence",
     "check_truth",
+    "configure",
     "is_number",
     "mesh_topology",
     "open_renderer",
     "renderer_notices",
+    "texture_coordinates",
 ]
 
 _DEEPEST = 1 << 20
@@ -72,35 +72,6 @@ class _Parameterisation(Parameterisation, Protocol): ...
 
 @runtime_checkable
 class _Loss(Loss, Protocol): ...
-
-
-@dataclass(frozen=True)
-class CheckedParameter:
-    """A parameter with its defaults filled in.
-
-    Attributes:
-        key: of the scene.
-        bounds: (low, high); None is open.
-        learning_rate: None for the optimizer's.
-        preconditioner: None for none.
-        coarse_to_fine: None where its resolution is constant.
-        parameterisation: None where none was given.
-        transform: of that; None for the identity.
-        regularizer: bound to the mesh; None for none.
-        initial: float32, inside the bounds, of the scene's shape.
-        notices: one line for each change made to the input.
-    """
-
-    key: str
-    bounds: Bounds
-    learning_rate: float | None
-    preconditioner: Preconditioner | None
-    coarse_to_fine: CoarseToFine | None
-    parameterisation: Parameterisation | None
-    transform: Transform | None
-    regularizer: MeshRegularizer | None
-    initial: np.ndarray
-    notices: tuple[str, ...]
 
 
 def check_max_depth(max_depth: Any) -> None:
@@ -141,8 +112,8 @@ def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
 
 def check_parameter(
     index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
-) -> CheckedParameter:
-    """The parameter with its defaults. Raises `FieldError` for the field that is wrong.
+) -> Unknown:
+    """Return the parameter with its defaults filled in. Raises `FieldError` for the field that is wrong.
 
     Args:
         index: of the parameter in the problem, for messages.
@@ -168,36 +139,60 @@ def check_parameter(
     with checking("learning_rate"):
         if rate is not None and (not is_number(rate) or rate <= 0):
             raise InputError(f"expected a number above 0, got {rate!r}")
-    preconditioner, parameterisation, transform, regularizer = None, None, None, None
+    preconditioner, parameterisation, transform = None, None, None
     with checking("preconditioner"):
         if parameter.preconditioner is not None:
-            preconditioner = check_preconditioner(key, parameter.preconditioner, info)
+            preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
     with checking("coarse_to_fine"):
         schedule = _coarse_to_fine(parameter, info)
     initial, clipped = clip_to_bounds(start, bounds)
     initial.flags.writeable = False
     with checking("parameterisation"):
         if parameter.parameterisation is not None:
-            parameterisation, transform = check_parameterisation(parameter.parameterisation, bounds, initial)
+            parameterisation, transform = _check_parameterisation(parameter.parameterisation, bounds, initial)
+    mesh = None if info.moving_mesh is None else info.moving_mesh()
     with checking("regularizer"):
-        if parameter.regularizer is not None:
-            regularizer = check_regularizer(parameter.regularizer, info)
+        regularizer = check_regularizer(parameter.regularizer, mesh)
+    with checking("remeshing"):
+        remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
+    with checking("self_intersection"):
+        check_self_intersection(parameter.self_intersection, mesh)
     notices = [f"parameter {key}: initial {notice}"] * bool(notice)
     notices += [f"parameter {key}: {line}" for line in (narrowed, clipped) if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
-    own_rate = None if rate is None else float(rate)
-    return CheckedParameter(
-        key,
-        bounds,
-        own_rate,
-        preconditioner,
-        schedule,
-        parameterisation,
-        transform,
-        regularizer,
-        initial,
-        tuple(notices),
+    notices += [] if mesh is None else mesh_notices(key, *mesh)
+    return Unknown(
+        given=parameter,
+        initial=initial,
+        bounds=bounds,
+        measure=ErrorMeasure(info.role, info.conversion.repeated),
+        learning_rate=None if rate is None else float(rate),
+        preconditioner=preconditioner,
+        parameterisation=parameterisation,
+        transform=transform,
+        coarse_to_fine=schedule,
+        faces=None if mesh is None else np.asarray(mesh[1]).astype(np.int64).reshape(-1, 3),
+        regularizer=regularizer,
+        remeshing=remeshing,
+        notices=tuple(notices),
     )
+
+
+def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
+    """Return an unknown with those settings that it has none of its own for. Raises `InputError` for one that does not suit."""
+    own = {n: x for n, x in vars(settings).items() if x is not None and getattr(unknown.given, n) is None}
+    changes: dict[str, Any] = dict(own)
+    if "parameterisation" in own:
+        found = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
+        changes |= {"parameterisation": found[0], "transform": found[1]}
+    if "preconditioner" in own:
+        changes["preconditioner"] = _check_preconditioner(unknown.given.key, own["preconditioner"], info)
+    if "coarse_to_fine" in own:
+        try:
+            _check_resolutions(own["coarse_to_fine"], info)
+        except InputError as error:
+            raise InputError(f"parameter {unknown.given.key}: coarse_to_fine: {error}") from error
+    return replace(unknown, given=replace(unknown.given, **own), **changes)
 
 
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
@@ -223,7 +218,7 @@ def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.nd
     return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
 
 
-def check_parameterisation(
+def _check_parameterisation(
     given: Any, bounds: Bounds, initial: np.ndarray
 ) -> tuple[Parameterisation, Transform | None]:
     """A parameterisation, made of its name or table, and its φ. Raises `InputError`."""
@@ -241,7 +236,16 @@ def mesh_topology(info: ParameterInfo) -> MeshTopology | None:
     return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
 
 
-def check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
+def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray | None:
+    """Return the texture coordinates (V, 2) of a mesh by the key of its vertex positions, which have `size` elements; None for none."""
+    name = f"{key.rpartition('.')[0]}.vertex_texcoords"
+    if name not in renderer.parameters():
+        return None
+    found = arrays.numpy(renderer.values([name])[name]).reshape(-1, 2)
+    return found if len(found) == size // 3 else None
+
+
+def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
     """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
@@ -264,14 +268,6 @@ def _coarse_to_fine(parameter: Parameter, info: ParameterInfo) -> CoarseToFine |
     if parameter.preconditioner is not None:
         parameter.preconditioner.check(parameter.key, schedule.shape(info.shape, 0))
     return schedule
-
-
-def check_resolutions(key: str, schedule: CoarseToFine, info: ParameterInfo) -> None:
-    """Raise `InputError` for a parameter that cannot have these resolutions."""
-    try:
-        _check_resolutions(schedule, info)
-    except InputError as error:
-        raise InputError(f"parameter {key}: coarse_to_fine: {error}") from error
 
 
 def _check_resolutions(schedule: CoarseToFine, info: ParameterInfo) -> None:

@@ -109,7 +109,7 @@ def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarra
 
 def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:
     """The error of a parameter at the start and at the end; and where the pictures tell of it."""
-    measure, told = problem.measures[key], result.sensitivity.get(key)
+    measure, told = problem.unknowns[key].measure, result.sensitivity.get(key)
     line = f"error {measure.text(before)} before, {measure.text(after)} after"
     if measure.unit and key in problem.truth:
         line += f" ({measure.name_with_median(result.parameters[key], problem.truth[key])})"

@@ -86,8 +86,9 @@ def _parameters(problem: Problem) -> Table:
     table = _table()
     initial = {key: np.asarray(value) for key, value in problem.initial().items()}
     for key, error in problem.parameter_error(problem.initial()).items():
-        low, high = (("open" if side is None else f"{side:g}") for side in problem.bounds[key])
-        about = f"shape {initial[key].shape}, bounds {low} to {high}, error of the start {error:.3g}{problem.measures[key].unit}"
+        low, high = (("open" if side is None else f"{side:g}") for side in problem.unknowns[key].bounds)
+        unit = problem.unknowns[key].measure.unit
+        about = f"shape {initial[key].shape}, bounds {low} to {high}, error of the start {error:.3g}{unit}"
         table.add_row(escape(key), about)
     return table
 

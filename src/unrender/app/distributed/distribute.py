@@ -85,7 +85,7 @@ def distribute(
         blobs = tuple(packed(problem, share, cluster.ray) for share in shares)
         hosts = RayHosts(cluster, shares, blobs, threads, tell)
         try:
-            yield problem.executed_by(DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
+            yield problem.with_parts(executor=DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
         finally:
             hosts.close()
 

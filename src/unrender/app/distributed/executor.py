@@ -124,7 +124,7 @@ class DistributedExecutor:
             raise InputError(
                 f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
             )
-        for key in self._problem.remeshings:
+        for key in (key for key, unknown in self._problem.unknowns.items() if unknown.remeshing is not None):
             raise InputError(f"{key}: remeshing: meshes of distributed runs keep their triangles; leave it out")
         assignment.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
 

@@ -141,7 +141,7 @@ def _write(
     spp: int,
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
-    repeated = {key: measure.repeated for key, measure in problem.measures.items()}
+    repeated = problem.coordinates.repeated
     notices = textures.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
     others = [name for name in asked if name != MITSUBA]
     if renderer.pair.emissive:

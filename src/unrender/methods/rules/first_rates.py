@@ -29,13 +29,13 @@ def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
     """
     return [
         key
-        for key, value in problem.initial_values().items()
-        if (low := problem.bounds[key][0]) is not None
-        and problem.bounds[key][1] is None
-        and key not in problem.learning_rates
-        and key not in problem.parameterisations
-        and (value.ndim == _TEXTURE or _is_number(value, constants))
-        and (value > low + constants.margins * MARGIN).all()
+        for key, unknown in problem.unknowns.items()
+        if (low := unknown.bounds[0]) is not None
+        and unknown.bounds[1] is None
+        and unknown.learning_rate is None
+        and unknown.parameterisation is None
+        and (unknown.initial.ndim == _TEXTURE or _is_number(unknown.initial, constants))
+        and (unknown.initial > low + constants.margins * MARGIN).all()
     ]
 
 
@@ -44,18 +44,18 @@ def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS
     values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
     residuals and would together go too far; less for numbers with two ends. With a parameterisation, that of u for such a step."""
     found: dict[str, float] = {}
-    initial = problem.initial_values()
+    initial = {key: unknown.initial for key, unknown in problem.unknowns.items()}
     materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
     textures = Counter(materials.values())
-    for key, value in initial.items():
-        low, high = problem.bounds[key]
+    for key, unknown in problem.unknowns.items():
+        value, (low, high) = unknown.initial, unknown.bounds
         if low is not None and high is not None:
             size = high - low
         else:
             size = float(np.sqrt(np.mean(np.square(value, dtype=np.float64)))) or 1.0
-        if key in problem.faces:
+        if unknown.faces is not None:
             size = constants.mesh_share * _radius(value)
-        if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.bounds:
+        if _ALBEDO in key and key.replace(_ALBEDO, _EXTINCTION) in problem.unknowns:
             size *= constants.albedo_share
         elif _is_number(value, constants) and low is not None and high is not None:
             size *= constants.number_share
@@ -63,9 +63,9 @@ def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS
             size *= constants.normals_share
         if key in materials:
             size /= math.sqrt(textures[materials[key]])
-        if key in problem.coordinates.transforms:
+        if unknown.transform is not None:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
-            size /= float(problem.coordinates.transforms[key].slope(np.float64(middle)))
+            size /= float(unknown.transform.slope(np.float64(middle)))
         found[key] = share * size
     return found
 

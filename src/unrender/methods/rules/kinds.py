@@ -44,13 +44,12 @@ class Part:
 
 def textures(traits: Traits) -> Part:
     """Textures, grids and values at vertices without a preconditioner of their own move along Sobolev gradients."""
-    shapes, infos = traits.problem.shapes(), traits.infos
     keys = tuple(
         key
-        for key, info in infos.items()
+        for key, unknown in traits.problem.unknowns.items()
         if traits.options.smooth
-        and key not in traits.problem.preconditioners
-        and (grid.is_map(shapes[key]) or (info.mesh is not None and not info.welded))
+        and unknown.preconditioner is None
+        and (grid.is_map(unknown.shape()) or (traits.infos[key].mesh is not None and not traits.infos[key].welded))
     )
     return Part(keys, f"Sobolev gradients of {listed(keys)}", smoothed=True) if keys else Part()
 
@@ -60,11 +59,12 @@ def volumes(traits: Traits) -> Part:
 
     Textures are not, since smoothed gradients do the same; nor are grids beside a mesh.
     """
-    problem, start, found = traits.problem, traits.problem.initial_values(), {}
-    for key, shape in problem.shapes().items() if traits.options.coarse and not traits.meshes else ():
+    found, allowed = {}, traits.options.coarse and not traits.meshes
+    for key, unknown in traits.problem.unknowns.items() if allowed else ():
+        shape, start = unknown.shape(), unknown.initial
         ways = [steps for cells, steps in traits.constants.coarse if len(shape) == _GRID and min(shape[:-1]) >= cells]
-        own = key in problem.coarse_to_fine or key in problem.preconditioners
-        if ways and not own and traits.infos[key].resizable and not (start[key] != start[key][:1, :1, :1]).any():
+        own = unknown.coarse_to_fine is not None or unknown.preconditioner is not None
+        if ways and not own and traits.infos[key].resizable and not (start != start[:1, :1, :1]).any():
             found[key] = ways[0]
     steps = {key: f"resolution doubled by step {' and '.join(map(str, each))}" for key, each in found.items()}
     settings = {
@@ -75,7 +75,8 @@ def volumes(traits: Traits) -> Part:
 
 def positive_values(traits: Traits) -> Part:
     """Positive numbers, colours and textures without an upper bound move as their logarithms."""
-    given, found = traits.problem.parameterisations, logarithms(traits.problem, traits.constants)
+    found, known = logarithms(traits.problem, traits.constants), traits.problem.unknowns
+    given = {key: u.parameterisation for key, u in known.items() if u.parameterisation is not None}
     moved = {key: "log" for key in found if traits.options.parameterise and key not in traits.rates}
     named = {key: type(own).__name__.lower() for key, own in given.items()} | moved
     settings = {key: ParameterSettings(parameterisation=name) for key, name in moved.items()}
@@ -87,7 +88,7 @@ def meshes(traits: Traits) -> Part:
     keys, constants = traits.meshes, traits.constants
     if not keys:
         return Part()
-    fewest = min(traits.problem.initial_values()[key].size // 3 for key in keys)
+    fewest = min(traits.problem.unknowns[key].initial.size // 3 for key in keys)
     strength = float(np.clip(fewest / constants.vertices_per_strength, *constants.strengths))
     reason = f"large steps of {listed(keys)}: one rate for all vertices, λ {strength:.2g}"
     settings = {key: ParameterSettings(preconditioner=LargeSteps(strength)) for key in keys}

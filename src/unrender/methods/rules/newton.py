@@ -82,7 +82,7 @@ def beside(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
         plan: Of the others.
     """
     constants, problem = traits.constants, traits.problem
-    own = any(key in problem.preconditioners for key in keys)
+    own = any(problem.unknowns[key].preconditioner is not None for key in keys)
     if not _few(traits, keys) or own or not problem.loss.linear or not isinstance(plan.estimator, PathGradient):
         return None
     estimator = _estimator(traits, keys, constants.block_images)

@@ -34,7 +34,7 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
     """Return path gradients beside perturbed renders of what they do not reach; None where they reach all, or nothing."""
     constants, problem, sigma = traits.constants, traits.problem, traits.options.sigma
     keys = beyond_paths(traits.infos, list(traits.infos))
-    others = problem.rendered_by(PartialDerivatives(problem.renderer, frozenset(keys)))
+    others = problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(keys)))
     if not 0 < len(keys) < len(traits.infos) or refusal(others):
         return None
     if plan := beside(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
@@ -80,7 +80,7 @@ def paths(traits: Traits) -> Plan:
         preconditioner=Sobolev(correlation=options.correlation) if smoothed else None,
         preconditioned=smoothed,
         wiener=not isinstance(sampler, pixels.Uniform),
-        reparameterised=tuple(key for key in configured.parameterisations if key in configured.coordinates.transforms),
+        reparameterised=tuple(key for key, own in configured.unknowns.items() if own.transform is not None),
     )
     for part in own:
         if part.optimizer is not None:

@@ -67,7 +67,7 @@ class Traits:
     def newton_suits(self) -> bool:
         """Whether nothing rules out Gauss-Newton steps: no image or pixels asked for, a loss of pixels, no preconditioners."""
         asked = self.options.image is not None or self.options.pixels is not None
-        return not asked and self.problem.loss.pixelwise and not self.problem.preconditioners
+        return not asked and self.problem.loss.pixelwise and not self.problem.coordinates.preconditioners
 
     @cached_property
     def unreachable(self) -> str:

@@ -51,7 +51,9 @@ def arrays_of(problem: Problem, before: Mapping[str, np.ndarray] | None = None) 
             found[f"{key}/{_FIRST}"] = first
             if (uv := problem.texture_coordinates(key)) is not None:
                 found[f"{key}/{_UV}"] = uv.astype(np.float32)
-    for key, surface in problem.surfaces.items():
+    for key, surface in ((key, unknown.surface) for key, unknown in problem.unknowns.items()):
+        if surface is None:
+            continue
         found[f"{key}/{_VERTICES}"] = surface.vertices.astype(np.float32)
         found[f"{key}/{_TRUE_FACES}"] = surface.faces.astype(np.int32)
     return found
