@@ -113,14 +113,7 @@ def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
 def check_parameter(
     index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
 ) -> Unknown:
-    """Return the parameter with its defaults filled in. Raises `FieldError` for the field that is wrong.
-
-    Args:
-        index: of the parameter in the problem, for messages.
-        parameter: as given.
-        known: the scene's parameters.
-        renderer: gives the scene's own value where there is no initial one.
-    """
+    """Return a parameter with its defaults filled in; `index`: its place in the problem. Raises `FieldError` for the field that is wrong."""
     key, info = parameter.key, _known(index, parameter.key, known)
 
     @contextmanager
@@ -135,10 +128,8 @@ def check_parameter(
         _check_normals(start, info)
     with checking("bounds"):
         bounds, narrowed = check_bounds(parameter.bounds, info, start)
-    rate = parameter.learning_rate
     with checking("learning_rate"):
-        if rate is not None and (not is_number(rate) or rate <= 0):
-            raise InputError(f"expected a number above 0, got {rate!r}")
+        rate = _check_rate(parameter.learning_rate)
     preconditioner, parameterisation, transform = None, None, None
     with checking("preconditioner"):
         if parameter.preconditioner is not None:
@@ -157,8 +148,8 @@ def check_parameter(
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
-    notices = [f"parameter {key}: initial {notice}"] * bool(notice)
-    notices += [f"parameter {key}: {line}" for line in (narrowed, clipped) if line]
+    told = (f"initial {notice}" if notice else "", narrowed, clipped)
+    notices = [f"parameter {key}: {line}" for line in told if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)
     return Unknown(
@@ -166,7 +157,7 @@ def check_parameter(
         initial=initial,
         bounds=bounds,
         measure=ErrorMeasure(info.role, info.conversion.repeated),
-        learning_rate=None if rate is None else float(rate),
+        learning_rate=rate,
         preconditioner=preconditioner,
         parameterisation=parameterisation,
         transform=transform,
@@ -176,6 +167,12 @@ def check_parameter(
         remeshing=remeshing,
         notices=tuple(notices),
     )
+
+
+def _check_rate(rate: Any) -> float | None:
+    if rate is not None and (not is_number(rate) or rate <= 0):
+        raise InputError(f"expected a number above 0, got {rate!r}")
+    return None if rate is None else float(rate)
 
 
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
