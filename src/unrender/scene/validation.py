@@ -113,7 +113,7 @@ def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
 def check_parameter(
     index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
 ) -> Unknown:
-    """Return a parameter with its defaults filled in; `index`: its place in the problem. Raises `FieldError` for the field that is wrong."""
+    """Return the `index`-th parameter with its defaults filled in. Raises `FieldError` for the field that is wrong."""
     key, info = parameter.key, _known(index, parameter.key, known)
 
     @contextmanager
