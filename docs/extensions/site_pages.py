@@ -19,7 +19,7 @@ from unrender.core import registry
 from unrender.display.pictures import png, shown_image
 from unrender.methods import method
 
-PIXELS, SAMPLES = 96, 256
+PIXELS, SAMPLES = 96, 64
 """Side and samples per pixel of the gallery's pictures."""
 ENLARGED = 2
 """Pixels on the page for each pixel of a picture, along each axis."""
